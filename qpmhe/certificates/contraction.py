@@ -298,7 +298,11 @@ def _unstable(search: Search, text: str) -> NotCertifiedError:
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """An observer made for a region, and its verified constants."""
+    """An observer made for a region, and its verified constants.
+
+    It is projected in the certified metric: where X is the region, it stays there, and the bound
+    holds at projected samples as well.
+    """
 
     observer: Luenberger
     stability: ObserverStability
@@ -334,4 +338,4 @@ def synthesise_gain(
     )
     made = _stability(search, rho)
     assert made.gain is not None
-    return Synthesis(Luenberger(made.gain), made)
+    return Synthesis(Luenberger(made.gain, metric=made.P), made)

@@ -236,8 +236,8 @@ def _proved_observer(
     if own is not None and not limits(made.stability)[1]:
         return observer, own, ""
     return made.observer, made.stability, (
-        f"Luenberger({made.observer.gain.tolist()}), made for the region in place of the model's "
-        f"own: {why}"
+        f"Luenberger({made.observer.gain.tolist()}, metric=P) with the certified P, made for the "
+        f"region in place of the model's own: {why}"
     )
 
 

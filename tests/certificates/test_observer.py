@@ -6,7 +6,9 @@ import pytest
 import qpmhe
 from qpmhe.certificates.contraction import certify_observer, synthesise_gain
 from qpmhe.certificates.evidence import CertificateError, Evidence, NotCertifiedError
+from qpmhe.certificates.observer_bound import ObserverBound
 from qpmhe.certificates.properties import ObserverStability
+from qpmhe.certificates.regions import bounded_region
 from qpmhe.errors import OptionError, QpmheError
 
 from .attacks import RELATIVE, attack_observer
@@ -143,6 +145,32 @@ def test_observer_that_does_not_contract_is_shown_where():
         certify_observer(system, observer, VAN_DER_POL)
     made = synthesise_gain(system, VAN_DER_POL, rho=0.85)
     assert made.stability.evidence is Evidence.PROVED
+
+
+def test_a_gain_made_for_x_is_projected_in_its_metric_and_its_bound_holds_there():
+    region = qpmhe.Box([-2.5, -3.5], [2.5, 3.5])
+    system = qpmhe.System.from_ode(
+        lambda x: np.array([x[1], (1.0 - x[0] ** 2) * x[1] - x[0]]), lambda x: x[:1], dt=0.1, n=2,
+        p=1, states=region,
+    )
+    sizes = qpmhe.certificates.Sizes(0.0, 0.3)
+    made = synthesise_gain(system, region, sizes=(0.01, 0.3))
+    x, start, rng = [np.array([2.2, -0.5])], np.array([-2.4, 3.4]), np.random.default_rng(0)
+    for _ in range(60):
+        x.append(system.f(x[-1], np.zeros(0)))
+    truth = np.array(x)
+    y = truth[:-1, :1] + rng.choice([-0.3, 0.3], (60, 1))
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1))
+    for observer, holds in ((made.observer, True), (qpmhe.Luenberger(made.observer.gain), False)):
+        run = qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=4, initial_state=start, max_qps=0
+        ).run(y)
+        bound = ObserverBound(
+            made.stability, bounded_region(system, region), sizes, observer.metric
+        )
+        band = bound.along(run, initial_error=truth[0] - start)
+        assert (run.flags & qpmhe.Status.OBSERVER_PROJECTED.value).any()
+        assert (band.lost is None) is holds
 
 
 def test_undetectable_system_has_no_gain():
