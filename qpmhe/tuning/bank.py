@@ -25,64 +25,37 @@ _GAP = 10
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What one filter takes the record for.
+    """What one filter takes the record for."""
 
-    Parameters
-    ----------
-    measurements, inputs : (T, p) and (T, m) array
-        y, NaN where it is missing, and u.
-    noise, disturbance : (p, p) and (n, n) array
-        Covariances R, and Q of what the disturbance adds to the state.
-    start, prior : (n,) and (n, n) array
-        The first estimate, and its covariance.
-    step : float
-        The length of each step, as a multiple of what the record says.
-    outliers : bool
-        Whether single measurements may be outliers, which the filter then leaves out.
-    gains : (p,) array or None
-        What the record's numbers were divided by to make y.
-    """
-
-    measurements: Array
-    inputs: Array
-    noise: Array
-    disturbance: Array
-    start: Array
+    measurements: Array  # (T, p), NaN where missing
+    inputs: Array  # (T, m)
+    noise: Array  # R
+    disturbance: Array  # Q of what the disturbance adds to the state
+    start: Array  # the first estimate, and its covariance
     prior: Array
-    step: float = 1.0
-    outliers: bool = False
-    gains: Array | None = None
+    step: float = 1.0  # length of each, as a multiple of what the record says
+    outliers: bool = False  # whether single measurements may be such, which it then leaves out
+    gains: Array | None = None  # (p,): what the record's numbers were divided by to make y
 
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
     """What the filters have found: all but `logs` of the first filter alone.
 
-    Attributes
-    ----------
-    logs : (T, H) array
-        Log likelihood of each sample under each hypothesis, for as many measurements as the first
-        has; -infinity in all samples where the filter failed.
-    states, corrected : (T, n) array
-        Estimates before and after each measurement.
-    innovations, spreads, weights : (T, p), (T, p, p) and (T, p, p) array
-        y(t) - h(x(t)), NaN where missing or left out; their covariances S, and the inverses.
-    covariances : (T, n, n) array
-        Of the estimates after each measurement.
-    transitions, outputs, gains : array
-        A (T, n, n), C (T, p, n), and the measurement update's K (T, n, p).
+    `logs` are log likelihoods, for as many measurements as the first has; -infinity in all
+    samples where the filter failed.
     """
 
-    logs: Array
-    states: Array
+    logs: Array  # (T, H)
+    states: Array  # (T, n), before and after each measurement
     corrected: Array
-    innovations: Array
-    spreads: Array
+    innovations: Array  # (T, p), NaN where missing or left out
+    spreads: Array  # (T, p, p), their covariances, and the inverses
     weights: Array
-    covariances: Array
-    transitions: Array
-    outputs: Array
-    gains: Array
+    covariances: Array  # (T, n, n), after each measurement
+    transitions: Array  # A
+    outputs: Array  # C
+    gains: Array  # K of the measurement update
 
     @property
     def likelihoods(self) -> Array:

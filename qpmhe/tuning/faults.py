@@ -94,29 +94,15 @@ _KINDS = {
 class Fault:
     """A fault that explains the record better than none.
 
-    Parameters
-    ----------
-    kind : str
-        One of the keys above.
-    value : float
-        Factor of a covariance, a sensor, a step or an input; samples of a shift; the bias in the
-        units of the sensor.
-    hypothesis : Hypothesis
-        The record and its covariances without the fault.
-    subject : tuple of int
-        The sensors, inputs or disturbances that it concerns; empty for all.
-    span : (int, int) or None
-        First and last sample, if not the whole record.
-    gain : float
-        How much more likely the record is with it, as a logarithm.
+    The value is a factor; of a shift or a clock samples, of a bias in the units of the sensor.
     """
 
     kind: str
     value: float
-    hypothesis: Hypothesis
-    subject: tuple[int, ...] = ()
-    span: tuple[int, int] | None = None
-    gain: float = 0.0
+    hypothesis: Hypothesis  # the record and its covariances without the fault
+    subject: tuple[int, ...] = ()  # sensors, inputs or disturbances; all if empty
+    span: tuple[int, int] | None = None  # first and last sample, if not the whole record
+    gain: float = 0.0  # how much more likely the record is with it, as a logarithm
 
     def in_words(self, names: Names, deviations: Array, outliers: Array) -> Finding:
         """The finding, with the noise's deviations and the shares of outliers of each sensor."""

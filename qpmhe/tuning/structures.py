@@ -94,15 +94,8 @@ class CholeskyFactor:
 class Structure:
     """All that is tuned, as one vector theta: parts of covariances, parameters, and others.
 
-    Attributes
-    ----------
-    names : list of str
-        Of the components of theta.
-    start : (d,) array
-        Where the search begins: theta of `first`, the weights before.
-    covariances, seen : int
-        How many components are of covariances, and are of covariances or parameters of the model:
-        what the observer's likelihood depends on. Discount and threshold are behind them.
+    `start` is theta of `first`, the weights before. The likelihood depends on the first `seen`
+    components, of which the first `covariances` are of these; discount and threshold are behind.
     """
 
     def __init__(
