@@ -150,6 +150,11 @@ class Observer(ABC):
         """Whether sensors that fail are rejected."""
         return False
 
+    @property
+    def innovation_limit(self) -> float | None:
+        """The largest innovation of one output that counts in full, in its standard deviations."""
+        return None
+
     @abstractmethod
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array | None]:
         """The correction L(z, v) and the covariance of the next step.
@@ -243,6 +248,13 @@ class KalmanType(Observer):
     def rejects(self) -> bool:
         """Whether it has a gate."""
         return self._innovation is not None and self._innovation.rejects
+
+    @property
+    def innovation_limit(self) -> float | None:
+        """The root of its rule's limit; see `Observer.innovation_limit`."""
+        if self._innovation is None:
+            return None
+        return float(np.sqrt(self._innovation.limits(len(self._noise))[0]))
 
     def _form(self, kind: str) -> ObserverForm:
         """The observer's C form, with its covariances."""

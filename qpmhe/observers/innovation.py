@@ -54,9 +54,9 @@ class Prediction:
         most = found.max()
         return found / most if most > 0.0 else np.zeros_like(found)
 
-    def grown(self, shares: Array, factor: float) -> Array:
-        """P with variances that have grown by a factor, as far as each has a share."""
-        scale = np.sqrt(1.0 + (factor - 1.0) * shares)
+    def grown(self, growth: Array) -> Array:
+        """P whose variances have grown by these factors (n,)."""
+        scale = np.sqrt(growth)
         larger: Array = scale[:, None] * self.covariance * scale
         return larger
 
@@ -120,10 +120,11 @@ class Innovation(ABC):
     def _judged(
         self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts
     ) -> _Judged:
-        """Test each sensor, and find those that are due and how P explains them."""
-        parts, limits = self._parts(observed)
+        """Test each sensor, and find those that are due and how P would have to grow for each."""
+        parts, limits, least = self._parts(observed)
+        innovation = prediction.spread + noise
         passes = np.array([
-            not part or _distance(prediction.spread + noise, v, [], part) <= limit
+            not part or _distance(innovation, v, [], part) <= limit
             for part, limit in zip(parts, limits, strict=True)
         ])
         counts = np.where(passes, 0, rejections + 1)
@@ -131,28 +132,45 @@ class Innovation(ABC):
             if not part:
                 counts[k] = rejections[k]
         late = np.flatnonzero((rejections >= self.reopen) & ~passes).tolist()
-        if self.rejects and not any(rejections[k] % self.reopen == 0 for k in late):
-            late = []  # they were contradicted, and wait
-        shares = np.zeros(0)
-        if late:
+        due: dict[int, Array] = {}
+        # Those that were contradicted wait.
+        if late and not (self.rejects and all(rejections[k] % self.reopen for k in late)):
             known = [place for k in np.flatnonzero(passes) for place in parts[k]]
-            doubted = [place for k in late for place in parts[k]]
-            shares = prediction.shares(doubted, noise)
-            given = [
-                [] if len(doubted) > len(known) or failures >= LONGEST * self.reopen else known
-                for failures in rejections.tolist()
-            ]
+            if sum(len(parts[k]) for k in late) > len(known):
+                known = []
+            for k in late:
+                given = known if rejections[k] < LONGEST * self.reopen else []
+                growth = self._growth(prediction, noise, v, parts[k], given, limits[k], least)
+                if growth is not None:
+                    due[k] = growth
+        return _Judged(parts, passes, counts, due)
 
-            def passing(factor: float) -> list[int]:
-                larger = prediction.spread_of(prediction.grown(shares, factor)) + noise
-                return [k for k in late if _distance(larger, v, given[k], parts[k]) <= limits[k]]
+    def _growth(
+        self, prediction: Prediction, noise: Array, v: Array, part: list[int], given: list[int],
+        limit: float, least: float,
+    ) -> Array | None:
+        """Factors (n,) of the variances with which a sensor passes; None if there are none."""
+        shares, factor = prediction.shares(part, noise), 1.0
 
-            late = passing(GROWTH**MOST_GROWTH)
-            return _Judged(parts, passes, counts, late, shares, passing)
-        return _Judged(parts, passes, counts, late, shares, lambda _: [])
+        def innovation(factor: float) -> Array:
+            larger = prediction.grown(1.0 + (factor - 1.0) * shares)
+            return prediction.spread_of(larger) + noise
 
-    def _parts(self, observed: Mask) -> tuple[list[list[int]], Array]:
-        """For each sensor its places among the outputs that are there, and its limit."""
+        for _ in range(MOST_GROWTH):
+            factor *= GROWTH
+            variances = innovation(factor).diagonal()[part]
+            if (v[part] ** 2 <= least * variances).all():
+                break
+        else:
+            return None
+        factor *= GROWTH
+        if not _distance(innovation(factor), v, given, part) <= limit:
+            return None
+        growth: Array = 1.0 + ((factor if self.rejects else GROWTH) - 1.0) * shares
+        return growth
+
+    def _parts(self, observed: Mask) -> tuple[list[list[int]], Array, float]:
+        """Places of each sensor's outputs that are there, their limits, and that of one output."""
         key = observed.tobytes()
         known: dict[bytes, Any] = self.__dict__.setdefault("_known", {})
         if key not in known:
@@ -164,20 +182,23 @@ class Innovation(ABC):
                 for sensor in self.sensors(observed.size)
             ]
             table = np.append(self.limits(observed.size), 0.0)
-            known[key] = parts, np.array([table[len(part) - 1] for part in parts])
-        found: tuple[list[list[int]], Array] = known[key]
+            limits = np.array([table[len(part) - 1] for part in parts])
+            known[key] = parts, limits, float(table[0])
+        found: tuple[list[list[int]], Array, float] = known[key]
         return found
 
 
 class _Judged(NamedTuple):
-    """The places and the results of all sensors, and those that are due, by growths of P."""
+    """The places, results and counts of all sensors, and growths of P for those that are due."""
 
     parts: list[list[int]]
     passes: Mask
     counts: Counts
-    due: list[int]
-    shares: Array
-    passing: Callable[[float], list[int]]
+    due: dict[int, Array]
+
+    def larger(self, prediction: Prediction) -> Array | None:
+        """P, grown for all that are due."""
+        return prediction.grown(np.max(list(self.due.values()), axis=0)) if self.due else None
 
 
 @dataclass(frozen=True)
@@ -195,27 +216,29 @@ class Gate(Innovation):
     corrects, and its covariance proceeds, as if its outputs were missing.
 
     A gate can shut on the truth, where P is too small for the observer's error. A sensor that has
-    been rejected ``reopen`` times in a row and fails once more is therefore due, and opens: P
-    becomes :math:`T P T` with
+    been rejected ``reopen`` times in a row and fails once more is therefore due: P becomes
+    :math:`T P T` with
 
     .. math::
-        T_{ii}^2 = 1 + (4^k - 1) \frac{r_i}{\max_j r_j}, \qquad
+        T_{ii}^2 = 1 + (4^{k+1} - 1) \frac{r_i}{\max_j r_j}, \qquad
         r_i = \frac{(P C_s^\top S_{ss}^{-1} C_s P)_{ii}}{P_{ii}}
 
-    and the least k with which its innovation passes, given those of the sensors that passed; with
-    several sensors due, s is all of them, and k the least that opens all. :math:`r_i` is the share
-    by which the sensor would reduce the variance of :math:`x_i`: the states that it shows grow, and
-    correlations stay. The observer corrects with this P by the sensors that passed or opened, whose
-    counts start anew. So the covariance explains what the observer corrects by, and the gain is
-    near one along it.
+    and the least k from 1 to 20 with which, with :math:`4^k` in place of :math:`4^{k+1}`, each of
+    its outputs would pass alone. :math:`r_i` is the share by which the sensor would reduce the
+    variance of :math:`x_i`: the states that it shows grow, and correlations stay. The sensor opens
+    if with this P its innovation passes given those of the sensors that passed before. The observer
+    then corrects by it, too, and its count starts anew; where several open at once, each
+    :math:`T_{ii}` is the largest of theirs.
+    So the covariance explains what the observer corrects by, and the gain is near one along it.
 
-    A sensor stays rejected for another ``reopen`` samples where no k up to 20 makes it pass: P
-    spans nothing of what it sees, or the sensors that pass contradict it, however wrong P is. So a
-    sensor with a lasting fault stays shut where others show the same, and is followed where it
-    alone does. As it may be the others that are wrong, they are no longer given where they have
-    fewer outputs than the sensors that were rejected so often, or for a sensor that was rejected
-    ten times ``reopen`` times in a row: at the latest then it opens. When one is due, so are all
-    that were rejected ``reopen`` times. Samples in which a sensor is missing do not count.
+    Otherwise the sensors that pass contradict it, and it stays rejected for another ``reopen``
+    samples. So a sensor with a lasting fault stays shut where others show the same, and is followed
+    where it alone does. As it may be the others that are wrong, they are not asked where they have
+    fewer outputs than the sensors that were rejected so often, nor about a sensor that was rejected
+    ten times ``reopen`` times in a row, which opens at the latest then. When one sensor is due, so
+    are all that were rejected ``reopen`` times. A sensor stays shut where no k makes it pass: P
+    spans nothing of what it sees, or its outputs contradict each other. Samples in which a sensor
+    is missing do not count.
 
     Parameters
     ----------
@@ -279,16 +302,12 @@ class Gate(Innovation):
     ) -> Verdict:
         """Test each sensor, and open those that are due; see `Innovation.judge`."""
         found = self._judged(prediction, noise, v, observed, rejections)
-        passes, counts, larger = found.passes, found.counts, None
-        if found.due:
-            factor = GROWTH
-            while len(found.passing(factor)) < len(found.due) and factor < GROWTH**MOST_GROWTH:
-                factor *= GROWTH
-            larger = prediction.grown(found.shares, factor)
-            passes[found.due], counts[found.due] = True, 0
+        passes, counts, opened = found.passes, found.counts, list(found.due)
+        passes[opened], counts[opened] = True, 0
         kept = np.ones(v.size, np.bool_)
         for part, passed in zip(found.parts, passes, strict=True):
             kept[part] = passed
+        larger = found.larger(prediction)
         return Verdict(larger, None if kept.all() else kept, noise, counts)
 
 
@@ -311,7 +330,7 @@ class HuberInnovation(Innovation):
 
     Alone, this would bring an observer whose covariance is too small back by c standard deviations
     a sample at most. Where an output has been beyond the threshold ``reopen`` times in a row, P
-    therefore grows before each further sample at which it is, as in `Gate` with k = 1: standard
+    therefore grows before each further sample at which it is, as in `Gate` with k = 0: standard
     deviations at most double in a sample, so that the model is linearised often on the way. As
     there, P does not grow while the outputs within the threshold contradict.
 
@@ -356,10 +375,8 @@ class HuberInnovation(Innovation):
     ) -> Verdict:
         """Weigh each output; see `Innovation.judge`."""
         found = self._judged(prediction, noise, v, observed, rejections)
-        larger, spread = None, prediction.spread
-        if found.due:
-            larger = prediction.grown(found.shares, GROWTH)
-            spread = prediction.spread_of(larger)
+        larger = found.larger(prediction)
+        spread = prediction.spread if larger is None else prediction.spread_of(larger)
         variances = (spread + noise).diagonal()
         excess = np.abs(v) / np.sqrt(variances) / self.threshold - 1.0
         return Verdict(

@@ -34,7 +34,7 @@ _LOST = 1e3
 _WORSE, _CLEARLY = 1.4, 3.0
 # A repeated number contradicts the filter if innovations are so many deviations off.
 _OTHERWISE = 1.7
-_FAILING, _KEPT, _WEAK_PRIOR = 0.02, 0.5, 0.1
+_FAILING, _KEPT, _WEAK_PRIOR, _REJECTED = 0.02, 0.5, 0.1, 0.02
 # How far from one the observer's error may be, in deviations of the prior.
 _SUITS = 0.3, 1.5
 # Correlations of innovations that matter, and how sure they must be.
@@ -341,9 +341,26 @@ class Examination:
                 "kept", f"The candidate was kept at {kept:.0%} of the samples{because}.",
                 "Estimate.explain says what to do about each." if kept > _KEPT else "",
             )
+        yield from self._rejection_notes()
         yield from self._drifts()
         if not self.findings:
             yield from self._input_notes()
+
+    def _rejection_notes(self) -> Iterator[Finding]:
+        """What the observer's gate has rejected; this filter has no gate."""
+        rejected, seen = self.run.rejected_sensors, np.isfinite(self.source.measurements)
+        for k, sensor in enumerate(self.source.observer.sensors[: rejected.shape[1]]):
+            outputs = list(sensor)
+            count = seen[:, outputs].any(axis=1).sum()
+            share = rejected[:, k].sum() / count if count else 0.0
+            if share > _REJECTED:
+                title = listed([self.names.outputs[j] for j in outputs])
+                yield Finding(
+                    "rejected",
+                    f"The observer's gate rejected {title} at {share:.0%} of its samples.",
+                    "If they are not outliers, raise the covariances of disturbance or noise.",
+                    "note",
+                )
 
     def _prior_note(self) -> Finding:
         horizon, shares = self.horizon, self.prior_shares

@@ -22,7 +22,7 @@ class Finding:
         ``bias``, ``swapped``, ``step``, ``sign``, ``input``, ``shift``, ``clock``, ``outliers``,
         ``unseen``,
         ``correlated``, ``estimator``; a note also has ``prior``, ``kept``, ``innovations``,
-        ``drift`` or ``record``.
+        ``drift``, ``record`` or ``rejected``.
     text : str
         What it is, as a sentence.
     remedy : str

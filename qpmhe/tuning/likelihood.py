@@ -43,14 +43,15 @@ class Likelihood:
 
     def __init__(
         self, structure: Structure, data: list[Data], make: Callable[[dict[str, float]], System],
-        remade: bool,
+        remade: bool, threshold: float | None = None,
     ) -> None:
         self.structure, self.data, self._make = structure, data, make
         self._remade = remade  # a change of parameters makes another system
+        self._threshold = threshold  # where weights have none
         #: The samples that tune: those not held out.
         self.tuned = [~one.held for one in data]
         #: What makes another one of the same structure and data.
-        self.recipe = structure, data, make, remade
+        self.recipe = structure, data, make, remade, threshold
         self._filters: dict[tuple[float, ...], _Filter] = {}
         #: The first thing that a model has raised far from the start; blank if none did.
         self.failure = ""
@@ -102,7 +103,7 @@ class Likelihood:
         key = tuple(weights.parameters.values()) if self._remade else ()
         if key not in self._filters:
             try:
-                made = _Filter(self._make(weights.parameters), weights)
+                made = _Filter(self._make(weights.parameters), weights, self._threshold)
             except Exception as error:
                 self._note(weights, error)
                 return None
@@ -120,9 +121,9 @@ class Likelihood:
 class _Filter:
     """The filter of one system, in CasADi where it is traced and in NumPy where it is not."""
 
-    def __init__(self, system: System, weights: Weights) -> None:
+    def __init__(self, system: System, weights: Weights, threshold: float | None) -> None:
         self._system = system.copy(np.sqrt(weights.prior.diagonal().clip(1e-300)), traced=True)
-        self._threshold = weights.threshold
+        self._threshold = threshold if weights.threshold is None else weights.threshold
         self._clip = _bounds(system)
         self._sweeps: dict[int, tuple[Any, Any]] = {}
         self._step: Any = None
@@ -133,7 +134,7 @@ class _Filter:
             and (residual is None or residual.periods is not None)
         )
         if self.traced:
-            self._step = _symbolic_step(model, self._system, self._clip, weights.threshold)
+            self._step = _symbolic_step(model, self._system, self._clip, self._threshold)
 
     def _covariances(self, weights: Weights) -> tuple[Array, Array, Array]:
         entering = self._system.state_covariance(weights.disturbance)

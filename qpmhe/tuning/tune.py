@@ -104,7 +104,9 @@ def tune(
     discount : float
         As for `qpmhe.QuadraticCost`.
     observer : callable
-        Makes the estimator's observer from ``prior``, ``disturbance`` and ``noise``.
+        Makes the estimator's observer from ``prior``, ``disturbance`` and ``noise``. Where it
+        judges innovations, as ``functools.partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate())``
+        does, those beyond its limit count in the likelihood as those beyond ``threshold`` do.
     arrival : {"observer", "constant"}
         What weighs the prior: the observer's covariance, or ``prior`` at all times.
     ahead : int
@@ -169,7 +171,7 @@ def tune(
         {"prior": first.n, "disturbance": first.r, "noise": first.p}, prior, disturbance, noise,
         discount, threshold, started, horizon=horizon, arrival=arrival,
     )
-    _check_observer(observer, start)
+    judged = _made_observer(observer, start).innovation_limit
     data = checked_data(records, first, inputs, initial_state)
     hold_out(data, held_out, 2 * ahead)
     labels = _labels(first, names)
@@ -185,7 +187,7 @@ def tune(
     if objective == "auto":
         objective = "truth" if has_truth else "prediction"
     options = {"max_qps": 2, **options}
-    likelihood = Likelihood(plan, data, make, remade)
+    likelihood = Likelihood(plan, data, make, remade, judged)
     at_start = likelihood.value(plan.start)
     if not np.isfinite(at_start):
         raise ModelError(
@@ -246,7 +248,7 @@ def _maker(
     return lambda at: system(**at), bool(parameters), made
 
 
-def _check_observer(kind: Any, start: Weights) -> None:
+def _made_observer(kind: Any, start: Weights) -> Observer:
     """Make one, so that what is wrong shows before the search."""
     expected = (
         "expected what makes an observer of prior, disturbance and noise, such as "
@@ -267,6 +269,7 @@ def _check_observer(kind: Any, start: Weights) -> None:
         raise OptionError(
             f"observer(prior=..., disturbance=..., noise=...) returned {shown(made)}; {expected}"
         )
+    return made
 
 
 def _mapping(name: str, given: Any, example: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 import qpmhe
 from qpmhe import Status
 
-from .fuzz_promise import main
+from .fuzz_promise import main, some_rule
 
 # Of a row, in units of its width or of a standard deviation.
 FEASIBLE = 1e-8
@@ -159,7 +159,7 @@ def case(draw, engine="python"):
     system = qpmhe.System(f, h, n=n, p=p, m=1 + k, **options)
     observer = qpmhe.Luenberger(draw.uniform(0, 0.9) * a @ np.linalg.pinv(c))
     if draw.random() < 0.5:
-        observer = qpmhe.ExtendedKalman(**covariances)
+        observer = qpmhe.ExtendedKalman(**covariances, innovation=some_rule(draw, p))
     discount = 1.0 if draw.random() < 0.7 else 0.9
     cost = qpmhe.QuadraticCost.from_covariances(discount=discount, **covariances)
     nominal = draw.normal(size=k)

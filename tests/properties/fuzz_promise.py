@@ -37,6 +37,17 @@ def some_angles(draw, size):
     return qpmhe.angles(which, draw.uniform(0.5, 8.0, which.size)) if which.size else None
 
 
+def some_rule(draw, size):
+    """What a Kalman-type observer makes of innovations: a gate, Huber's weights, or None."""
+    which = draw.random()
+    if which < 0.4:
+        return None
+    if which < 0.6:
+        return qpmhe.HuberInnovation(draw.uniform(0.5, 3.0), reopen=int(draw.integers(1, 6)))
+    groups = [list(range(size))] if draw.random() < 0.3 else None
+    return qpmhe.Gate(draw.choice([0.5, 0.95, 0.997]), int(draw.integers(1, 6)), groups)
+
+
 def case(draw):
     """An estimator on a random small problem, and its options."""
     n, p = int(draw.integers(1, 4)), int(draw.integers(1, 3))
@@ -65,8 +76,9 @@ def case(draw):
         covariances["disturbance"][-1, -1] = 0.0
     gain = draw.normal(size=(n, p)) if draw.random() < 0.3 else a @ np.linalg.pinv(c)
     observer = qpmhe.Luenberger(draw.uniform(0, 1.2) * gain)
-    if draw.random() < 0.3:
-        observer = qpmhe.ExtendedKalman(**covariances)
+    if draw.random() < 0.4:
+        make = qpmhe.ExtendedKalman if draw.random() < 0.7 else qpmhe.UnscentedKalman
+        observer = make(**covariances, innovation=some_rule(draw, p))
         if draw.random() < 0.5:
             covariances["prior"] = qpmhe.ObserverPrior()
     options = {
@@ -79,6 +91,13 @@ def case(draw):
     if system.state_residual is None and draw.random() < 0.2:  # as `augment_parameters` does
         held = draw.permutation(n)[: draw.integers(1, n + 1)]
         system.held = {int(j): float(draw.uniform(0.05, 1.0)) for j in held}
+    if draw.random() < 0.3 and cost.disturbance_factor is None:
+        loss = qpmhe.Barron(
+            cost.noise, draw.choice([0.5, 0.0, -2.0, -np.inf]), draw.uniform(0.5, 3.0),
+            per_component=bool(draw.random() < 0.5), graduation=draw.choice([1.0, 10.0]),
+        )
+        prior = cost.prior if cost.observer_prior is None else cost.observer_prior
+        cost = qpmhe.RobustCost(prior=prior, disturbance=cost.disturbance, noise=loss)
     mhe = qpmhe.MovingHorizonEstimator(
         system, observer, cost, horizon=int(draw.integers(1, 7)),
         initial_state=draw.normal(size=n), **options,

@@ -371,3 +371,17 @@ def test_prior_that_claims_too_much():
         prior=400.0 * case.cost.prior, disturbance=case.cost.disturbance, noise=case.cost.noise)
     found = qpmhe.diagnose(case._replace(cost=cost).run())
     assert any("The prior says that the observer is off by" in one.text for one in found.notes)
+
+
+def test_what_a_gate_rejected_is_noted():
+    generator = np.random.default_rng(8)
+    y = generator.standard_normal((300, 2)) * 0.1
+    y[generator.random(300) < 0.1, 1] += 5.0
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=2, p=2)
+    covariances = {"prior": np.eye(2), "disturbance": 1e-4 * np.eye(2), "noise": 0.01 * np.eye(2)}
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.ExtendedKalman(**covariances, innovation=qpmhe.Gate()),
+        qpmhe.QuadraticCost.from_covariances(**covariances), horizon=10, initial_state=[0.0, 0.0],
+    )
+    notes = [one for one in qpmhe.diagnose(mhe.run(y)).notes if one.kind == "rejected"]
+    assert [one.text for one in notes] == ["The observer's gate rejected y2 at 11% of its samples."]

@@ -377,3 +377,20 @@ def test_an_output_that_is_never_there():
         [(both, u)], system, noise=np.eye(2), structure={"noise": {"first": [0]}}
     )
     assert found.noise[1, 1] == 1.0
+
+
+@pytest.mark.parametrize("rule", [qpmhe.Gate(), qpmhe.HuberInnovation()])
+def test_innovations_that_the_observer_doubts_tune_little(rule):
+    """5 % of the measurements are off by 30 standard deviations."""
+    (Y, U), generator = simulated(3)[:2], np.random.default_rng(4)
+    hit = generator.random(Y.shape) < 0.05
+    spoilt = Y + hit * generator.choice([-1.0, 1.0], Y.shape) * 30.0 * 0.5
+    found = []
+    for innovation, y in ((None, Y), (None, spoilt), (rule, spoilt)):
+        kind = functools.partial(qpmhe.ExtendedKalman, innovation=innovation)
+        tuning = tuned([(y, U)], horizon=5, observer=kind, structure={"noise": "scalar"})
+        found.append(float(np.sqrt(tuning.noise[0, 0])))
+    clean, plain, judged = found
+    assert plain > 5.0 * clean
+    assert judged < 3.0 * clean
+    assert judged < 0.4 * plain

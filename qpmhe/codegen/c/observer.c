@@ -257,8 +257,7 @@ typedef struct {
     int size[MHE_SENSORS], at[MHE_SENSORS][NY];
     int passes[MHE_SENSORS], due[MHE_SENSORS];
     int known_count, known[NY]; /* places of the sensors that passed */
-    int given[MHE_SENSORS];     /* how many of these hold for each */
-    real shares[NX];            /* of the states in a growth of P */
+    real growth[NX];            /* of the variances of P */
 } mhe_sensors;
 
 /* The squared norm of a part of v in its covariance, given others; infinite if singular. */
@@ -285,15 +284,11 @@ static real mhe_distance(const mhe_seen *seen, const real *spread, int known_cou
     return sum;
 }
 
-/* By which share the due sensors would reduce each variance, over the largest share. */
-static void mhe_find_shares(const mhe_seen *seen, const mhe_sensors *sensors, const real *P,
+/* By which share a sensor would reduce each variance, over the largest share. */
+static void mhe_find_shares(const mhe_seen *seen, int count, const int *at, const real *P,
                             const real *cross, const real *spread, real *shares)
 {
     real S[NY * NY], rows[NY * NX], solved[NY * NX], most = 0;
-    int count = 0, at[NY];
-    for (int k = 0; k < MHE_SENSORS; k++)
-        for (int i = 0; sensors->due[k] && i < sensors->size[k]; i++)
-            at[count++] = sensors->at[k][i];
     for (int i = 0; i < count; i++) {
         for (int j = 0; j < count; j++) {
             const int place = at[i] * seen->count + at[j];
@@ -313,40 +308,64 @@ static void mhe_find_shares(const mhe_seen *seen, const mhe_sensors *sensors, co
     for (int j = 0; j < NX; j++) shares[j] = most > 0 ? shares[j] / most : 0;
 }
 
-/* out = P with variances that have grown by a factor, as far as each has a share. */
-static void mhe_grow(const real *P, const real *shares, real factor, real *out)
+/* out = P whose variances have grown by these factors. */
+static void mhe_grow(const real *P, const real *growth, real *out)
 {
     real scale[NX];
-    for (int j = 0; j < NX; j++) scale[j] = sqrt(1 + (factor - 1) * shares[j]);
+    for (int j = 0; j < NX; j++) scale[j] = sqrt(growth[j]);
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) out[i * NX + j] = scale[i] * P[i * NX + j] * scale[j];
 }
 
-/* Which of the due sensors pass with a P that has grown by a factor; how many. */
-static int mhe_passing(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
-                       const mhe_sensors *sensors, const real *P, real factor, int *passing)
+/* C P C' with a P that has grown by a factor. */
+static void mhe_spread_grown(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                             const real *P, const real *shares, real factor, real *spread)
 {
-    real larger[NX * NX], cross[NY * NX], spread[NY * NY];
-    int found = 0;
-    mhe_grow(P, sensors->shares, factor, larger);
+    real growth[NX], larger[NX * NX], cross[NY * NX];
+    for (int j = 0; j < NX; j++) growth[j] = 1 + (factor - 1) * shares[j];
+    mhe_grow(P, growth, larger);
     mhe_predict_outputs(s, stage, seen, larger, cross, spread);
-    for (int k = 0; k < MHE_SENSORS; k++) {
-        passing[k] = sensors->due[k] &&
-                     mhe_distance(seen, spread, sensors->given[k], sensors->known,
-                                  sensors->size[k], sensors->at[k]) <=
-                         s->innovation.limits[sensors->size[k] - 1];
-        found += passing[k];
-    }
-    return found;
 }
 
-/* Test each sensor against the innovation's covariance spread + R, and find those that are due;
- * how many a larger P explains. */
+/* Let P grow so that a sensor passes; whether it does, given others. */
+static int mhe_explain(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                       mhe_sensors *sensors, const real *P, const real *cross, const real *spread,
+                       int known_count, int k)
+{
+    const int size = sensors->size[k], *part = sensors->at[k];
+    real shares[NX], larger[NY * NY], factor = 1;
+    int alone = 0;
+    mhe_find_shares(seen, size, part, P, cross, spread, shares);
+    for (int i = 0; !alone && i < MHE_MOST_GROWTH; i++) {
+        factor *= MHE_GROWTH;
+        mhe_spread_grown(s, stage, seen, P, shares, factor, larger);
+        alone = 1;
+        for (int l = 0; l < size; l++) {
+            const int at = part[l] * seen->count + part[l];
+            const real square = seen->v[part[l]] * seen->v[part[l]];
+            if (!(square <= s->innovation.limits[0] * (larger[at] + seen->noise[at]))) alone = 0;
+        }
+    }
+    if (!alone) return 0;
+    factor *= MHE_GROWTH;
+    mhe_spread_grown(s, stage, seen, P, shares, factor, larger);
+    if (!(mhe_distance(seen, larger, known_count, sensors->known, size, part) <=
+          s->innovation.limits[size - 1]))
+        return 0;
+    if (MHE_INNOVATION != MHE_GATED) factor = MHE_GROWTH;
+    for (int j = 0; j < NX; j++)
+        sensors->growth[j] = mhe_max(1 + (factor - 1) * shares[j], sensors->growth[j]);
+    return 1;
+}
+
+/* Test each sensor against the innovation's covariance spread + R, and find those that are due and
+ * how P would have to grow; how many. */
 static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
                     const real *P, const real *cross, const real *spread, mhe_sensors *sensors,
                     int32_t *next)
 {
-    int late = 0, doubted = 0;
+    const int32_t reopen = s->innovation.reopen;
+    int late = 0, doubted = 0, due = 0;
     memset(sensors, 0, sizeof *sensors);
     for (int i = 0; i < seen->count; i++) {
         const int k = s->innovation.sensor_of[seen->at[i]];
@@ -358,25 +377,23 @@ static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_see
         sensors->passes[k] = !size || mhe_distance(seen, spread, 0, 0, size, sensors->at[k]) <=
                                           s->innovation.limits[size - 1];
         next[k] = !size ? before : sensors->passes[k] ? 0 : before + (before < INT32_MAX);
-        sensors->due[k] = !sensors->passes[k] && before >= s->innovation.reopen;
-        late += sensors->due[k] &&
-                (MHE_INNOVATION != MHE_GATED || before % s->innovation.reopen == 0);
-        doubted += sensors->due[k] ? size : 0;
+        if (!sensors->passes[k] && before >= reopen) {
+            doubted += size;
+            late |= MHE_INNOVATION != MHE_GATED || before % reopen == 0;
+        }
         for (int i = 0; sensors->passes[k] && i < size; i++)
             sensors->known[sensors->known_count++] = sensors->at[k][i];
     }
-    if (!late) { /* those that were contradicted wait */
-        memset(sensors->due, 0, sizeof sensors->due);
-        return 0;
-    }
+    if (!late) return 0; /* those that were contradicted wait */
+    const int known = doubted > sensors->known_count ? 0 : sensors->known_count;
     for (int k = 0; k < MHE_SENSORS; k++) {
-        const int long_shut = stage->rejections[k] / MHE_LONGEST >= s->innovation.reopen;
-        sensors->given[k] = doubted > sensors->known_count || long_shut ? 0 : sensors->known_count;
+        const int32_t before = stage->rejections[k];
+        if (sensors->passes[k] || before < reopen) continue;
+        sensors->due[k] = mhe_explain(s, stage, seen, sensors, P, cross, spread,
+                                      before / MHE_LONGEST >= reopen ? 0 : known, k);
+        due += sensors->due[k];
     }
-    real most = 1;
-    for (int i = 0; i < MHE_MOST_GROWTH; i++) most *= MHE_GROWTH;
-    mhe_find_shares(seen, sensors, P, cross, spread, sensors->shares);
-    return mhe_passing(s, stage, seen, sensors, P, most, sensors->due);
+    return due;
 }
 
 /* Let the outputs count as the rule for innovations says, and P grow where it must; the sensors'
@@ -392,11 +409,8 @@ static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe
     const int count = seen->count;
     real noise[NY * NY];
     if (due) {
-        real factor = MHE_GROWTH, larger[NX * NX];
-        int passing[MHE_SENSORS];
-        for (int i = 1; i < MHE_MOST_GROWTH; i++, factor *= MHE_GROWTH)
-            if (mhe_passing(s, stage, seen, &sensors, P, factor, passing) == due) break;
-        mhe_grow(P, sensors.shares, factor, larger);
+        real larger[NX * NX];
+        mhe_grow(P, sensors.growth, larger);
         memcpy(P, larger, sizeof larger);
     }
     memcpy(noise, seen->noise, sizeof(real) * (size_t)(count * count));
@@ -415,7 +429,7 @@ static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe
 #else
     if (due) {
         real larger[NX * NX];
-        mhe_grow(P, sensors.shares, MHE_GROWTH, larger);
+        mhe_grow(P, sensors.growth, larger);
         memcpy(P, larger, sizeof larger);
         mhe_predict_outputs(s, stage, seen, P, cross, spread);
     }

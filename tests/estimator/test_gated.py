@@ -1,0 +1,519 @@
+"""Kalman-type observers that judge innovations, against filters written out here."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe import Status
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.errors import InvalidInputError, OptionError
+
+pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
+ENGINES = [
+    "python",
+    pytest.param("compiled", marks=pytest.mark.skipif(
+        find_compiler() is None, reason="there is no C compiler"
+    )),
+]
+FILTERS = [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman]
+# 0.997 quantiles of the chi-square distributions with 1, 2 and 3 degrees, from tables.
+CHI2 = {1: 8.807468, 2: 11.618286, 3: 13.931419}
+DT = 0.1
+
+
+def f(x):
+    """A pendulum, and a constant."""
+    return np.array([x[0] + DT * x[1], x[1] - DT * np.sin(x[0]) - 0.02 * x[1] * x[2], x[2]])
+
+
+def h(x):
+    return np.array([np.sin(x[0]), x[1] + 0.1 * x[0] ** 2, x[1], x[0] + x[2]])
+
+
+def f_slope(x):
+    return np.array([
+        [1.0, DT, 0.0], [-DT * np.cos(x[0]), 1.0 - 0.02 * x[2], -0.02 * x[1]], [0.0, 0.0, 1.0],
+    ])
+
+
+def h_slope(x):
+    return np.array([
+        [np.cos(x[0]), 0.0, 0.0], [0.2 * x[0], 1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0],
+    ])
+
+
+P0 = np.diag([0.02, 0.05, 0.01])
+Q = np.diag([1e-4, 1e-3, 1e-6])
+ROOT = np.array([[1, 0, 0, 0], [0.4, 1, 0, 0], [-0.2, 0.1, 1, 0], [0, 0.3, 0, 1]])
+R = 0.01 * ROOT @ ROOT.T
+
+
+def pendulum():
+    return qpmhe.System(f, h, n=3, p=4)
+
+
+def disturbed(seed, steps=90, missing=0.15):
+    """Truth, and measurements with outliers, gaps, and sensor 2 off for 25 samples."""
+    rng = np.random.default_rng(seed)
+    x, X, Y = np.array([0.5, 0.0, 0.3]), [], []
+    for t in range(steps):
+        y = h(x) + np.linalg.cholesky(R) @ rng.standard_normal(4)
+        y += (rng.random(4) < 0.05) * rng.choice([-1.5, 1.5], 4)
+        y[2] += 1.0 * (30 <= t < 55)
+        y[rng.random(4) < missing] = np.nan
+        X.append(x)
+        Y.append(y)
+        x = f(x) + np.sqrt(np.diag(Q)) * rng.standard_normal(3)
+    return np.array(X), np.array(Y)
+
+
+def estimator(system, observer, start, engine="python", **options):
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=qpmhe.ObserverPrior(), disturbance=observer._disturbance, noise=observer._noise
+    )
+    return qpmhe.MovingHorizonEstimator(
+        system, observer, cost, initial_state=start, engine=engine,
+        **({"horizon": 6, "max_qps": 0} | options),
+    )
+
+
+def conditional(S, v, given, part):
+    """The squared norm of v[part] in its covariance, given v[given], by Schur complements."""
+    if given:
+        T = S[np.ix_(part, given)] @ np.linalg.inv(S[np.ix_(given, given)])
+        mean, spread = T @ v[given], T @ S[np.ix_(given, part)]
+    else:
+        mean, spread = 0.0, 0.0
+    rest = v[part] - mean
+    return rest @ np.linalg.inv(S[np.ix_(part, part)] - spread) @ rest
+
+
+def spread(P, C, scale):
+    """The innovation's covariance with a scaled P."""
+    return C @ scale @ P @ scale @ C.T + R
+
+
+def plain_gated(z, Y, sensors, reopen):
+    """States z(0..T) and rejections of a gated extended Kalman filter, one sample at a time."""
+    P, counts, states, rejected = P0, [0] * len(sensors), [z], []
+    for y in Y:
+        A, C = f_slope(z), h_slope(z)
+        v = y - h(z)
+        seen = [[j for j in sensor if np.isfinite(y[j])] for sensor in sensors]
+        S = C @ P @ C.T + R
+        passed = [not s or conditional(S, v, [], s) <= CHI2[len(s)] for s in seen]
+        late = [k for k, count in enumerate(counts) if count >= reopen and not passed[k]]
+        tried = late if any(counts[k] % reopen == 0 for k in late) else []
+        known = [j for k, s in enumerate(seen) if passed[k] for j in s]
+        doubted = sum(len(seen[k]) for k in tried)
+        opened, T = [], np.eye(3)
+        for k in tried:
+            part, limit = seen[k], CHI2[len(seen[k])]
+            gain = P @ C[part].T
+            share = np.diag(gain @ np.linalg.inv(S[np.ix_(part, part)]) @ gain.T) / np.diag(P)
+
+            def scaled(power, share=share):
+                return np.diag(np.sqrt(1.0 + (4.0**power - 1.0) * share / share.max()))
+
+            least = next((
+                power for power in range(1, 21)
+                if all(v[j] ** 2 <= CHI2[1] * spread(P, C, scaled(power))[j, j] for j in part)
+            ), None)
+            if least is None:
+                continue
+            given = [] if doubted > len(known) or counts[k] >= 10 * reopen else known
+            if conditional(spread(P, C, scaled(least + 1)), v, given, part) <= limit:
+                opened.append(k)
+                T = np.maximum(T, scaled(least + 1))
+        P = T @ P @ T
+        used = [j for k, s in enumerate(seen) if passed[k] or k in opened for j in s]
+        rejected.append([bool(s) and not passed[k] and k not in opened for k, s in enumerate(seen)])
+        counts = [
+            count if not s else count + 1 if out else 0
+            for count, s, out in zip(counts, seen, rejected[-1], strict=True)
+        ]
+        z_next = f(z)
+        if used:
+            K = P @ C[used].T @ np.linalg.inv(C[used] @ P @ C[used].T + R[np.ix_(used, used)])
+            z_next, rest = z_next + A @ K @ v[used], np.eye(3) - K @ C[used]
+            P = rest @ P @ rest.T + K @ R[np.ix_(used, used)] @ K.T
+        z, P = z_next, A @ P @ A.T + Q
+        P = 0.5 * (P + P.T)
+        states.append(z)
+    return np.array(states), np.array(rejected)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("groups", [None, [[0, 1]], [[3, 1], [0, 2]], [[0, 1, 2]]])
+@pytest.mark.parametrize("start", [[0.5, 0.0, 0.3], [1.0, 0.6, 0.8]], ids=["near", "far"])
+def test_the_gated_filter_is_the_plain_one(engine, groups, start):
+    gate = qpmhe.Gate(reopen=4, groups=groups)
+    sensors = gate.sensors(4)
+    observer = qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=gate)
+    opened = 0
+    for seed in range(3):
+        _, Y = disturbed(seed)
+        expected, rejected = plain_gated(np.array(start), Y, sensors, 4)
+        run = estimator(pendulum(), observer, start, engine).run(Y)
+        assert run.engine == engine
+        np.testing.assert_array_equal(run.rejected_sensors, rejected)
+        np.testing.assert_allclose(run.observer_states, expected, rtol=1e-7, atol=1e-7)
+        opened += rejected.any()
+    assert opened == 3
+
+
+@pytest.mark.parametrize("make", FILTERS)
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("reopen", [1, 7])
+def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make, engine, reopen):
+    """The estimate is moved away, or the only sensor jumps for good."""
+    A = np.array([[1.0, DT], [0.0, 1.0]])
+    system = qpmhe.System(lambda x: A @ x, lambda x: x[:1], n=2, p=1)
+    observer = make(
+        prior=0.01 * np.eye(2), disturbance=np.diag([1e-6, 1e-4]), noise=[[0.01]],
+        innovation=qpmhe.Gate(reopen=reopen),
+    )
+    rng = np.random.default_rng(4)
+    for start, jump in (([50.0, 0.0], 0.0), ([0.0, 0.0], 50.0)):
+        x, X, Y, begins = np.zeros(2), [], [], 0 if jump == 0.0 else 40
+        for t in range(160):
+            X.append(x + (t >= begins) * np.array([jump, 0.0]))
+            Y.append(X[-1][:1] + 0.1 * rng.standard_normal(1))
+            x = A @ x + np.array([1e-3, 1e-2]) * rng.standard_normal(2)
+        run = estimator(system, observer, start, engine).run(Y)
+        shut = run.rejected_sensors[:, 0]
+        assert shut[begins : begins + reopen].all()
+        assert not shut[begins + reopen]
+        errors = np.abs(run.observer_states[:-1] - X)[:, 0]
+        assert errors[begins + reopen] > 40.0
+        assert errors[begins + reopen + 1] < 15.0
+        assert errors[begins + reopen + 40 :].max() < 0.5
+        assert shut[begins + reopen + 40 :].mean() < 0.03
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_sensors_that_pass_keep_a_faulty_one_shut(engine):
+    A = np.array([[1.0, DT], [0.0, 1.0]])
+    system = qpmhe.System(lambda x: A @ x, lambda x: np.array([x[0], x[0]]), n=2, p=2)
+    observer = qpmhe.ExtendedKalman(
+        prior=0.01 * np.eye(2), disturbance=np.diag([1e-6, 1e-4]), noise=0.01 * np.eye(2),
+        innovation=qpmhe.Gate(reopen=3),
+    )
+    rng = np.random.default_rng(5)
+    Y = 0.1 * rng.standard_normal((75, 2))
+    Y[40:, 0] += 20.0
+    run = estimator(system, observer, [0.0, 0.0], engine).run(Y)
+    # It is let in once, when it has been rejected ten times as often.
+    assert np.flatnonzero(~run.rejected_sensors[40:, 0])[0] == 30
+    assert np.abs(run.observer_states[:71, 0]).max() < 0.3
+    assert run.rejected_sensors[40:70, 1].mean() < 0.1
+    Y[70:, 0] -= 20.0
+    again = estimator(system, observer, [0.0, 0.0], engine).run(Y)
+    assert not again.rejected_sensors[70:, 0].any()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("make", FILTERS)
+def test_all_sensors_gated(make, engine):
+    observer = make(
+        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate(reopen=1000, groups=[[0, 2]])
+    )
+    start = np.array([0.5, 0.0, 0.3])
+    mhe = estimator(pendulum(), observer, start, engine)
+    few = mhe.update([100.0, 0.0, 100.0, np.nan])
+    assert few.rejected_sensors == (0,)
+    assert Status.SENSORS_REJECTED in few.status
+    assert Status.ALL_REJECTED not in few.status
+    z = mhe.observer_state
+    for y in ([50.0, 50.0, 50.0, 50.0], [50.0, np.nan, np.nan, -1e149]):
+        estimate = mhe.update(y)
+        assert Status.SENSORS_REJECTED | Status.ALL_REJECTED in estimate.status
+        np.testing.assert_allclose(mhe.observer_state, f(z), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(estimate.filtered, z, rtol=0, atol=1e-12)
+        z = mhe.observer_state
+        assert "only predicted" in estimate.explain()
+        assert "Rejected sensors: 0, " in estimate.explain()
+    assert estimate.rejected_sensors == (0, 2)
+    run = estimator(pendulum(), observer, start, engine).run([[50.0] * 4] * 3)
+    assert run.rejected_sensors.all()
+    assert run.rejected_sensors.shape == (3, 3)
+    assert run.share(Status.ALL_REJECTED) == 1.0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("make", FILTERS)
+def test_huber_by_hand(make, engine):
+    """P = 1, R = 1: S = 2; v = 4 has nu = 4 / sqrt 2."""
+    system = qpmhe.System(lambda x: 2.0 * x, lambda x: x, n=1, p=1)
+    observer = make(
+        prior=[[1.0]], disturbance=[[0.5]], noise=[[1.0]],
+        innovation=qpmhe.HuberInnovation(threshold=1.345),
+    )
+    mhe = estimator(system, observer, [0.0], engine, horizon=1)
+    weight = 1.345 * math.sqrt(2.0) / 4.0
+    estimate = mhe.update([4.0])
+    assert estimate.filtered[0] == pytest.approx(0.5 * weight * 4.0, rel=1e-12)
+    assert mhe.observer_state[0] == pytest.approx(weight * 4.0, rel=1e-12)
+    P = 4.0 * (1.0 - 0.5 * weight) + 0.5
+    S = P + 1.0  # an innovation below the threshold counts in full
+    z = weight * 4.0
+    estimate = mhe.update([z + math.sqrt(S)])
+    assert estimate.filtered[0] == pytest.approx(z + P / S * math.sqrt(S), rel=1e-12)
+    assert estimate.rejected_sensors == ()
+    assert not estimate.status & (Status.SENSORS_REJECTED | Status.ALL_REJECTED)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_huber_of_several_outputs(engine):
+    """Each output's innovation in its own deviation; the noise grows by what its weight says."""
+    observer = qpmhe.ExtendedKalman(
+        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.HuberInnovation(1.2)
+    )
+    start = np.array([0.5, 0.0, 0.3])
+    y = h(start) + np.array([0.1, -2.0, np.nan, 0.9])
+    mhe = estimator(pendulum(), observer, start, engine)
+    mhe.update(y)
+    C, v, r = h_slope(start)[[0, 1, 3]], np.array([0.1, -2.0, 0.9]), R[np.ix_([0, 1, 3], [0, 1, 3])]
+    variances = np.diag(C @ P0 @ C.T + r)
+    weights = np.minimum(1.0, 1.2 * np.sqrt(variances) / np.abs(v))
+    assert weights[0] == 1.0
+    assert (weights[1:] < 0.7).all()
+    softened = r + np.diag(variances / weights - variances)
+    K = P0 @ C.T @ np.linalg.inv(C @ P0 @ C.T + softened)
+    np.testing.assert_allclose(
+        mhe.observer_state, f(start) + f_slope(start) @ K @ v, rtol=0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("make", FILTERS)
+def test_huber_finds_back_from_a_covariance_that_is_too_small(make, engine):
+    """Without a way back the correction would be less than 2 standard deviations a sample."""
+    system = qpmhe.System(lambda x: x, lambda x: x, n=1, p=1)
+    covariances = {"prior": [[1e-8]], "disturbance": [[1e-10]], "noise": [[1.0]]}
+    rng = np.random.default_rng(6)
+    Y = rng.standard_normal((120, 1))
+    for reopen, settled in ((5, True), (10**6, False)):
+        observer = make(**covariances, innovation=qpmhe.HuberInnovation(reopen=reopen))
+        run = estimator(system, observer, [30.0], engine).run(Y)
+        assert (abs(run.observer_states[-30:, 0]).max() < 1.0) == settled
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("make", FILTERS)
+@pytest.mark.parametrize("innovation", [qpmhe.Gate(reopen=3), qpmhe.HuberInnovation(reopen=3)])
+def test_a_snapshot_in_the_middle_of_a_rejection(make, engine, innovation):
+    observer = make(prior=P0, disturbance=Q, noise=R, innovation=innovation)
+    _, Y = disturbed(7)
+    options = {"engine": engine, "max_qps": 1}
+    mhe = estimator(pendulum(), observer, [1.0, 0.6, 0.8], **options)
+    for t, y in enumerate(Y):
+        if t in (2, 33, 34, 50):
+            state = pickle.loads(pickle.dumps(mhe.state_dict()))
+            other = estimator(pendulum(), observer, [0.0, 0.0, 0.0], **options)
+            other.load_state_dict(state)
+            follow = [other.update(one) for one in Y[t : t + 6]]
+            mine = estimator(pendulum(), observer, [1.0, 0.6, 0.8], **options)
+            for one in Y[:t]:
+                mine.update(one)
+            for found, one in zip(follow, Y[t : t + 6], strict=True):
+                expected = mine.update(one)
+                np.testing.assert_allclose(found.state, expected.state, rtol=1e-9, atol=1e-9)
+                assert found.rejected_sensors == expected.rejected_sensors
+        mhe.update(y)
+
+
+@pytest.mark.parametrize("change", [1, -1, -100])
+def test_counts_that_do_not_follow_are_refused(change):
+    observer = qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate())
+    mhe = estimator(pendulum(), observer, [1.0, 0.6, 0.8])
+    for y in disturbed(7)[1][:5]:
+        mhe.update(y)
+    state = mhe.state_dict()
+    state["window/rejections"][2, 1] += change
+    with pytest.raises(InvalidInputError, match=r"another observer|damaged"):
+        mhe.load_state_dict(state)
+    for other in (None, qpmhe.Gate(reopen=9), qpmhe.HuberInnovation(), qpmhe.Gate(groups=[[0, 1]])):
+        another = estimator(pendulum(), qpmhe.ExtendedKalman(
+            prior=P0, disturbance=Q, noise=R, innovation=other
+        ), [1.0, 0.6, 0.8])
+        with pytest.raises(InvalidInputError, match="observer"):
+            another.load_state_dict(mhe.state_dict())
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("innovation", [qpmhe.Gate(reopen=2), qpmhe.HuberInnovation(reopen=2)])
+def test_a_late_measurement_counts_as_one_in_time(engine, innovation):
+    observer = qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=innovation)
+    _, Y = disturbed(8, missing=0.0)
+    late, timely = (
+        estimator(pendulum(), observer, [1.0, 0.6, 0.8], engine, max_qps=1) for _ in range(2)
+    )
+    for t, y in enumerate(Y[:40]):
+        held = y.copy()
+        if t % 9 == 4:
+            held[1:3] = np.nan
+        late.update(held)
+        expected = timely.update(y)
+        if t % 9 == 7:
+            found = late.amend(t - 3, Y[t - 3])
+            np.testing.assert_allclose(found.candidate, expected.candidate, rtol=1e-9, atol=1e-9)
+            assert found.rejected_sensors == expected.rejected_sensors
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_batch_is_its_members(engine):
+    observer = qpmhe.ExtendedKalman(
+        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate(reopen=2, groups=[[0, 1]])
+    )
+    starts = np.array([[0.5, 0.0, 0.3], [1.0, 0.6, 0.8], [0.0, 0.0, 0.0]])
+    Y = np.array([disturbed(seed, steps=40)[1] for seed in range(3)])
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=qpmhe.ObserverPrior(), disturbance=Q, noise=R
+    )
+
+    def made():
+        return qpmhe.BatchEstimator(
+            pendulum(), observer, cost, members=3, horizon=6, initial_states=starts, max_qps=1,
+            engine=engine,
+        )
+
+    run, stepped = made().run(Y), made()
+    assert run.rejected_sensors.shape == (3, 40, 3)
+    single = [
+        estimator(pendulum(), observer, start, engine, max_qps=1).run(one)
+        for start, one in zip(starts, Y, strict=True)
+    ]
+    for k, one in enumerate(single):
+        np.testing.assert_array_equal(run.rejected_sensors[k], one.rejected_sensors)
+        np.testing.assert_array_equal(run.states[k], one.states)
+    for t in range(12):
+        estimate = stepped.update(Y[:, t])
+        np.testing.assert_array_equal(estimate.rejected_sensors, run.rejected_sensors[:, t])
+    plain = qpmhe.BatchEstimator(
+        pendulum(), qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R), cost, members=3,
+        horizon=6, initial_states=starts, engine=engine,
+    )
+    assert plain.update(Y[:, 0]).rejected_sensors.shape == (3, 0)
+
+
+@pytest.mark.parametrize("make", FILTERS)
+@pytest.mark.parametrize(
+    "innovation", [qpmhe.Gate(), qpmhe.Gate(reopen=1), qpmhe.HuberInnovation()]
+)
+def test_corrections_vanish_with_the_error_and_are_bounded_by_it(make, innovation):
+    """L(z, 0) = 0 and (eq:kappa), whatever the counts."""
+    rng, system = np.random.default_rng(9), pendulum()
+    observer = make(prior=P0, disturbance=Q, noise=R, innovation=innovation)
+    ratios = []
+    for _ in range(300):
+        z, root = rng.standard_normal(3), rng.standard_normal((3, 3))
+        sample = qpmhe.Sample(
+            system, np.zeros(0), f_slope(z), h_slope(z), covariance=root @ root.T * rng.uniform(),
+            rejections=rng.integers(0, 15, 4),
+        )
+        nothing, _ = observer.correct(z, np.zeros(4), sample)
+        assert (nothing == 0.0).all()
+        v = rng.standard_normal(4) * 10.0 ** rng.uniform(-3, 8)
+        correction, covariance = observer.correct(z, v, sample)
+        values = np.linalg.eigvalsh(covariance)
+        assert values[0] > -1e-12 * values[-1]
+        ratios.append(np.linalg.norm(correction) / np.linalg.norm(v))
+    assert max(ratios) < 500.0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("make", FILTERS)
+@pytest.mark.parametrize("innovation", [
+    qpmhe.Gate(reopen=1), qpmhe.Gate(reopen=2, groups=[[0, 1, 2]]), qpmhe.HuberInnovation(reopen=1),
+])
+def test_degenerate_geometry_raises_nothing(make, engine, innovation):
+    """Outputs that are equal, that say nothing, and states that are known exactly."""
+    system = qpmhe.System(
+        lambda x: np.array([x[0] + 0.1 * x[1], x[1]]),
+        lambda x: np.array([x[0], x[0], 0.0 * x[1] + 3.0]), n=2, p=3,
+    )
+    rng = np.random.default_rng(10)
+    for prior in (np.zeros((2, 2)), np.diag([1e-12, 0.0]), np.diag([1e9, 1e-9])):
+        observer = make(
+            prior=prior, disturbance=np.zeros((2, 2)), noise=1e-10 * np.eye(3),
+            innovation=innovation,
+        )
+        cost = qpmhe.QuadraticCost.from_covariances(
+            prior=np.eye(2), disturbance=1e-6 * np.eye(2), noise=np.eye(3)
+        )
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=3, initial_state=[0.0, 0.0], engine=engine, max_qps=1
+        )
+        for t in range(30):
+            y = np.array([5.0, 5.0, 3.0]) + 1e-5 * rng.standard_normal(3)
+            y += (rng.random(3) < 0.2) * 10.0 ** rng.uniform(0, 149, 3)
+            y[rng.random(3) < 0.1] = [np.nan, np.inf, -np.inf][t % 3]
+            estimate = mhe.update(y)
+            assert np.isfinite(estimate.state).all()
+            assert estimate.cost <= estimate.candidate_cost
+
+
+@pytest.mark.parametrize("units", [2.0**30, 2.0**-30, 1e9])
+@pytest.mark.parametrize("innovation", [
+    qpmhe.Gate(reopen=2), qpmhe.Gate(reopen=2, groups=[[0, 2]]), qpmhe.HuberInnovation(reopen=2),
+])
+@pytest.mark.parametrize("make", FILTERS)
+def test_no_unit_matters(make, innovation, units):
+    A, C = np.array([[1.0, 0.1], [-0.1, 0.95]]), np.array([[1.0, 0.0], [0.3, 1.0], [1.0, -1.0]])
+    rng = np.random.default_rng(11)
+    Y = rng.standard_normal((60, 3)) * 0.1
+    Y[20:35, 0] += 5.0
+    found = []
+    for one in (1.0, units):
+        T = np.diag([one, 1.0 / one])
+        D = np.diag([1.0, one, 1.0])
+        a, c = T @ A @ np.linalg.inv(T), D @ C @ np.linalg.inv(T)
+        system = qpmhe.System(lambda x, a=a: a @ x, lambda x, c=c: c @ x, n=2, p=3)
+        observer = make(
+            prior=T @ T * 0.01, disturbance=1e-4 * T @ T, noise=0.01 * D @ D, innovation=innovation
+        )
+        run = estimator(system, observer, T @ [2.0, -2.0]).run(Y @ D)
+        found.append((run.observer_states @ np.linalg.inv(T), run.rejected_sensors))
+    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(found[1][1], found[0][1])
+
+
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: qpmhe.Gate(probability=0.0), "probability is 0.0"),
+    (lambda: qpmhe.Gate(probability=1.0), "probability is 1.0"),
+    (lambda: qpmhe.Gate(probability=-0.5), "probability is -0.5"),
+    (lambda: qpmhe.Gate(probability=np.nan), "probability is nan"),
+    (lambda: qpmhe.Gate(probability="high"), "probability is 'high'"),
+    (lambda: qpmhe.Gate(reopen=0), "reopen is 0"),
+    (lambda: qpmhe.Gate(reopen=2.5), "reopen is 2.5"),
+    (lambda: qpmhe.Gate(groups=3), "groups is 3"),
+    (lambda: qpmhe.Gate(groups=[[]]), "groups is"),
+    (lambda: qpmhe.Gate(groups=[[0, -1]]), "numbers from 0 on"),
+    (lambda: qpmhe.Gate(groups=[[0, 1], [1, 2]]), "one group at most"),
+    (lambda: qpmhe.HuberInnovation(threshold=0.0), "threshold is 0.0"),
+    (lambda: qpmhe.HuberInnovation(threshold=-1.0), "threshold is -1.0"),
+    (lambda: qpmhe.HuberInnovation(threshold=np.inf), "threshold is inf"),
+    (lambda: qpmhe.HuberInnovation(reopen=-3), "reopen is -3"),
+    (lambda: qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=3.0),
+     r"innovation is 3.0; expected qpmhe.Gate\(...\)"),
+    (lambda: qpmhe.UnscentedKalman(prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate),
+     "innovation is"),
+    (lambda: qpmhe.ExtendedKalman(
+        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate(groups=[[0, 4]])
+    ), "groups has the output 4; expected outputs from 0 to 3"),
+])
+def test_what_fits_nothing_is_refused(make, message):
+    with pytest.raises(OptionError, match=message):
+        make()
+
+
+def test_sensors_are_in_the_order_of_their_first_outputs():
+    gate = qpmhe.Gate(groups=[[4, 2], [3, 0]])
+    assert gate.sensors(6) == ((3, 0), (1,), (4, 2), (5,))
+    np.testing.assert_allclose(
+        qpmhe.Gate(groups=[[0, 1, 2]]).limits(4), list(CHI2.values()), rtol=1e-6
+    )
