@@ -14,7 +14,7 @@ def motor(gallery):
 
 @pytest.fixture(scope="module")
 def errors(motor):
-    """Median errors with weights by hand, unseen and again, of an EKF and of those in the picture."""
+    """Median errors by hand, unseen and again, of an EKF and of those in the picture."""
     judge = import_module("gallery.problem").judge
     estimators = import_module("gallery.baselines").estimators
     (problem,) = motor.problems(Path(), True)
