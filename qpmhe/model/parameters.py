@@ -217,10 +217,10 @@ def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
     m = dimension("m", 0 if given["m"] is None else given["m"], 0)
     alone = ", the dimension of x alone: the parameters are added here"
     states, disturbances = given["states"], given["disturbances"]
-    checked_set("states", states, n, alone)
+    hard = checked_set("states", states, n, alone)
     checked_set("disturbances", disturbances, n, alone)
     nominal, moved, bounds, _ = parameters
-    probes = _probes(probe_points(states, n, m), nominal, moved, bounds)
+    probes = _probes(probe_points(hard, n, m), nominal, moved, bounds)
     f, h = _function("f", given["f"], n, m, probes), _function("h", given["h"], p, m, probes)
     change, dt, method = parameters.change(n, m), given["dt"], given["method"]
     output = change.over_leading(h)
