@@ -200,7 +200,7 @@ FAULTS: dict[str, tuple[str, Callable[[str, int], Case], tuple[str, ...]]] = {
         ("battery_cell", "cstr", "vehicle")),
     "sensor in another unit, 1000 times": (
         "gain", lambda model, seed: measured(model, seed, in_thousandths),
-        ("van_der_pol", "cstr", "vehicle")),
+        ("van_der_pol", "cstr", "battery_cell")),
     "input in another unit, a thousandth": (
         "input", lambda model, seed: scaled_input(model, seed, 1e-3),
         ("battery_cell", "cstr", "vehicle")),
