@@ -7,7 +7,10 @@ from qpmhe.codegen.compiler import find_compiler
 
 from .cases import CASES, case
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
+    pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
+]
 
 ARRAYS = (
     "state", "filtered", "trajectory", "candidate", "observer_state", "disturbances", "noises",
