@@ -265,8 +265,7 @@ class KalmanType(Observer):
 
     def _judge(self, prediction: Prediction, noise: Array, v: Array, sample: Sample) -> Verdict:
         """How much the outputs that are there count; see `Innovation.judge`."""
-        if self._innovation is None:
-            return Verdict(None, None, noise, None)
+        assert self._innovation is not None
         observed: Mask | None = sample.observed
         if observed is None:
             observed = np.ones(v.size, np.bool_)

@@ -7,7 +7,7 @@ import numpy as np
 from .._checks import Array
 from .._linalg import solve
 from .base import KalmanType, ObserverForm, Sample
-from .innovation import Prediction, Verdict
+from .innovation import UNJUDGED, Prediction, Verdict
 
 
 class ExtendedKalman(KalmanType):
@@ -89,10 +89,13 @@ class ExtendedKalman(KalmanType):
         r, there = self._noise_of(sample), sample.observed
         if there is not None:
             c, r, v = c[there], r[np.ix_(there, there)], v[there]
+        if self._innovation is None:
+            return c, r, v, UNJUDGED
         cross = covariance @ c.T
         prediction = Prediction(covariance, cross, c @ cross, lambda larger: c @ larger @ c.T)
         verdict = self._judge(prediction, r, v, sample)
-        kept, r = verdict.kept, verdict.noise
+        kept = verdict.kept
+        r = r if verdict.noise is None else verdict.noise
         if kept is None:
             return c, r, v, verdict
         return c[kept], r[np.ix_(kept, kept)], v[kept], verdict

@@ -70,16 +70,20 @@ class Verdict(NamedTuple):
         A larger P; None for the one that it has.
     kept : (q,) bool array or None
         Which of the outputs that are there correct; None for all.
-    noise : (q, q) array
-        Covariance of the noise of all outputs that are there.
+    noise : (q, q) array or None
+        Covariance of the noise of all outputs that are there; None for the one that it has.
     rejections : (s,) int array or None
         For each sensor how often in a row it has failed, this sample included.
     """
 
-    covariance: Array | None
-    kept: Mask | None
-    noise: Array
-    rejections: Counts | None
+    covariance: Array | None = None
+    kept: Mask | None = None
+    noise: Array | None = None
+    rejections: Counts | None = None
+
+
+#: Of an observer without a rule.
+UNJUDGED = Verdict()
 
 
 class Innovation(ABC):
@@ -308,7 +312,7 @@ class Gate(Innovation):
         for part, passed in zip(found.parts, passes, strict=True):
             kept[part] = passed
         larger = found.larger(prediction)
-        return Verdict(larger, None if kept.all() else kept, noise, counts)
+        return Verdict(larger, None if kept.all() else kept, None, counts)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from .._linalg import cholesky, solve
 from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from .base import KalmanType, ObserverForm, Sample
-from .innovation import Innovation, Prediction, Verdict
+from .innovation import UNJUDGED, Innovation, Prediction, Verdict
 
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3
@@ -140,6 +140,8 @@ class UnscentedKalman(KalmanType):
         seen = self._outputs(sigma, sample)
         if there is not None:
             r, v = r[np.ix_(there, there)], v[there]
+        if self._innovation is None:
+            return sigma, seen, r, v, UNJUDGED
 
         def spread_of(larger: Array) -> Array:
             outputs = self._outputs(self._sigma(z, larger, sample), sample)
@@ -148,7 +150,8 @@ class UnscentedKalman(KalmanType):
         cross = (sigma.moves * sigma.roots).T @ seen
         prediction = Prediction(covariance, cross, seen.T @ seen, spread_of)
         verdict = self._judge(prediction, r, v, sample)
-        kept, r = verdict.kept, verdict.noise
+        kept = verdict.kept
+        r = r if verdict.noise is None else verdict.noise
         if verdict.covariance is not None:
             sigma = self._sigma(z, verdict.covariance, sample)
             seen = self._outputs(sigma, sample)
