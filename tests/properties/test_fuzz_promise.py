@@ -7,7 +7,7 @@ from tests.properties import fuzz_promise
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
-@pytest.mark.parametrize("seed", [7, 11])
+@pytest.mark.parametrize("seed", [3, 11])
 def test_no_step_breaks_the_promise(pytestconfig, seed):
     steps = 1000 if pytestconfig.option.all else 200
     counts, faults = fuzz_promise.run(steps, seed)

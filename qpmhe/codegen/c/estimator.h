@@ -394,7 +394,9 @@ typedef struct {
     mhe_real *costs, *candidate_costs;
     int32_t *status, *qps, *iterations;
     mhe_real *observer_states;     /* MHE_NX each */
+#if MHE_SENSORS
     uint8_t *rejected;             /* MHE_SENSORS each */
+#endif
 } mhe_log;
 
 /* Forget all samples and start at x0, or at the nearest point of X. The settings are not copied:
