@@ -143,7 +143,7 @@ def test_the_weight_of_the_prior_in_bounds(n, bounds):
 WRITTEN = [
     "extended", "extended prior", "extended prior bounded", "extended irregular",
     "extended singular", "unscented prior", "unscented irregular", "injection", "smoothed",
-    "steady prior",
+    "steady prior", "gated prior", "unscented gated", "weighted smoothed",
 ]
 
 

@@ -75,7 +75,11 @@ static void run(mhe_workspace *k)
     int32_t *flags = malloc(sizeof *flags * (size_t)count * 3);
     mhe_log log = {out, out + count * MHE_NX, out + 2 * count * MHE_NX, out + 3 * count * MHE_NX,
                    out + (3 * MHE_NX + 1) * count, flags, flags + count, flags + 2 * count,
-                   out + (3 * MHE_NX + 2) * count};
+                   out + (3 * MHE_NX + 2) * count,
+#if MHE_SENSORS
+                   0,
+#endif
+                   };
     const mhe_log nothing = {0};
     for (int silent = 0; silent < 2; silent++) {
         for (int i = 0; i < members; i++)

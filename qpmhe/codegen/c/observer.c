@@ -187,6 +187,8 @@ static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, cons
 #if MHE_X_SET
         share = mhe_draw_inside(mhe_x_set_at(s, stage), stage->z, moves + k * NX,
                                 moves + (NX + k) * NX);
+#else
+        (void)stage;
 #endif
         sigma->roots[k] = 1 / (sqrt((real)2) * s->covariances.spread * share);
     }
