@@ -47,7 +47,7 @@ def model(anchors: Array) -> qpmhe.System:
     def move(x: Array, u: Array) -> Array:
         return np.concatenate((x[..., :2] + u[..., :1] * x[..., 2:], x[..., 2:]), axis=-1)
 
-    def distances(x: Array, u: Array) -> Array:
+    def distances(x: Array) -> Array:
         # Smooth where the tag is at an anchor, to a centimetre.
         level = (x[..., :1] - east) ** 2 + (x[..., 1:2] - north) ** 2
         return np.sqrt(level + above + 1e-4)
