@@ -87,7 +87,7 @@ def problem_of(walk: Walk, quick: bool) -> Problem:
         model(walk.anchors), [record], by_hand,
         lambda x, real: np.hypot(*(x[:, :2] - real).T), "m", 5.0,
         # The filter's own error in the first half: the strongest of the baselines sets the weights.
-        tuning={
+        tuning=None if quick else {
             "objective": "truth", "held_out": 0.0, "observer": gated, "max_qps": 0, "structure": {
                 "disturbance": {"speed": [0, 1]}, "noise": {"range": list(range(p))},
             },
