@@ -40,7 +40,8 @@ def write(folder, anchors=ANCHORS, seconds=20.0, every=0.1, packed=False, silent
 
     times = np.arange(0.0, seconds, 0.125)
     save("trajectory.csv", ["timestamp,x,y,z,heading_degrees", *(
-        f"{BEGAN + round(1e9 * t)},{x},{y},0,0" for t, (x, y) in zip(times, path(times), strict=True)
+        f"{BEGAN + round(1e9 * t)},{x},{y},0,0"
+        for t, (x, y) in zip(times, path(times), strict=True)
     )])
     head = "%time,field.stamp,field.id,field.x,field.y,field.z,field.distanceFromTag,field.rssi"
     for k, (number, (x, y, z)) in enumerate(anchors.items()):

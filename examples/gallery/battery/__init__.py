@@ -1,1 +1,1 @@
-"""How full is a lithium-ion cell, from its voltage and current while a car is driven?"""
+"""How full a lithium-ion cell is, from its voltage and current while a car is driven."""

@@ -3,9 +3,9 @@
 import sys
 
 from ..command import main
-from . import __doc__ as question
+from . import __doc__ as description
 from .cell import draw, problems
 from .measurements import SOURCE
 
 if __name__ == "__main__":
-    sys.exit(main("battery", question, problems, draw, SOURCE))
+    sys.exit(main("battery", str(description), problems, draw, SOURCE))

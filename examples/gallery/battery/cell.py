@@ -23,7 +23,7 @@ from ..baselines import QPS
 from ..command import DataError
 from ..problem import Array, Problem, Record, Result, Way
 from .measurements import drive_cycles, load, resample
-from .model import PRIOR, Cell, constant_gain, robust_cost, robust_kalman, system_of, weights_of
+from .model import Cell, constant_gain, robust_cost, robust_kalman, system_of, weights_of
 
 DT = 2.0  # s
 SHORTEST = 360.0  # s, of a cycle

@@ -1,7 +1,7 @@
 """Identify the cell's open-circuit voltage and its two-RC equivalent circuit.
 
-Run ``python -m examples.gallery.battery.identify --data DIR``. It reads the C/20 test and the HPPC test
-and writes ``samsung_30t.json``; it never sees a drive cycle.
+Run ``python -m examples.gallery.battery.identify --data DIR``. It reads the C/20 test and the HPPC
+test and writes ``samsung_30t.json``; it never sees a drive cycle.
 
 1. OCV(SOC) is the C/20 discharge, plus what the current of 0.15 A takes from it, by the resistances
    found below. Charge is left out: the cell has hysteresis, it rests 10 to 20 mV lower where it was

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 DOI = "10.17632/9xyvy2njj3"
 C20, HPPC = "c20_25degC.mat", "hppc_25degC.mat"
 SOURCE = (
-    "P. Kollmeyer, M. Skells, Samsung INR21700 30T 3Ah Li-ion Battery Data, McMaster University, is "
-    f"at https://doi.org/{DOI}: put the .mat files of the drive cycles into one folder."
+    "P. Kollmeyer, M. Skells, Samsung INR21700 30T 3Ah Li-ion Battery Data, McMaster University, "
+    f"is at https://doi.org/{DOI}: put the .mat files of the drive cycles into one folder."
 )
 _FIELDS = "Time", "Voltage", "Current", "Ah", "Battery_Temp_degC"
 

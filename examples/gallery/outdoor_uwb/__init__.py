@@ -1,1 +1,1 @@
-"""A walker's tag is ranged by anchors outdoors, with few ranges grossly wrong; sight may be blocked."""
+"""Somebody walks outdoors with a tag; anchors that stand close together measure distances to it."""
