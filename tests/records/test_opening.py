@@ -133,7 +133,7 @@ def test_lines_that_end_in_cr(here):
 
 def test_lines_above_the_header(here):
     for above in ("# logger v1\n", "Logger,v1\n\nserial,77\n", "a,b,c,d\n"):
-        assert "Delete lines above the header" in refused(above + SHORT)
+        assert "Skip lines above the header by --skip-lines" in refused(above + SHORT)
     assert "delete it if it is a comment" in refused(SHORT + "# stopped\n")
     code, _, error = process.shell(
         f"printf '# logger\\n0,1,2\\n' | qpmhe estimate {DISCRETE} -"
