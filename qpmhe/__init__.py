@@ -75,6 +75,7 @@ register_engine("compiled", _compiled_engine)
 
 
 def _page(run: Run) -> str:
+    """The run as HTML."""
     from .plots.page import run_page  # late: it needs Matplotlib
 
     return run_page(run)

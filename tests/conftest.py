@@ -8,6 +8,7 @@ names of the cases only, so that the processes of pytest-xdist agree on it.
 
 import hashlib
 import os
+import sys
 from collections import defaultdict
 
 import hypothesis
@@ -104,3 +105,11 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(
             f"{left_out} of {collected} cases left out; --all (make test-all) runs them too"
         )
+
+
+@pytest.fixture(autouse=True)
+def _no_figures_left():
+    """Pyplot keeps the figures that it shows, and warns of too many."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")

@@ -160,11 +160,13 @@ mhe = qpmhe.MovingHorizonEstimator(
     system, observer, cost, horizon=4, initial_state=scenario.initial_estimate)
 run = mhe.run(scenario.simulate(0).measurements[:9])
 run"""
-    cells = [first, "qpmhe.plots.costs(run);"]
+    cells = [first, "qpmhe.plots.costs(run);", "print(1)\nqpmhe.plots.states(run);"]
     notebook = nbformat.v4.new_notebook(cells=list(map(nbformat.v4.new_code_cell, cells)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the client's event loop and sockets
         nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute(cwd=tmp_path)
-    shown = [output["data"] for cell in notebook.cells for output in cell["outputs"]]
+    shown = [output["data"] for cell in notebook.cells for output in cell["outputs"]
+             if "data" in output]
     assert "text/html" in shown[0]
     assert "image/png" in shown[1]
+    assert "image/png" in shown[2]

@@ -118,12 +118,14 @@ class CompiledEngine:
         """Remember this in place of all that was; whole or, if interrupted, not at all."""
         before = self._memory.copy(), self._tools
         self._held = tools, self._tools  # the memory points to a record of these
+        next_check = self._next_check
         try:
-            self._memory[...], self._tools = memory, tools
+            self._next_check = 0 if self._traces else math.inf
+            self._memory[...], self._tools = memory, tools  # last: nothing behind it can fail
         except BaseException:
+            self._next_check = next_check
             self._memory[...], self._tools = before
             raise
-        self._next_check = 0 if self._traces else math.inf
 
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""

@@ -322,6 +322,8 @@ class Stages:
             may_be_irregular and np.isfinite(steps).all() and (steps > 0.0).all()
         )):
             raise ValueError("a step's length is impossible")
+        if not isinstance(state["own"], list):
+            raise TypeError(f"own is {state['own']!r}")
         for when, own in state["own"]:
             when = check_size("a sample's time", when, lambda t: time - length <= t < time)
             self._own[when] = read(own)

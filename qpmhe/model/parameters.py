@@ -219,6 +219,7 @@ def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
     states, disturbances = given["states"], given["disturbances"]
     hard = checked_set("states", states, n, alone)
     checked_set("disturbances", disturbances, n, alone)
+    sets = parameters.sets(states, n, disturbances, n)  # raises for soft ones
     nominal, moved, bounds, _ = parameters
     probes = _probes(probe_points(hard, n, m), nominal, moved, bounds)
     f, h = _function("f", given["f"], n, m, probes), _function("h", given["h"], p, m, probes)
@@ -226,7 +227,7 @@ def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
     output = change.over_leading(h)
     options: Any = {
         "n": change.n, "p": p, "m": change.m, "noises": given["noises"],
-        **parameters.sets(states, n, disturbances, n),
+        **sets,
     }
     if dt is None and method is not None:
         raise OptionError(f"method is {shown(method)}, but dt is missing; give both or neither.")

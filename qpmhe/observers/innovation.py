@@ -367,7 +367,7 @@ class HuberInnovation(Innovation):
         object.__setattr__(self, "reopen", _checked_reopen(self.reopen))
 
     def sensors(self, outputs: int) -> tuple[tuple[int, ...], ...]:
-        """Each output alone."""
+        """Each of the outputs alone."""
         return tuple((output,) for output in range(outputs))
 
     def limits(self, outputs: int) -> Array:

@@ -58,8 +58,9 @@ def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
         # Pyplot shows the figures that it knows: at the end of a notebook's cell, or in windows.
         pyplot = sys.modules.get("matplotlib.pyplot") or _notebooks_pyplot()
         make = Figure if pyplot is None else pyplot.figure
+        # Outside of the context, which would undo what a notebook's first figure sets for all.
+        figure = make(figsize=(6.4, 0.9 + height * count), layout="constrained")
         with rc_context(LIGHT):
-            figure = make(figsize=(6.4, 0.9 + height * count), layout="constrained")
             return list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
     given = list(np.ravel(np.asarray(axes, dtype=object)))
     for one in given:

@@ -178,7 +178,7 @@ BAD_MATRICES = [
     pytest.param([[1.0, 0.5], [0.0, 1.0]], WeightError, ["not symmetric", "by 0.5"],
                  id="asymmetric"),
     pytest.param(np.ones((2, 3)), ShapeError, ["shape (2, 3)", "square"], id="wide"),
-    pytest.param([1.0, 2.0], ShapeError, ["shape (1, 2)", "square"], id="vector"),
+    pytest.param([1.0, 2.0], ShapeError, ["shape (2,)", "np.diag"], id="vector"),
     pytest.param(np.ones((2, 2, 2)), ShapeError, ["shape (2, 2, 2)", "square"], id="cube"),
     pytest.param([[1.0, 0.0], [0.0, math.nan]], InvalidInputError, ["nan", "finite"], id="NaN"),
     pytest.param(math.inf, InvalidInputError, ["inf", "finite"], id="infinite"),

@@ -154,7 +154,7 @@ def test_a_discrete_system_has_one_step():
         (-1.0, WeightError, ["noise_weight has the eigenvalue -1", "positive definite"]),
         (0.0, WeightError, ["noise_weight has the eigenvalue 0", "positive definite"]),
         (math.nan, InvalidInputError, ["noise_weight is nan", "finite"]),
-        ([1.0, 2.0], ShapeError, ["noise_weight has shape (1, 2)", "square"]),
+        ([1.0, 2.0], ShapeError, ["noise_weight has shape (2,)", "np.diag"]),
         ([[1.0, 0.0], [0.0, 1.0]], ShapeError, ["noise_weight has shape (2, 2)", "(1, 1)"]),
         ("heavy", InvalidInputError, ["noise_weight is 'heavy'", "real numbers"]),
         (1j, InvalidInputError, ["noise_weight is 1j", "real numbers"]),

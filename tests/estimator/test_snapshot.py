@@ -188,7 +188,7 @@ def test_another_process_continues_bit_for_bit(tmp_path):
     ("state", "words"),
     [
         ({}, "None"),
-        ({"problem": (2, 1, 0, 7)}, r"\(2, 1, 0, 7\); expected \(2, 1, 0, 6\)"),
+        ({"problem": (2, 1, 0, 7)}, r"2, 1, 0, 7.; expected \(2, 1, 0, 6\)"),
     ],
 )
 def test_a_state_of_another_problem_is_refused(state, words):
