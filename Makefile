@@ -17,7 +17,7 @@ $(VENV)/.%: pyproject.toml
 reproduce: $(VENV)/.solvers
 	$(BIN)/qpmhe reproduce $(ARGS)
 
-# A sample of four minutes on two cores: every test, but not all of its cases.
+# A sample of five minutes on two cores: every test, but not all of its cases.
 test: $(VENV)/.test
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal $(ARGS)
 

@@ -1,4 +1,4 @@
-"""Which tests run: a sample of about three minutes, or everything with ``--all``.
+"""Which tests run: a sample of about five minutes, or everything with ``--all``.
 
 The sample holds every test but those marked ``slow``. Of a test with several cases it holds one
 and a share of the others: first those that bring new values of the parameters, and in `oracles`

@@ -61,6 +61,7 @@ def test_two_qps_improve_on_a_projected_constant_gain(judged, which, gain):
     assert two < alone / 1.5
 
 
+@pytest.mark.slow  # make examples runs it, too
 def test_the_command_writes_both_reactors(gallery, tmp_path):
     pd = pytest.importorskip("pandas")
     subprocess.run(
