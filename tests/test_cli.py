@@ -57,7 +57,7 @@ def test_reproduce_writes_what_it_says(tmp_path: Path, method):
 
 
 def test_reproduction_over_seeds_is_the_mean_of_single_ones():
-    options = {"steps": 6, "backend_name": "banded"}
+    options = {"steps": 20, "backend_name": "banded"}
     one, two, three = (qpmhe.studies.reproduce(seed=k, **options) for k in (4, 5, 6))
     found = qpmhe.studies.reproduce(seed=4, seeds=3, **options)
     for row, *singles in zip(found.rows, one.rows, two.rows, three.rows, strict=True):
