@@ -70,7 +70,7 @@ class Problem:
     error : callable
         error(estimates (T, n), truth (T, k)): the size of each sample's error (T,).
     unit : str
-        That of the error.
+        Unit of the error.
     lost : float
         A run whose root mean square error is larger, or not finite, is lost.
     tuning : dict, optional

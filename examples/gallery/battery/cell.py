@@ -101,7 +101,7 @@ TUNING: dict[str, Any] = {
 
 
 def error(estimates: Array, soc: Array) -> Array:
-    """That of the SOC in percentage points; every estimate is shown within 0 and 1."""
+    """Error of the SOC in percentage points; every estimate is cut to between 0 and 1."""
     return 100.0 * np.abs(np.clip(estimates[:, 0], 0.0, 1.0) - soc[:, 0])
 
 

@@ -31,7 +31,7 @@ class Bank:
 
     A loss that redescends has many minima: where most signals of the first seconds are reflected,
     an estimator stays near a wrong one for a window. The minimum with the least cost is found from
-    several starts, and the cost that is least is that of the trajectory with the most signals in
+    several starts, and the least cost belongs to the trajectory with the most signals in
     agreement. At each sample the estimate is the one with the least cost so far.
 
     Parameters
