@@ -10,7 +10,8 @@ voltage over the step, disturbances on all four states:
 
 m_j = tau_j (1 - a_j) / dt makes y the mean over a step of constant current, so that samples may be
 means over some seconds. The factor rho follows the cell's temperature and age: all its resistances
-fall by 1 to 2 % per kelvin. It is a random walk, because the records are all at 25 degC and do not show how.
+fall by 1 to 2 % per kelvin. It is a random walk, because all records
+are at 25 degC and do not show how.
 """
 
 import json
