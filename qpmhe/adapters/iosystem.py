@@ -41,8 +41,8 @@ def to_iosystem(
         state but the one it is in, resets it with that state as the initial estimate. Use it
         nowhere else meanwhile.
     dt : float, optional
-        Sampling time. The default is that of a system made by `System.from_ode`, and an
-        unspecified one for others.
+        Sampling time. The default is the system's own where `System.from_ode` made it, and
+        unspecified for others.
     name : str
         Name of the block.
     measurement_labels, control_labels, estimate_labels : str or sequence of str

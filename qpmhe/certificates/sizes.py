@@ -181,7 +181,7 @@ def corners_of(name: str, given: ConvexSet, size: int) -> Array:
 
 
 def lengths_of(name: str, given: Array | ConvexSet, size: int, weight: Array) -> Array:
-    """|s|_W at most, always () or at each sample (T,); of a set, that of the box around it."""
+    """The largest |s|_W, always () or at each sample (T,); a set counts as the box around it."""
     if isinstance(given, ConvexSet):
         corners = corners_of(name, given, size)
         if len(corners):
