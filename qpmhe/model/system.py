@@ -289,14 +289,19 @@ class System:
         ----------
         rate : callable
             f_c(x) or f_c(x, u), in units of x per unit of time.
-        h, n, p, m, h_jacobian, **options
-            As for `System`.
+        h : callable
+            Output h(x) or h(x, u), as for `System`.
         dt : float
             Sampling time, in the time unit of the rate.
+        n, p, m : int
+            Numbers of states (entries of x), of outputs (entries of y) and of inputs (entries
+            of u; 0 for a system without inputs).
         method : {"rk4", "euler"}
             Runge-Kutta of order 4, or one explicit Euler step.
         rate_jacobian : callable, optional
             Derivative of the rate with respect to x, (n, n).
+        h_jacobian, **options
+            As for `System`.
 
         Raises
         ------
