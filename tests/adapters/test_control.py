@@ -1,13 +1,13 @@
-"""Systems of python-control beside the same ones written with NumPy."""
+"""What only python-control's systems have: linear ones, sampling, dependence on time."""
 
 import pickle
-import sys
 
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
 import qpmhe
+from adapters.twins import same
 from qpmhe import System, from_control
 from qpmhe.errors import InvalidInputError, ModelError, OptionError
 
@@ -27,15 +27,6 @@ def angle(t, x, u, params):
     return np.array([x[0]])
 
 
-def same(one, other, x=POINTS, u=INPUTS, tolerance=1e-12):
-    for name in ("f", "h", "f_jacobian", "h_jacobian"):
-        mine, theirs = getattr(one, name), getattr(other, name)
-        np.testing.assert_allclose(
-            mine.batch(x, u), theirs.batch(x, u), rtol=tolerance, atol=tolerance, err_msg=name
-        )
-        np.testing.assert_allclose(mine(x[0], u[0]), theirs(x[0], u[0]), atol=tolerance)
-
-
 def linear(a, b):
     return System(
         lambda x, u: x @ a.T + u @ b.T, lambda x, u: x @ C.T + u @ D.T, n=2, p=1, m=1
@@ -44,7 +35,7 @@ def linear(a, b):
 
 def test_a_linear_system_in_continuous_time_is_sampled_exactly():
     ad, bd, *_ = cont2discrete((A, B, C, D), 0.1, "zoh")
-    same(from_control(control.ss(A, B, C, D), dt=0.1), linear(ad, bd))
+    same(from_control(control.ss(A, B, C, D), dt=0.1), linear(ad, bd), POINTS, INPUTS)
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
@@ -53,23 +44,12 @@ def test_a_linear_system_is_discretised_like_any_rate(method):
         lambda x, u: x @ A.T + u @ B.T, lambda x, u: x @ C.T + u @ D.T, dt=0.1, n=2, p=1, m=1,
         method=method,
     )
-    same(from_control(control.ss(A, B, C, D), dt=0.1, method=method), plain)
+    same(from_control(control.ss(A, B, C, D), dt=0.1, method=method), plain, POINTS, INPUTS)
 
 
 @pytest.mark.parametrize("dt", [True, 0.1])
 def test_a_linear_system_in_discrete_time_is_taken_as_it_is(dt):
-    same(from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B))
-
-
-def test_a_nonlinear_system_is_discretised():
-    theirs = control.NonlinearIOSystem(swing, angle, inputs=1, outputs=1, states=2)
-    plain = System.from_ode(
-        lambda x, u: np.stack(
-            (x[..., 1], -np.sin(x[..., 0]) - 0.1 * x[..., 1] + u[..., 0]), axis=-1
-        ),
-        lambda x, u: x[..., :1], dt=0.05, n=2, p=1, m=1,
-    )
-    same(from_control(theirs, dt=0.05), plain, tolerance=1e-8)
+    same(from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B), POINTS, INPUTS)
 
 
 def test_a_nonlinear_system_in_discrete_time_without_inputs():
@@ -87,7 +67,7 @@ def test_an_estimator_runs_on_it_and_it_pickles():
         control.ss(A, B, C, 0), dt=0.1, states=qpmhe.Box([-5, -5], [5, 5])
     )
     copy = pickle.loads(pickle.dumps(system))
-    same(copy, system)
+    same(copy, system, POINTS, INPUTS)
     assert repr(copy.states) == repr(system.states)
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([0.3, 0.2]),
@@ -172,9 +152,3 @@ def test_a_map_is_asked_at_its_own_times_only():
 
     theirs = control.NonlinearIOSystem(update, angle, inputs=1, outputs=1, states=2, dt=True)
     assert from_control(theirs).n == 2
-
-
-def test_without_python_control_there_is_a_remedy(monkeypatch):
-    monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(InvalidInputError, match=r"pip install 'qpmhe\[control\]'"):
-        from_control(object())

@@ -1,40 +1,17 @@
-"""Systems of SymPy expressions beside the same ones written with NumPy."""
+"""What only SymPy's models have: symbols, matrices, functions of time, special functions."""
 
 import pickle
-import sys
 
 import numpy as np
 import pytest
 
+from adapters.twins import same
 from qpmhe import System, from_sympy
-from qpmhe.errors import InvalidInputError, ModelError
-from qpmhe.models.batch_reactor import batch_reactor
+from qpmhe.errors import ModelError
 
 sympy = pytest.importorskip("sympy")
 X = sympy.symbols("x1 x2")
 POINTS = np.random.default_rng(0).uniform(0.5, 3.0, (6, 2))
-
-
-def same(one, other, u, tolerance=1e-12):
-    for name in ("f", "h", "f_jacobian", "h_jacobian"):
-        mine, theirs = getattr(one, name), getattr(other, name)
-        np.testing.assert_allclose(
-            mine.batch(POINTS, u), theirs.batch(POINTS, u), rtol=tolerance, err_msg=name,
-            atol=tolerance,
-        )
-        np.testing.assert_allclose(mine(POINTS[0], u[0]), theirs(POINTS[0], u[0]), atol=tolerance)
-
-
-@pytest.mark.parametrize("method", ["euler", "rk4"])
-def test_the_reactor_is_the_reactor(method):
-    reaction = sympy.Rational(16, 100) * X[0] ** 2 - sympy.Rational(64, 100) * X[1]
-    system = from_sympy(
-        [-2 * reaction, reaction], X[0] + X[1], X, dt=0.1, method=method
-    )
-    plain = batch_reactor(method).system
-    same(system, plain, np.empty((6, 0)))
-    assert (system.f_jacobian.method, system.h_jacobian.method) == ("given", "given")
-    same(pickle.loads(pickle.dumps(system)), plain, np.empty((6, 0)))
 
 
 def test_discrete_time_inputs_and_constants():
@@ -48,13 +25,7 @@ def test_discrete_time_inputs_and_constants():
         ),
         lambda x, u: np.stack((x[..., 1], x[..., 0] * u[..., 0]), axis=-1), n=2, p=2, m=1,
     )
-    same(system, plain, np.random.default_rng(2).standard_normal((6, 1)), 1e-7)
-
-
-def test_one_state():
-    x = sympy.Symbol("x")
-    system = from_sympy([x**2 / 2], [x], [x])
-    assert system.f_jacobian.batch(np.array([[3.0]]), np.empty((1, 0))).tolist() == [[[3.0]]]
+    same(system, plain, POINTS, np.random.default_rng(2).standard_normal((6, 1)), 1e-7)
 
 
 @pytest.mark.parametrize(
@@ -122,6 +93,7 @@ def test_one_symbol_needs_no_list():
     system = from_sympy(a * u, a, a, u)
     assert (system.n, system.m, system.p) == (1, 1, 1)
     assert system.f(np.array([3.0]), np.array([2.0])).tolist() == [6.0]
+    assert (system.f_jacobian.method, system.h_jacobian.method) == ("given", "given")
 
 
 @pytest.mark.parametrize("x", [sympy.Matrix(X), sympy.Matrix([X]), sympy.MatrixSymbol("x", 2, 1)])
@@ -141,8 +113,8 @@ def test_states_may_be_functions_of_time():
         lambda x, u: x[..., :1], dt=0.1, n=2, p=1, m=1,
     )
     inputs = np.random.default_rng(3).standard_normal((6, 1))
-    same(system, plain, inputs, 1e-7)
-    same(pickle.loads(pickle.dumps(system)), plain, inputs, 1e-7)
+    same(system, plain, POINTS, inputs, 1e-7)
+    same(pickle.loads(pickle.dumps(system)), plain, POINTS, inputs, 1e-7)
     with pytest.raises(ModelError, match=r"Derivative\(q\(t\), t\).*solve the equations"):
         from_sympy([speed], [q], [q])
     with pytest.raises(ModelError, match=r"f contains t, .*on time an input"):
@@ -166,9 +138,3 @@ def test_special_functions_are_those_of_scipy():
     )
     # Below -1/e Lambert's W is complex: no value, rather than its real part.
     assert np.isnan(system.h.batch(-x, nothing)[1, 1])
-
-
-def test_without_sympy_there_is_a_remedy(monkeypatch):
-    monkeypatch.setitem(sys.modules, "sympy", None)
-    with pytest.raises(InvalidInputError, match=r"pip install 'qpmhe\[sympy\]'"):
-        from_sympy([X[0]], [X[0]], [X[0]])
