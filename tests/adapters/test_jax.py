@@ -58,6 +58,32 @@ def test_functions_that_do_not_see_the_input():
     np.testing.assert_array_equal(system.h(np.array([3.0]), np.array([8.0])), [11.0])
 
 
+def network(xp, x):
+    """Thousands of operations at a state."""
+    weights = np.random.default_rng(1).standard_normal((24, 30)) / 5.0
+    hidden = xp.tanh(xp.tanh(x @ weights[:, :6].T) @ weights[:, 6:].T)
+    return 0.9 * x + hidden @ weights[:, :6]
+
+
+def chain(xp, x):
+    """Many states, few operations at each."""
+    return 0.9 * x + 0.1 * x**2 * xp.roll(x, 1, axis=-1)
+
+
+@pytest.mark.parametrize(("model", "n"), [(network, 6), (chain, 12)])
+def test_large_models_over_a_long_window(model, n):
+    systems = (
+        from_jax(lambda x: model(jnp, x), lambda x: x[:2], n=n, p=2),
+        qpmhe.System(lambda x: model(np, x), lambda x: x[..., :2], n=n, p=2),
+    )
+    xs = 0.5 * np.random.default_rng(2).standard_normal((40, n))
+    same(*systems, xs, np.empty((40, 0)), 1e-11)
+    both = [estimator(one, horizon=20, gain=0.01, max_qps=2) for one in systems]
+    for y in xs[:, :2]:
+        one, two = (mhe.update(y) for mhe in both)
+        np.testing.assert_allclose(one.trajectory, two.trajectory, rtol=1e-8, atol=1e-9)
+
+
 # Precision
 
 
