@@ -1,40 +1,33 @@
-"""The compiled step against the Python one, where no inequality is active."""
+"""The compiled step beside the Python one, on data and models that the table of cases lacks."""
 
+import copy
 import functools
 import math
-import subprocess
-import sys
-from typing import Any, NamedTuple
+import pickle
 
 import numpy as np
 import pytest
+from oracles.systems import SYSTEMS, around, reactor
 
 import qpmhe
+from qpmhe import Box, Polytope, Status
 from qpmhe.codegen.compiler import find_compiler
-from qpmhe.models.batch_reactor import batch_reactor
-from qpmhe.models.batch_reactor import casadi_output as reactor_output
-from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
-from qpmhe.models.chain import casadi_output, casadi_rate, chain_of_masses
-from tests.codegen.test_agreement import agree
-
-from .plain import spd
+from qpmhe.errors import InvalidInputError, ShapeError, WeightError
+from tests.codegen.cases import Case, case, recorded, spd
+from tests.codegen.test_agreement import ARRAYS, agree
 
 casadi = pytest.importorskip("casadi")
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
-
-STEPS = 30
-
-
-class Model(NamedTuple):
-    """A system with all that an estimator of it needs, and a record."""
-
-    system: qpmhe.System
-    observer: Any
-    cost: qpmhe.QuadraticCost
-    start: np.ndarray
-    Y: np.ndarray
-    U: np.ndarray | None
-    horizon: int
+pytestmark = [
+    pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
+    pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
+]
+ENGINES, STEPS, INF, NAN = ("python", "compiled"), 24, np.inf, np.nan
+both_engines = pytest.mark.parametrize("engine", ENGINES)
+WAYS = [
+    {"max_qps": 0}, {"max_qps": 3, "delay": 1}, {"max_qps": None, "warm_start": True},
+    {"max_qps": 1, "candidate": "reinitialized", "warm_start": True},
+    {"max_qps": None, "backend": "banded", "tolerance": 1e-3, "candidate": "reinitialized"},
+]
 
 
 def system_of(f, h, **options):
@@ -42,65 +35,32 @@ def system_of(f, h, **options):
     return qpmhe.from_casadi(f, h, compiled=False, **options)
 
 
-def weights_of(seed, n, p):
-    generator = np.random.default_rng(seed)
-    return {"prior": spd(generator, n), "disturbance": 10 * spd(generator, n),
-            "noise": spd(generator, p)}
-
-
-def model_of(system, gain, start, horizon, seed=3, noise=0.1):
-    """A model with weights that are not diagonal, and a record of it."""
-    n, p, m = system.n, system.p, system.m
-    generator = np.random.default_rng(seed)
-    cost = qpmhe.QuadraticCost(**weights_of(seed, n, p))
-    start = np.array(start, float)
-    x, Y = start + 0.2 * generator.standard_normal(n), []
-    U = generator.uniform(-1.0, 1.0, (STEPS, m))
-    for u in U:
-        Y.append(system.h(x, u) + noise * generator.standard_normal(p))
-        x = system.f(x, u) + 0.02 * generator.standard_normal(n)
-    return Model(
-        system, qpmhe.Luenberger(gain), cost, start, np.array(Y), U if m else None, horizon
+def case_of(system, observer, start, horizon=4, **options):
+    """A case with weights that are not diagonal, and a record of it."""
+    cost = qpmhe.QuadraticCost(
+        prior=spd(1, system.n), disturbance=10 * spd(2, system.n), noise=spd(3, system.p)
     )
-
-
-def reactor(method):
-    _, observer, cost, scenario = batch_reactor(method)
-    system = system_of(reactor_rate, reactor_output, n=2, dt=scenario.dt, method=method)
-    Y = scenario.simulate(1, STEPS).measurements
-    return Model(system, observer, cost, scenario.initial_estimate, Y, None, 10)
-
-
-def chain():
-    _, observer, cost, scenario = chain_of_masses(2, 2)
-    system = system_of(casadi_rate(2, 2), casadi_output(2, 2), n=8, dt=scenario.dt)
-    Y = scenario.simulate(1, STEPS).measurements
-    return Model(system, observer, cost, scenario.initial_estimate, Y, None, 5)
-
-
-def with_inputs():
-    def f(x, u):
-        return [0.9 * x[0] + 0.2 * casadi.sin(x[1]) + 0.1 * u[0],
-                0.8 * x[1] - 0.1 * x[0] ** 2 + 0.1 * u[0] * u[1]]
-
-    system = system_of(f, lambda x, u: x[0] + 0.3 * u[1] * x[1], n=2, m=2)
-    return model_of(system, [[0.2], [0.1]], [0.5, 0.5], 5)
+    if not isinstance(observer, qpmhe.Observer):
+        observer = qpmhe.Luenberger(observer)
+    return Case(
+        system, observer, cost, np.array(start, float), recorded(system, start),
+        {"horizon": horizon, "max_qps": 2} | options,
+    )
 
 
 def wide():
     """More outputs than states."""
-    system = system_of(
+    return case_of(system_of(
         lambda x: [x[0] + 0.1 * x[1], 0.9 * x[1] - 0.3 * casadi.sin(x[0])],
         lambda x: [x[0], casadi.sin(x[0]) + x[1], x[0] * x[1]], n=2,
-    )
-    return model_of(system, [[0.1, 0.0, 0.05], [0.0, 0.1, 0.0]], [1.0, 0.5], 4)
+    ), [[0.1, 0.0, 0.05], [0.0, 0.1, 0.0]], [1.0, 0.5])
 
 
-def scalar():
+def scalar(**options):
     system = system_of(
         lambda x: 0.9 * x + 0.2 * casadi.sin(x), lambda x: [x[0] + 0.1 * x[0] ** 2, -x[0]], n=1
     )
-    return model_of(system, [[0.2, -0.1]], [0.7], 3)
+    return case_of(system, [[0.2, -0.1]], [0.7], 3, **options)
 
 
 def three():
@@ -108,208 +68,471 @@ def three():
         return [4.0 * (x[1] - x[0]), x[0] * (2.0 - x[2]) - x[1], x[0] * x[1] - x[2]]
 
     system = system_of(rate, lambda x: [x[0] + x[2], x[1]], n=3, dt=0.05, method="euler")
-    return model_of(system, [[0.1, 0.0], [0.0, 0.1], [0.05, 0.0]], [1.0, 1.0, 0.5], 4)
+    return case_of(system, [[0.1, 0.0], [0.0, 0.1], [0.05, 0.0]], [1.0, 1.0, 0.5])
 
 
 def large(n):
     generator = np.random.default_rng(n)
     A = 0.9 * np.eye(n) + 0.1 * generator.standard_normal((n, n)) / math.sqrt(n)
     C = generator.standard_normal((3, n))
-    system = system_of(
+    return case_of(system_of(
         lambda x: casadi.mtimes(casadi.DM(A), x) + 0.05 * casadi.sin(x),
         lambda x: casadi.mtimes(casadi.DM(C), x), n=n,
+    ), 0.02 * C.T, np.ones(n), 2)
+
+
+def high_gain(method, sampling):
+    system = system_of(
+        lambda x: [x[1], -casadi.sin(x[0]) - 0.1 * x[1]], lambda x: x[0], n=2, dt=0.1,
+        method=method,
     )
-    return model_of(system, 0.02 * C.T, np.ones(n), 2)
+    return case_of(system, qpmhe.HighGain(2, epsilon=0.2, dt=0.1, sampling=sampling), [0.5, 0.0])
 
 
 MODELS = {
-    "reactor euler": lambda: reactor("euler"), "reactor rk4": lambda: reactor("rk4"),
-    "chain": chain, "inputs": with_inputs, "wide": wide, "n=1": scalar, "n=3": three,
+    "wide": wide, "n=1": scalar, "n=3": three, "reactor": lambda: case("reactor"),
     # Where the rows of the factorisation's panels change their padding.
     "n=23": lambda: large(23), "n=25": lambda: large(25),
+    **{f"N={k}": lambda k=k: case("inputs").with_options(horizon=k) for k in (1, 2, 12)},
+    "high gain, euler": lambda: high_gain("euler", "euler"),
+    "high gain, rk4": lambda: high_gain("rk4", "exact"),
+    # Components that do not depend on the state, and an output that depends on none.
+    "no slopes": lambda: case_of(system_of(
+        lambda x, u: [u[0], 0.5], lambda x, u: 2.0 * u[0], n=2, m=1
+    ), [[0.1], [0.1]], [0.5, 0.5]),
 }
 
 
 @functools.cache
 def made(name):
-    return MODELS[name]()
+    return (MODELS | FRAGILE)[name]()
 
 
-def estimator(model, engine="compiled", cost=None, observer=None, **options):
-    return qpmhe.MovingHorizonEstimator(
-        model.system, observer or model.observer, cost or model.cost,
-        **({"horizon": model.horizon, "initial_state": model.start, "engine": engine,
-            "max_qps": 2} | options),
-    )
-
-
-def both(model, **options):
-    """The Python estimator and the compiled one."""
-    pair = estimator(model, "python", **options), estimator(model, **options)
-    assert [one.engine for one in pair] == ["python", "compiled"]
+def both(one, **options):
+    pair = [one.estimator(engine, **options) for engine in ENGINES]
+    assert tuple(mhe.engine for mhe in pair) == ENGINES
     return pair
 
 
-def input_at(model, t):
-    return () if model.U is None else (model.U[t % STEPS],)
+def spoilt(one, generator, share=0.3):
+    """The samples with components that are missing in all sorts of ways, weights and steps."""
+    samples = []
+    for t, sample in enumerate(one.samples):
+        y = np.array(sample["y"], float)
+        for j in np.flatnonzero(generator.random(y.size) < share):
+            y[j] = generator.choice([NAN, INF, -INF, 1e200, -1e160])
+        own = {}
+        if t % 3 == 1:
+            own["noise_weight"] = 10.0 ** generator.uniform(-2, 2) * spd(t, y.size)
+        if one.system.dt and t % 7 in (0, 1, 4):
+            own["dt"] = one.system.dt * generator.uniform(0.2, 2.0)
+        samples.append(sample | {"y": None if t % 11 == 7 else y} | own)
+    return samples
 
 
-def close(expected, found, tolerance=1e-10):
-    """Equality up to rounding of all that two estimates of a window say."""
-    agree(expected, found, tolerance)
+def late(one, t, generator):
+    """A sample of the window whose measurement comes now: whole, in part, or once more."""
+    first = max(0, t + 1 - one.options["horizon"])
+    when = first if t % 4 == 0 else int(generator.integers(first, t + 1))
+    y = np.array(one.samples[when]["y"]) + 0.1 * generator.standard_normal(one.system.p)
+    y[generator.random(y.size) < 0.3] = generator.choice([NAN, INF, 1e170])
+    return when, y
 
 
-def follow(model, pair, steps=STEPS, tolerance=1e-10):
-    """Give both the record, and compare each step; the estimates of the second."""
-    estimates = []
-    for t in range(steps):
-        expected, found = (one.update(model.Y[t], *input_at(model, t)) for one in pair)
-        close(expected, found, tolerance)
-        estimates.append(found)
-    return estimates
+def equal(one, other):
+    """Equality of two estimates to the last bit."""
+    for name in (*ARRAYS, "cost", "candidate_cost"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    assert (one.status, one.qps, one.solver_iterations, one.dropped, one.time) == (
+        other.status, other.qps, other.solver_iterations, other.dropped, other.time
+    )
 
 
-OPTIONS = {
-    "observer": {"max_qps": 0},
-    "1 qp": {"max_qps": 1},
-    "3 qps": {"max_qps": 3, "delay": 1},
-    "converged": {"max_qps": None, "delay": 2},
-    "best": {"max_qps": 1, "warm_start": True},
-    "best converged": {"max_qps": None, "warm_start": True},
-    "reinitialized": {"candidate": "reinitialized"},
-    "reinitialized best": {"candidate": "reinitialized", "warm_start": True},
-    "loose": {"max_qps": None, "tolerance": 1e-3},
-    "banded": {"backend": "banded"},
-}
+def loaded(mhe, fresh):
+    fresh.load_state_dict(pickle.loads(pickle.dumps(mhe.state_dict())))
+    return fresh
 
 
-@pytest.mark.parametrize("options", OPTIONS)
 @pytest.mark.parametrize("name", MODELS)
-def test_the_same_estimates(name, options):
-    model = made(name)
-    estimates = follow(model, both(model, **OPTIONS[options]))
-    improved = sum(e.improved for e in estimates)
-    assert improved == 0 if options == "observer" else improved > STEPS / 2
+def test_the_same_estimates_whatever_comes(name):
+    """And copies of an estimator, however they are made, go on to the last bit."""
+    one = made(name)
+    for k, way in enumerate(WAYS):
+        generator, (reference, compiled), copies = np.random.default_rng(k), both(one, **way), []
+        for t, sample in enumerate(spoilt(one, generator)):
+            found = compiled.update(**sample)
+            agree(reference.update(**sample), found, 1e-9)
+            assert (Status.MISSING in found.status) == np.isnan(found.noises[-1]).any()
+            for other in copies:
+                equal(other.update(**sample), found)
+            for _ in range(int(generator.integers(0, 3))):
+                when, y = late(one, t, generator)
+                found = compiled.amend(when, y)
+                agree(reference.amend(when, y), found, 1e-9)
+                for other in copies:
+                    equal(other.amend(when, y), found)
+            if t == 3 * k + 1:
+                fresh = one.estimator("compiled", **way)
+                fresh.update(**one.samples[0])
+                copies = [
+                    loaded(compiled, fresh), pickle.loads(pickle.dumps(compiled)),
+                    copy.deepcopy(compiled),
+                ]
+        expected = reference.covariances()
+        for mhe in (compiled, *copies):
+            np.testing.assert_allclose(
+                mhe.covariances(), expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max()
+            )
+            assert (mhe.engine, mhe.time) == ("compiled", STEPS)
 
 
-@pytest.mark.parametrize("discount", [0.5, 0.9])
-@pytest.mark.parametrize("name", ["reactor euler", "wide", "n=3", "inputs"])
-def test_discounts(name, discount):
-    model = made(name)
-    weights = {name: getattr(model.cost, name) for name in ("prior", "disturbance", "noise")}
-    cost = qpmhe.QuadraticCost(**weights, discount=discount)
-    for options in ({"max_qps": 0}, {"max_qps": 3}, {"warm_start": True, "max_qps": None}):
-        follow(model, both(model, cost=cost, **options))
+def test_measurements_in_other_forms():
+    for y in ([1.0, None, 0.5], (None, None, None), np.ma.array([1.0, 2.0, 0.5], mask=[0, 1, 1]),
+              [1, 2, 3], np.array([1, 2, 3], np.float32), np.arange(6.0)[::2]):
+        agree(*(mhe.update(y) for mhe in both(made("wide"))), 1e-10)
 
 
 def test_a_discount_that_underflows_within_the_window():
     """The oldest stages then weigh nothing: no reason for the factorisation to fail."""
-    system = system_of(lambda x: 0.9 * x, lambda x: x + 0.1 * x**3, n=1)
+    system, estimates = system_of(lambda x: 0.9 * x, lambda x: x + 0.1 * x**3, n=1), []
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=5.0, noise=5.0, discount=0.01)
-    estimates = {}
-    ys = 0.3 + 0.1 * np.sin(np.arange(200.0))
     for horizon in (20, 190):
         mhe = qpmhe.MovingHorizonEstimator(
             system, qpmhe.Luenberger([0.3]), cost, horizon=horizon, initial_state=[0.5],
             max_qps=3, engine="compiled",
         )
-        estimates[horizon] = [mhe.update(y) for y in ys]
+        estimates.append([mhe.update(y) for y in 0.3 + 0.1 * np.sin(np.arange(200.0))])
     assert 0.01**190 == 0
-    for short, long in zip(*estimates.values(), strict=True):
-        assert qpmhe.Status.SOLVER_FAILED not in long.status
+    for short, long in zip(*estimates, strict=True):
+        assert Status.SOLVER_FAILED not in long.status
         # What is 20 samples old weighs 1e-40.
         np.testing.assert_allclose(long.state, short.state, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "horizon"),
-    [("reactor rk4", 1), ("reactor rk4", 2), ("inputs", 1), ("inputs", 2), ("inputs", 12)],
-)
-def test_horizons(name, horizon):
-    model = made(name)
-    for options in (
-        {"delay": 1}, {"delay": horizon, "warm_start": True}, {"candidate": "reinitialized"},
-    ):
-        estimates = follow(model, both(model, horizon=horizon, **options))
-        assert len(estimates[-1].trajectory) == horizon + 1
+def test_wrong_arguments_change_nothing():
+    one = case("inputs")
+    y, u = one.samples[0].values()
+    spoilt_one, twin = (one.estimator("compiled") for _ in range(2))
+    for t, sample in enumerate(one.samples[:7]):
+        for error, call in (
+            (ShapeError, lambda m: m.update([1.0], u)), (ShapeError, lambda m: m.update(y, [0.0])),
+            (InvalidInputError, lambda m: m.update(y)),
+            (InvalidInputError, lambda m: m.update(y, u, dt=0.1)),
+            (WeightError, lambda m: m.update(y, u, noise_weight=-np.eye(2))),
+            (InvalidInputError, lambda m: m.amend(99, y)),
+            (ShapeError, lambda m: m.run(np.zeros((5, 2)), np.zeros((4, 2)))),
+        ):
+            with pytest.raises(error):
+                call(spoilt_one)
+        assert spoilt_one.time == t
+        equal(spoilt_one.update(**sample), twin.update(**sample))
 
 
-@pytest.mark.parametrize("name", ["reactor euler", "wide", "n=3"])
-def test_steady_state_kalman(name):
-    model = made(name)
-    n, p = model.system.n, model.system.p
-    observer = qpmhe.SteadyStateKalman(
-        model.system, model.start, disturbance=0.01 * np.eye(n), noise=0.1 * np.eye(p)
+# Models that are not finite everywhere, with outliers that drive the observer there.
+
+
+def logarithm():
+    return case_of(system_of(
+        lambda x: [0.8 * x[0] + 0.2 * casadi.log(x[1] + 1.0), 0.9 * x[1] + 0.1 * x[0]],
+        lambda x: x[0], n=2,
+    ), [[0.1], [0.2]], [1.0, 1.0], 5, delay=1)
+
+
+def roots():
+    def f(x):
+        upper, lower = 0.4 * casadi.sqrt(x[0]), 0.4 * casadi.sqrt(x[1])
+        return [x[0] + 0.1 * (0.4 - upper), x[1] + 0.1 * (upper - lower)]
+
+    system = system_of(f, lambda x: casadi.sqrt(x[1]), n=2)
+    return case_of(system, [[0.1], [0.2]], [1.0, 1.5], 2)
+
+
+def quotient():
+    """Not finite in one output alone, for some of the inputs."""
+    one = case_of(system_of(
+        lambda x, u: [0.9 * x[0] + 0.1 * u[0], 0.8 * x[1] + 0.1],
+        lambda x, u: [x[0] + x[1], 1.0 / (x[0] * u[0])], n=2, m=1,
+    ), [[0.1, 0.0], [0.1, 0.0]], [1.0, 0.5], 1)
+    for t, sample in enumerate(one.samples):
+        sample["u"] = [{3: 0.0, 4: NAN, 9: INF, 10: 1e-320}.get(t % 12, 1.0)]
+        sample["y"] = np.array([0.6, NAN if t % 5 == 0 else 2.0])
+    return one
+
+
+FRAGILE = {"logarithm": logarithm, "roots": roots, "quotient": quotient}
+
+
+@pytest.mark.parametrize("way", range(4))
+@pytest.mark.parametrize("name", FRAGILE)
+def test_a_model_that_is_not_finite_everywhere(name, way):
+    one, generator, failed = made(name), np.random.default_rng(1), 0
+    for _ in range(2):
+        pair, twins = both(one, **WAYS[way]), both(one, **WAYS[way])
+        for t, sample in enumerate(one.samples):
+            y = np.array(sample["y"])
+            if name != "quotient" and generator.random() < 0.2:
+                y += generator.choice([-40.0, -400.0, 300.0, -2000.0])
+            for mhe, twin in zip(pair, twins, strict=True):
+                loaded(mhe, twin)
+            expected, found = (mhe.update(**sample | {"y": y}) for mhe in pair)
+            # Far away from the data rounding grows from step to step.
+            agree(expected, found, 1e-7)
+            for twin, estimate in zip(twins, (expected, found), strict=True):
+                equal(twin.update(**sample | {"y": y}), estimate)
+            assert np.isfinite(found.trajectory).all()
+            failed += not np.isfinite(found.candidate_cost)
+            if t % 3 == 2:
+                when = max(t - 1, t + 1 - one.options["horizon"])
+                agree(*(mhe.amend(when, one.samples[when]["y"]) for mhe in pair), 1e-7)
+    assert failed > 3
+    if name == "logarithm" and way == 0:
+        for mhe in pair:
+            mhe.update([-2000.0])
+            mhe.update([0.1])
+            with pytest.raises(InvalidInputError, match="finite"):
+                mhe.covariances()
+
+
+@both_engines
+def test_an_outage_longer_than_the_window(engine):
+    """The observer waits where the model last worked, however long that is ago."""
+    system = system_of(lambda x, u: x * u[0], lambda x, u: x, n=1, m=1)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.5]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
+        horizon=2, initial_state=[0.0], engine=engine,
     )
-    follow(model, both(model, observer=observer))
-    # Where the candidate is kept, the filtered estimate is the filter's own update of it.
-    pair, updated = both(model, observer=observer, max_qps=0), False
-    Y = model.Y[:12].copy()
-    Y[3, 0] = Y[5] = np.nan
-    for t, y in enumerate(Y):
-        weight = 3.0 * np.eye(p) if t == 7 else None
-        expected, found = (one.update(y, noise_weight=weight) for one in pair)
-        close(expected, found)
-        updated |= not np.array_equal(found.filtered, found.trajectory[-2])
-    assert updated
-    runs = [one.run(Y) for one in both(model, observer=observer, max_qps=0)]
-    np.testing.assert_allclose(runs[1].filtered, runs[0].filtered, rtol=1e-10)
+    for samples in (1, 2, 3, *range(60, 70), 130):
+        mhe.reset()
+        for _ in range(samples):
+            mhe.update([5.0], [1.0])
+        held = [mhe.update([5.0], [NAN]).state[0] for _ in range(5)]
+        assert held == [held[0]] * 5, samples
+        assert mhe.update([5.0], [1.0]).state[0] == pytest.approx(5.0, abs=3.0)
 
 
-@pytest.mark.parametrize("method", ["euler", "rk4"])
-def test_high_gain(method):
+@pytest.mark.parametrize(("fails", "f"), [
+    (True, lambda x: [0.5 * casadi.sqrt(casadi.fabs(x[0])), 0.9 * x[1] + 0.1]),
+    (True, lambda x: [0.9 * casadi.sqrt(x[0] ** 2 + x[1] ** 2), 0.9 * x[1]]),
+    (False, lambda x: [0.9 * casadi.fabs(x[0]), 0.9 * x[1]]),
+], ids=["infinite slope", "no slope", "absolute value"])
+def test_jacobians_that_are_not_finite_at_the_start(fails, f):
+    one = case_of(system_of(f, lambda x: x[0] + x[1], n=2), [[0.1], [0.1]], [0.0, 0.0], 3)
+    for max_qps in (0, 1):
+        pair, flags = both(one, max_qps=max_qps), []
+        for sample in one.samples[:12]:
+            expected, found = (mhe.update(**sample) for mhe in pair)
+            agree(expected, found, 1e-7)  # what rounding leaves of 0 has a large root
+            flags.append(found.status)
+        assert (Status.MODEL_FAILED in flags[0]) == (fails and max_qps > 0)
+        assert Status.MODEL_FAILED not in flags[-1]
+
+
+# Sets
+
+
+def estimator_in(name, kind, engine="compiled", sets=None, x_unit=1.0, y_unit=1.0, **options):
+    """A problem of the oracles, and an estimator of it in other units or sets."""
+    one = reactor() if name == "reactor" else SYSTEMS[name]()
+    S, T = x_unit * np.ones(one.n), y_unit * np.ones(one.p)
+    if sets is None:
+        sets = one.sets["box" if kind == "tight" else kind][1:]
+    width, functions = 0.5 if kind == "tight" else 1.0, one.symbolic()
     system = system_of(
-        lambda x: [x[1], -casadi.sin(x[0]) - 0.1 * x[1]], lambda x: x[0], n=2, dt=0.1,
-        method=method,
+        lambda x: S * functions["f"](x / S), lambda x: T * functions["h"](x / S), n=one.n, **{
+            label: each and qpmhe.model.sets.ConvexSet(
+                each.lower * unit * width, each.upper * unit * width, each.matrix / unit,
+                each.row_lower, each.row_upper,
+            )
+            for label, each, unit in zip(("disturbances", "noises"), sets, (S, T), strict=True)
+        },
     )
-    model = model_of(system, [[0.5], [0.5]], [0.5, 0.0], 4)
-    sampling = {"euler": "euler", "rk4": "exact"}[method]
-    observer = qpmhe.HighGain(2, epsilon=0.2, dt=0.1, sampling=sampling)
-    follow(model, both(model, observer=observer))
+    cost = qpmhe.QuadraticCost(
+        prior=one.cost.prior / np.outer(S, S), disturbance=one.cost.disturbance / np.outer(S, S),
+        noise=one.cost.noise / np.outer(T, T),
+    )
+    gain = options.pop("gain", one.gain)
+    return one, qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(gain * S[:, None] / T), cost, horizon=one.horizon,
+        initial_state=one.start * S, engine=engine, **options,
+    )
 
 
-def test_jacobians_without_entries():
-    """Components that do not depend on the state, and an output that depends on none."""
-    system = system_of(lambda x, u: [u[0], 0.5], lambda x, u: 2.0 * u[0], n=2, m=1)
-    model = model_of(system, [[0.1], [0.1]], [0.5, 0.5], 3)
-    for options in ({"max_qps": 0}, {"max_qps": None}, {"warm_start": True}):
-        follow(model, both(model, **options))
+@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
+@pytest.mark.parametrize("name", ["reactor", "van_der_pol", "stirred_tank", "pendulum"])
+def test_sets_that_the_observer_leaves_nearly_always(name, infeasible):
+    """All rungs, with the same rows where the QPs have solutions."""
+    rungs, apart = {"again": 0, "dropped": 0, "kept": 0, "nearest": 0}, 0
+    for backend in ("auto", "banded"):  # the banded one knows no inequalities
+        options = {"infeasible": infeasible, "max_qps": None, "backend": backend}
+        (one, reference), (_, compiled) = (
+            estimator_in(name, "tight", engine, **options) for engine in ENGINES
+        )
+        for y in one.record(0, 30):
+            expected, found = reference.update(y), compiled.update(y)
+            assert found.cost <= found.candidate_cost
+            assert found.candidate_cost == pytest.approx(expected.candidate_cost, rel=1e-9)
+            if Status.SOLVER_STOPPED in expected.status | found.status:
+                apart += found.cost != pytest.approx(expected.cost, rel=1e-6)
+            else:
+                rung = Status.IMPROVED | Status.CANDIDATE_OUTSIDE | Status.ROWS_DROPPED
+                assert (found.status & rung, found.dropped) == (
+                    expected.status & rung, expected.dropped
+                )
+                assert found.cost == pytest.approx(expected.cost, rel=1e-6)
+            assert backend == "auto" or found.solver_iterations == 0
+            rungs["nearest"] += found.nearest_points > 0
+            if Status.CANDIDATE_OUTSIDE in found.status:
+                rungs["dropped" if found.dropped else "again" if found.improved else "kept"] += 1
+    assert apart <= 4
+    assert min(rungs["again"], rungs["nearest"]) > 2
+    assert rungs["dropped" if infeasible == "drop_rows" else "kept"] > 2
 
 
-NOT_EXPANDED = """
-import casadi, numpy as np, qpmhe
-x = casadi.MX.sym("x", 2)
-A = casadi.MX(np.array([[2.0, 0.3], [0.1, 1.5]])) + 0.1 * casadi.diag(x) ** 2
-table = casadi.MX(casadi.DM([0.7, 0.8, 0.9]))[casadi.floor(casadi.fmin(casadi.fmax(x[0], 0), 2))]
-f = {expression}
-system = qpmhe.from_casadi(
-    casadi.Function("f", [x], [f]), lambda x: x[0] + 0.1 * x[1] ** 2, n=2, compiled=False
-)
-assert not system.symbolic.f.is_a("SXFunction")
-cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10 * np.eye(2), noise=np.eye(1))
-Y = np.random.default_rng(0).standard_normal((12, 1))
-for options in (
-    {{"max_qps": 0}}, {{"max_qps": 2}}, {{"warm_start": True}}, {{"candidate": "reinitialized"}},
-):
-    one, other = (
+@pytest.mark.parametrize("name", ["reactor", "stirred_tank"])
+def test_caps_on_iterations(name):
+    for cap in (1, 2, 5):
+        options, flags = {"max_qps": 3, "max_solver_iterations": cap}, Status(0)
+        one, mhe = estimator_in(name, "polytope", **options)
+        for y in one.record(1, 30):
+            estimate = mhe.update(y)
+            solves = estimate.qps + estimate.corrections + estimate.nearest_points
+            assert estimate.solver_iterations <= cap * solves
+            assert estimate.cost <= estimate.candidate_cost
+            flags |= estimate.status
+        # The active rows are mostly found by a few guesses.
+        assert Status.SOLVER_STOPPED in flags or cap > 1
+        assert Status.IMPROVED in flags
+
+
+def test_bounds_that_are_all_but_infinite():
+    costs = []
+    for far in (INF, 1e20, 1e200, 1e300):
+        one, mhe = estimator_in("reactor", "open", max_qps=2, sets=(
+            Box([-far, -0.05], [0.05, far]) & around([0, 0], 0.1, 0.1),
+            Box(-1.2, far) & Polytope([[1.0]], [0.3]),
+        ))
+        run = mhe.run(one.record(0, 30))
+        assert run.share(Status.IMPROVED) > 0.5
+        costs.append(run.costs)
+    for found in costs[1:]:
+        np.testing.assert_allclose(found, costs[0], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-6, 1e-8, 2e-10, 1e-12, 0.0])
+def test_sets_of_almost_no_width(width):
+    """However narrow, nothing worse than the candidate; what is narrower yet is an equation."""
+    runs = []
+    for engine in ENGINES:
+        one, mhe = estimator_in(
+            "reactor", "narrow", engine, max_qps=None, solver_tolerance=1e-9,
+            sets=(Polytope([[1, 1], [-1, -1]], [width, width]), None), gain=[[0.05], [-0.05]],
+        )
+        estimates = [mhe.update(y) for y in one.record(0, 12)]
+        for estimate in estimates:
+            assert estimate.cost <= estimate.candidate_cost
+            if estimate.improved and not estimate.dropped:
+                assert np.abs(estimate.disturbances.sum(axis=1)).max() <= width + 1e-8
+        runs.append([estimate.cost for estimate in estimates])
+    assert sum(estimate.improved for estimate in estimates) > 6
+    np.testing.assert_allclose(runs[1], runs[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("flat", [
+    Polytope([[1, -1], [-3, 3]], [0.1, -0.3]), Polytope([[1, 0], [0, 1], [-1, -1]], [0.0] * 3),
+    Box([0, 0], [1, 1]) & Polytope([[1, 2]], [0.0]),
+], ids=["opposite rows", "three rows", "rows and a box"])
+def test_equalities_made_of_inequalities(flat):
+    system = system_of(lambda x: 0.9 * x, lambda x: x[:1], n=2, disturbances=flat)
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
+    expected, found = (
         qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([0.1, 0.1]), cost, horizon=4, initial_state=[1.1, 1.0],
-            engine=engine, **options,
-        ).run(Y)
-        for engine in ("python", "compiled")
+            system, qpmhe.Luenberger([0.1, 0.1]), cost, horizon=4, initial_state=[0.0, 0.0],
+            engine=engine, infeasible="keep_candidate",
+        ).run(np.random.default_rng(1).standard_normal((12, 1)))
+        for engine in ENGINES
     )
-    np.testing.assert_allclose(other.states, one.states, rtol=1e-10, atol=1e-10)
-    np.testing.assert_array_equal(other.flags, one.flags)
-"""
+    np.testing.assert_allclose(found.costs, expected.costs, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.candidate_costs, expected.candidate_costs, rtol=1e-9)
+    assert found.share(Status.IMPROVED) > 0.5
 
 
-@pytest.mark.parametrize(
-    "expression", ["0.9 * casadi.solve(A, x)", "casadi.vertcat(table * x[0], 0.8 * x[1])"]
-)
-def test_models_that_have_no_scalar_form(expression):
-    # In a process of its own: too little scratch for such a model breaks the stack.
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", NOT_EXPANDED.format(expression=expression)],
-        capture_output=True, text=True, check=False,
-    )
-    assert done.returncode == 0, done.stderr[-500:]
+@pytest.mark.parametrize(("name", "kind"), [("stirred_tank", "tight"), ("van_der_pol", "polytope")])
+def test_no_unit_matters(name, kind):
+    """A compiler may contract the model's operations in other ways: the same up to rounding."""
+    generator = np.random.default_rng(5)
+    one, usual = estimator_in(name, kind, max_qps=3)
+    Y, flags = one.record(0, 30), Status(0)
+    expected = [usual.update(y) for y in Y]
+    S, T = (2.0 ** generator.integers(-30, 31, size) for size in (one.n, one.p))
+    _, other = estimator_in(name, kind, x_unit=S, y_unit=T, max_qps=3)
+    for y, before in zip(Y, expected, strict=True):
+        estimate = other.update(y * T)
+        size = np.abs(before.trajectory).max()
+        np.testing.assert_allclose(
+            estimate.trajectory / S, before.trajectory, rtol=1e-9, atol=1e-9 * size
+        )
+        assert estimate.cost == pytest.approx(before.cost, rel=1e-10)
+        for field in ("status", "qps", "nearest_points", "dropped"):
+            assert getattr(estimate, field) == getattr(before, field), field
+        flags |= estimate.status
+    assert Status.CANDIDATE_OUTSIDE in flags
+
+
+@both_engines
+@pytest.mark.parametrize("whole", [False, True])
+def test_rows_dropped_for_long_are_worth_a_warning(engine, whole):
+    one, mhe = estimator_in("pendulum", "tight", engine)
+    take = mhe.run if whole else lambda ys: [mhe.update(y) for y in ys]
+    with pytest.warns(qpmhe.ObserverWarning, match="inequalities were dropped in") as caught:
+        take(one.record(1, 30))
+    assert len(caught) == 1
+    assert caught[0].filename == __file__ or (engine, whole) == ("python", True)
+
+
+def test_whatever_the_system_and_the_options():
+    """The promise with coefficients that are inputs, sets that may be open, and odd numbers."""
+    generator, cost = np.random.default_rng(0), {"prior": 1, "disturbance": 1, "noise": 1}
+    odd = [NAN, INF, 0.0, 1e12, -1e149, 1e200]
+
+    def number(often=0.8):
+        return generator.uniform(-3.0, 3.0) if generator.random() < often else generator.choice(odd)
+
+    def box():
+        low, high = (np.where(generator.random(3) < 0.3, INF, generator.uniform(0.05, 3.0, 3))
+                     for _ in range(2))
+        rows = np.array([[1.0, 2.0]])
+        return qpmhe.model.sets.ConvexSet(-low[:2], high[:2], rows, -low[2:], high[2:])
+
+    for k in range(12):
+        system = system_of(
+            lambda x, u: [u[0] * x[0] + u[1] * casadi.sin(x[1]) + u[2] * x[0] ** 2,
+                          u[3] * x[1] + u[1] * x[0] + 0.1 * casadi.sqrt(x[0] + u[4])],
+            lambda x, u: [x[0] + u[2] * x[1] ** 2, casadi.log(x[1] + u[4])],
+            n=2, m=5, disturbances=box(), noises=box(),
+        )
+        weights = {
+            name: 10.0 ** generator.uniform(-4, 4) * np.array([[1.0, 0.3], [0.3, 0.5]])
+            for name in cost
+        }
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger(generator.uniform(-0.5, 0.5, (2, 2))),
+            qpmhe.QuadraticCost(**weights, discount=(1.0, 0.9, 0.1)[k % 3]), horizon=3,
+            initial_state=[0.01, 0.02], engine="compiled", max_qps=(1, 2, None, 0)[k % 4],
+            max_solver_iterations=(None, 1, 3)[k // 3 % 3], warm_start=bool(k % 2),
+            infeasible=("drop_rows", "keep_candidate")[k // 2 % 2],
+            candidate=("observer", "reinitialized")[k // 6],
+        )
+        usual = [*generator.uniform(-1.1, 1.1, 4), 2.0]
+        for t in range(20):
+            u = [number(0.5) for _ in range(5)] if generator.random() < 0.1 else usual
+            estimates = [mhe.update([number(), number()], u)]
+            estimates.append(mhe.amend(max(0, t - 1), [number(), number()]))
+            for estimate in estimates:
+                status = estimate.status
+                assert estimate.cost <= estimate.candidate_cost
+                assert estimate.improved != (Status.CANDIDATE in status)
+                assert np.isfinite(estimate.trajectory).all()
+                assert (Status.ROWS_DROPPED in status) == bool(estimate.dropped)
+                if not estimate.improved:
+                    np.testing.assert_array_equal(estimate.trajectory, estimate.candidate)
+                    assert estimate.cost == estimate.candidate_cost
