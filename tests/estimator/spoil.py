@@ -39,9 +39,10 @@ def cases(*rows):
     return [pytest.param(*row, id=repr(row[0])) for row in rows]
 
 
-def check(kind, fragments, build):
+def check(kind, fragments, build, /, *arguments, **options):
+    """That build raises our own error of this kind, with the fragments in its message."""
     with pytest.raises(kind) as caught:
-        build()
+        build(*arguments, **options)
     error, text = caught.value, str(caught.value)
     assert isinstance(error, InvalidInputError)
     assert isinstance(error, QpmheError)
@@ -56,7 +57,7 @@ def unharmed(build, calls, sample):
     for _ in range(5):
         for kind, fragments, call in calls:
             before, time = spoilt.state.copy(), spoilt.time
-            check(kind, fragments, lambda call=call: call(spoilt))
+            check(kind, fragments, call, spoilt)
             assert spoilt.time == time
             np.testing.assert_array_equal(spoilt.state, before)
         one, other = spoilt.update(*sample), twin.update(*sample)

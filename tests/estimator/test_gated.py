@@ -1,4 +1,4 @@
-"""Kalman-type observers that judge innovations, against filters written out here."""
+"""Kalman-type observers that judge innovations, against a filter written out here."""
 
 import math
 import pickle
@@ -11,13 +11,9 @@ from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError, OptionError
 
+from .spoil import check
+
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
-ENGINES = [
-    "python",
-    pytest.param("compiled", marks=pytest.mark.skipif(
-        find_compiler() is None, reason="there is no C compiler"
-    )),
-]
 FILTERS = [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman]
 # 0.997 quantiles of the chi-square distributions with 1, 2 and 3 degrees, from tables.
 CHI2 = {1: 8.807468, 2: 11.618286, 3: 13.931419}
@@ -49,34 +45,39 @@ P0 = np.diag([0.02, 0.05, 0.01])
 Q = np.diag([1e-4, 1e-3, 1e-6])
 ROOT = np.array([[1, 0, 0, 0], [0.4, 1, 0, 0], [-0.2, 0.1, 1, 0], [0, 0.3, 0, 1]])
 R = 0.01 * ROOT @ ROOT.T
+START, FAR = np.array([0.5, 0.0, 0.3]), np.array([1.0, 0.6, 0.8])
+
+
+def disturbed(seed, steps=90, missing=0.15):
+    """Measurements with outliers, gaps, and sensor 2 off for 25 samples."""
+    rng = np.random.default_rng(seed)
+    x, Y = START, []
+    for t in range(steps):
+        y = h(x) + np.linalg.cholesky(R) @ rng.standard_normal(4)
+        y += (rng.random(4) < 0.05) * rng.choice([-1.5, 1.5], 4)
+        y[2] += 1.0 * (30 <= t < 55)
+        y[rng.random(4) < missing] = np.nan
+        Y.append(y)
+        x = f(x) + np.sqrt(np.diag(Q)) * rng.standard_normal(3)
+    return np.array(Y)
 
 
 def pendulum():
     return qpmhe.System(f, h, n=3, p=4)
 
 
-def disturbed(seed, steps=90, missing=0.15):
-    """Truth, and measurements with outliers, gaps, and sensor 2 off for 25 samples."""
-    rng = np.random.default_rng(seed)
-    x, X, Y = np.array([0.5, 0.0, 0.3]), [], []
-    for t in range(steps):
-        y = h(x) + np.linalg.cholesky(R) @ rng.standard_normal(4)
-        y += (rng.random(4) < 0.05) * rng.choice([-1.5, 1.5], 4)
-        y[2] += 1.0 * (30 <= t < 55)
-        y[rng.random(4) < missing] = np.nan
-        X.append(x)
-        Y.append(y)
-        x = f(x) + np.sqrt(np.diag(Q)) * rng.standard_normal(3)
-    return np.array(X), np.array(Y)
+def watching(innovation, make=qpmhe.ExtendedKalman, **covariances):
+    return make(
+        **({"prior": P0, "disturbance": Q, "noise": R} | covariances), innovation=innovation
+    )
 
 
-def estimator(system, observer, start, engine="python", **options):
+def estimator(system, observer, start, **options):
     cost = qpmhe.QuadraticCost.from_covariances(
         prior=qpmhe.ObserverPrior(), disturbance=observer._disturbance, noise=observer._noise
     )
     return qpmhe.MovingHorizonEstimator(
-        system, observer, cost, initial_state=start, engine=engine,
-        **({"horizon": 6, "max_qps": 0} | options),
+        system, observer, cost, initial_state=start, **({"horizon": 6, "max_qps": 0} | options)
     )
 
 
@@ -146,113 +147,90 @@ def plain_gated(z, Y, sensors, reopen):
     return np.array(states), np.array(rejected)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("groups", [None, [[0, 1]], [[3, 1], [0, 2]], [[0, 1, 2]]])
-@pytest.mark.parametrize("start", [[0.5, 0.0, 0.3], [1.0, 0.6, 0.8]], ids=["near", "far"])
-def test_the_gated_filter_is_the_plain_one(engine, groups, start):
-    gate = qpmhe.Gate(reopen=4, groups=groups)
-    sensors = gate.sensors(4)
-    observer = qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=gate)
-    opened = 0
-    for seed in range(3):
-        _, Y = disturbed(seed)
-        expected, rejected = plain_gated(np.array(start), Y, sensors, 4)
-        run = estimator(pendulum(), observer, start, engine).run(Y)
-        assert run.engine == engine
+def test_the_gated_filter_is_the_plain_one(groups):
+    gate = qpmhe.Gate(reopen=2, groups=groups)
+    mhe = estimator(pendulum(), watching(gate), START)
+    for seed, start in ((0, START), (1, FAR), (2, FAR)):
+        Y = disturbed(seed)
+        states, rejected = plain_gated(start, Y, gate.sensors(4), 2)
+        mhe.reset(start)
+        run = mhe.run(Y)
         np.testing.assert_array_equal(run.rejected_sensors, rejected)
-        np.testing.assert_allclose(run.observer_states, expected, rtol=1e-7, atol=1e-7)
-        opened += rejected.any()
-    assert opened == 3
+        np.testing.assert_allclose(run.observer_states, states, rtol=1e-7, atol=1e-7)
+        assert rejected.any()
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+def test_a_compiled_batch_is_plain_filters():
+    gate, starts = qpmhe.Gate(reopen=2, groups=[[0, 1]]), np.array([START, FAR, 0.0 * FAR])
+    Y = np.array([disturbed(seed, steps=40) for seed in range(3)])
+    batch = qpmhe.BatchEstimator(
+        pendulum(), watching(gate), qpmhe.QuadraticCost(prior=P0, disturbance=Q, noise=R),
+        members=3, horizon=6, initial_states=starts, max_qps=0, engine="compiled",
+    )
+    run = batch.run(Y)
+    for k, (start, ys) in enumerate(zip(starts, Y, strict=True)):
+        states, rejected = plain_gated(start, ys, gate.sensors(4), 2)
+        np.testing.assert_array_equal(run.rejected_sensors[k], rejected)
+        np.testing.assert_allclose(run.states[k], states, rtol=1e-7, atol=1e-7)
+
+
+A = np.array([[1.0, DT], [0.0, 1.0]])
+DRIFT = {"prior": 0.01 * np.eye(2), "disturbance": np.diag([1e-6, 1e-4])}
 
 
 @pytest.mark.parametrize("make", FILTERS)
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("reopen", [1, 7])
-def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make, engine, reopen):
+def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make):
     """The estimate is moved away, or the only sensor jumps for good."""
-    A = np.array([[1.0, DT], [0.0, 1.0]])
     system = qpmhe.System(lambda x: A @ x, lambda x: x[:1], n=2, p=1)
-    observer = make(
-        prior=0.01 * np.eye(2), disturbance=np.diag([1e-6, 1e-4]), noise=[[0.01]],
-        innovation=qpmhe.Gate(reopen=reopen),
-    )
-    rng = np.random.default_rng(4)
-    for start, jump in (([50.0, 0.0], 0.0), ([0.0, 0.0], 50.0)):
-        x, X, Y, begins = np.zeros(2), [], [], 0 if jump == 0.0 else 40
-        for t in range(160):
-            X.append(x + (t >= begins) * np.array([jump, 0.0]))
-            Y.append(X[-1][:1] + 0.1 * rng.standard_normal(1))
-            x = A @ x + np.array([1e-3, 1e-2]) * rng.standard_normal(2)
-        run = estimator(system, observer, start, engine).run(Y)
-        shut = run.rejected_sensors[:, 0]
-        assert shut[begins : begins + reopen].all()
-        assert not shut[begins + reopen]
-        errors = np.abs(run.observer_states[:-1] - X)[:, 0]
-        assert errors[begins + reopen] > 40.0
-        assert errors[begins + reopen + 1] < 15.0
-        assert errors[begins + reopen + 40 :].max() < 0.5
-        assert shut[begins + reopen + 40 :].mean() < 0.03
+    for reopen in (1, 7):
+        gate = qpmhe.Gate(reopen=reopen)
+        mhe = estimator(system, watching(gate, make, **DRIFT, noise=[[0.01]]), [0.0, 0.0])
+        for start, jump, begins in ((50.0, 0.0, 0), (0.0, 50.0, 40)):
+            rng = np.random.default_rng(4)
+            truth = jump * (np.arange(140) >= begins)
+            mhe.reset([start, 0.0])
+            run = mhe.run(truth + 0.1 * rng.standard_normal(140))
+            shut = run.rejected_sensors[:, 0]
+            assert shut[begins : begins + reopen].all()
+            assert not shut[begins + reopen]
+            errors = np.abs(run.observer_states[:-1, 0] - truth)
+            assert errors[begins + reopen] > 40.0
+            assert errors[begins + reopen + 1] < 15.0
+            assert errors[begins + reopen + 40 :].max() < 0.5
+            assert shut[begins + reopen + 40 :].mean() < 0.05
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_sensors_that_pass_keep_a_faulty_one_shut(engine):
-    A = np.array([[1.0, DT], [0.0, 1.0]])
-    system = qpmhe.System(lambda x: A @ x, lambda x: np.array([x[0], x[0]]), n=2, p=2)
-    observer = qpmhe.ExtendedKalman(
-        prior=0.01 * np.eye(2), disturbance=np.diag([1e-6, 1e-4]), noise=0.01 * np.eye(2),
-        innovation=qpmhe.Gate(reopen=3),
-    )
-    rng = np.random.default_rng(5)
-    Y = 0.1 * rng.standard_normal((75, 2))
-    Y[40:, 0] += 20.0
-    run = estimator(system, observer, [0.0, 0.0], engine).run(Y)
-    # It is let in once, when it has been rejected ten times as often.
-    assert np.flatnonzero(~run.rejected_sensors[40:, 0])[0] == 30
-    assert np.abs(run.observer_states[:71, 0]).max() < 0.3
-    assert run.rejected_sensors[40:70, 1].mean() < 0.1
-    Y[70:, 0] -= 20.0
-    again = estimator(system, observer, [0.0, 0.0], engine).run(Y)
-    assert not again.rejected_sensors[70:, 0].any()
-
-
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("make", FILTERS)
-def test_all_sensors_gated(make, engine):
-    observer = make(
-        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate(reopen=1000, groups=[[0, 2]])
-    )
-    start = np.array([0.5, 0.0, 0.3])
-    mhe = estimator(pendulum(), observer, start, engine)
+def test_all_sensors_gated(make):
+    gate = qpmhe.Gate(reopen=1000, groups=[[0, 2]])
+    mhe = estimator(pendulum(), watching(gate, make), START)
     few = mhe.update([100.0, 0.0, 100.0, np.nan])
     assert few.rejected_sensors == (0,)
     assert Status.SENSORS_REJECTED in few.status
     assert Status.ALL_REJECTED not in few.status
-    z = mhe.observer_state
     for y in ([50.0, 50.0, 50.0, 50.0], [50.0, np.nan, np.nan, -1e149]):
+        z = mhe.observer_state
         estimate = mhe.update(y)
         assert Status.SENSORS_REJECTED | Status.ALL_REJECTED in estimate.status
         np.testing.assert_allclose(mhe.observer_state, f(z), rtol=0, atol=1e-12)
         np.testing.assert_allclose(estimate.filtered, z, rtol=0, atol=1e-12)
-        z = mhe.observer_state
         assert "only predicted" in estimate.explain()
         assert "Rejected sensors: 0, " in estimate.explain()
     assert estimate.rejected_sensors == (0, 2)
-    run = estimator(pendulum(), observer, start, engine).run([[50.0] * 4] * 3)
+    run = mhe.run([[50.0] * 4] * 3)
     assert run.rejected_sensors.all()
-    assert run.rejected_sensors.shape == (3, 3)
     assert run.share(Status.ALL_REJECTED) == 1.0
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("make", FILTERS)
-def test_huber_by_hand(make, engine):
+def test_huber_by_hand(make):
     """P = 1, R = 1: S = 2; v = 4 has nu = 4 / sqrt 2."""
     system = qpmhe.System(lambda x: 2.0 * x, lambda x: x, n=1, p=1)
-    observer = make(
-        prior=[[1.0]], disturbance=[[0.5]], noise=[[1.0]],
-        innovation=qpmhe.HuberInnovation(threshold=1.345),
-    )
-    mhe = estimator(system, observer, [0.0], engine, horizon=1)
+    covariances = {"prior": [[1.0]], "disturbance": [[0.5]], "noise": [[1.0]]}
+    observer = watching(qpmhe.HuberInnovation(threshold=1.345), make, **covariances)
+    mhe = estimator(system, observer, [0.0], horizon=1)
     weight = 1.345 * math.sqrt(2.0) / 4.0
     estimate = mhe.update([4.0])
     assert estimate.filtered[0] == pytest.approx(0.5 * weight * 4.0, rel=1e-12)
@@ -266,17 +244,11 @@ def test_huber_by_hand(make, engine):
     assert not estimate.status & (Status.SENSORS_REJECTED | Status.ALL_REJECTED)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_huber_of_several_outputs(engine):
+def test_huber_of_several_outputs():
     """Each output's innovation in its own deviation; the noise grows by what its weight says."""
-    observer = qpmhe.ExtendedKalman(
-        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.HuberInnovation(1.2)
-    )
-    start = np.array([0.5, 0.0, 0.3])
-    y = h(start) + np.array([0.1, -2.0, np.nan, 0.9])
-    mhe = estimator(pendulum(), observer, start, engine)
-    mhe.update(y)
-    C, v, r = h_slope(start)[[0, 1, 3]], np.array([0.1, -2.0, 0.9]), R[np.ix_([0, 1, 3], [0, 1, 3])]
+    mhe = estimator(pendulum(), watching(qpmhe.HuberInnovation(1.2)), START)
+    mhe.update(h(START) + np.array([0.1, -2.0, np.nan, 0.9]))
+    C, v, r = h_slope(START)[[0, 1, 3]], np.array([0.1, -2.0, 0.9]), R[np.ix_([0, 1, 3], [0, 1, 3])]
     variances = np.diag(C @ P0 @ C.T + r)
     weights = np.minimum(1.0, 1.2 * np.sqrt(variances) / np.abs(v))
     assert weights[0] == 1.0
@@ -284,169 +256,94 @@ def test_huber_of_several_outputs(engine):
     softened = r + np.diag(variances / weights - variances)
     K = P0 @ C.T @ np.linalg.inv(C @ P0 @ C.T + softened)
     np.testing.assert_allclose(
-        mhe.observer_state, f(start) + f_slope(start) @ K @ v, rtol=0, atol=1e-12
+        mhe.observer_state, f(START) + f_slope(START) @ K @ v, rtol=0, atol=1e-12
     )
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("make", FILTERS)
-def test_huber_finds_back_from_a_covariance_that_is_too_small(make, engine):
+def test_huber_finds_back_from_a_covariance_that_is_too_small(make):
     """Without a way back the correction would be less than 2 standard deviations a sample."""
     system = qpmhe.System(lambda x: x, lambda x: x, n=1, p=1)
     covariances = {"prior": [[1e-8]], "disturbance": [[1e-10]], "noise": [[1.0]]}
-    rng = np.random.default_rng(6)
-    Y = rng.standard_normal((120, 1))
+    Y = np.random.default_rng(6).standard_normal((120, 1))
     for reopen, settled in ((5, True), (10**6, False)):
-        observer = make(**covariances, innovation=qpmhe.HuberInnovation(reopen=reopen))
-        run = estimator(system, observer, [30.0], engine).run(Y)
-        assert (abs(run.observer_states[-30:, 0]).max() < 1.0) == settled
+        observer = watching(qpmhe.HuberInnovation(reopen=reopen), make, **covariances)
+        run = estimator(system, observer, [30.0]).run(Y)
+        assert (np.abs(run.observer_states[-30:]).max() < 1.0) == settled
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("make", FILTERS)
 @pytest.mark.parametrize("innovation", [qpmhe.Gate(reopen=3), qpmhe.HuberInnovation(reopen=3)])
-def test_a_snapshot_in_the_middle_of_a_rejection(make, engine, innovation):
-    observer = make(prior=P0, disturbance=Q, noise=R, innovation=innovation)
-    _, Y = disturbed(7)
-    options = {"engine": engine, "max_qps": 1}
-    mhe = estimator(pendulum(), observer, [1.0, 0.6, 0.8], **options)
-    for t, y in enumerate(Y):
-        if t in (2, 33, 34, 50):
-            state = pickle.loads(pickle.dumps(mhe.state_dict()))
-            other = estimator(pendulum(), observer, [0.0, 0.0, 0.0], **options)
-            other.load_state_dict(state)
-            follow = [other.update(one) for one in Y[t : t + 6]]
-            mine = estimator(pendulum(), observer, [1.0, 0.6, 0.8], **options)
-            for one in Y[:t]:
-                mine.update(one)
-            for found, one in zip(follow, Y[t : t + 6], strict=True):
-                expected = mine.update(one)
-                np.testing.assert_allclose(found.state, expected.state, rtol=1e-9, atol=1e-9)
-                assert found.rejected_sensors == expected.rejected_sensors
-        mhe.update(y)
-
-
-@pytest.mark.parametrize("change", [1, -1, -100])
-def test_counts_that_do_not_follow_are_refused(change):
-    observer = qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate())
-    mhe = estimator(pendulum(), observer, [1.0, 0.6, 0.8])
-    for y in disturbed(7)[1][:5]:
-        mhe.update(y)
-    state = mhe.state_dict()
-    state["window/rejections"][2, 1] += change
-    with pytest.raises(InvalidInputError, match=r"another observer|damaged"):
-        mhe.load_state_dict(state)
-    for other in (None, qpmhe.Gate(reopen=9), qpmhe.HuberInnovation(), qpmhe.Gate(groups=[[0, 1]])):
-        another = estimator(pendulum(), qpmhe.ExtendedKalman(
-            prior=P0, disturbance=Q, noise=R, innovation=other
-        ), [1.0, 0.6, 0.8])
-        with pytest.raises(InvalidInputError, match="observer"):
-            another.load_state_dict(mhe.state_dict())
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("innovation", [qpmhe.Gate(reopen=2), qpmhe.HuberInnovation(reopen=2)])
-def test_a_late_measurement_counts_as_one_in_time(engine, innovation):
-    observer = qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=innovation)
-    _, Y = disturbed(8, missing=0.0)
-    late, timely = (
-        estimator(pendulum(), observer, [1.0, 0.6, 0.8], engine, max_qps=1) for _ in range(2)
+def test_snapshots_and_late_measurements(innovation):
+    Y = disturbed(8, missing=0.0)
+    mhe, restored, late = (
+        estimator(pendulum(), watching(innovation), FAR, max_qps=1) for _ in range(3)
     )
-    for t, y in enumerate(Y[:40]):
+    for t, y in enumerate(Y):
+        if t in (2, 33, 34, 50):  # in the middle of a rejection
+            restored.load_state_dict(pickle.loads(pickle.dumps(mhe.state_dict())))
         held = y.copy()
         if t % 9 == 4:
             held[1:3] = np.nan
         late.update(held)
-        expected = timely.update(y)
+        expected = mhe.update(y)
+        if t >= 2:
+            found = restored.update(y)
+            np.testing.assert_array_equal(found.trajectory, expected.trajectory)
+            assert found.rejected_sensors == expected.rejected_sensors
         if t % 9 == 7:
             found = late.amend(t - 3, Y[t - 3])
             np.testing.assert_allclose(found.candidate, expected.candidate, rtol=1e-9, atol=1e-9)
             assert found.rejected_sensors == expected.rejected_sensors
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_batch_is_its_members(engine):
-    observer = qpmhe.ExtendedKalman(
-        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate(reopen=2, groups=[[0, 1]])
-    )
-    starts = np.array([[0.5, 0.0, 0.3], [1.0, 0.6, 0.8], [0.0, 0.0, 0.0]])
-    Y = np.array([disturbed(seed, steps=40)[1] for seed in range(3)])
-    cost = qpmhe.QuadraticCost.from_covariances(
-        prior=qpmhe.ObserverPrior(), disturbance=Q, noise=R
-    )
-
-    def made():
-        return qpmhe.BatchEstimator(
-            pendulum(), observer, cost, members=3, horizon=6, initial_states=starts, max_qps=1,
-            engine=engine,
-        )
-
-    run, stepped = made().run(Y), made()
-    assert run.rejected_sensors.shape == (3, 40, 3)
-    single = [
-        estimator(pendulum(), observer, start, engine, max_qps=1).run(one)
-        for start, one in zip(starts, Y, strict=True)
-    ]
-    for k, one in enumerate(single):
-        np.testing.assert_array_equal(run.rejected_sensors[k], one.rejected_sensors)
-        np.testing.assert_array_equal(run.states[k], one.states)
-    for t in range(12):
-        estimate = stepped.update(Y[:, t])
-        np.testing.assert_array_equal(estimate.rejected_sensors, run.rejected_sensors[:, t])
-    plain = qpmhe.BatchEstimator(
-        pendulum(), qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R), cost, members=3,
-        horizon=6, initial_states=starts, engine=engine,
-    )
-    assert plain.update(Y[:, 0]).rejected_sensors.shape == (3, 0)
+def test_snapshots_that_do_not_fit():
+    mhe = estimator(pendulum(), watching(qpmhe.Gate()), FAR)
+    mhe.run(disturbed(7)[:5])
+    for change in (1, -1, -100):
+        state = mhe.state_dict()
+        state["window/rejections"][2, 1] += change
+        with pytest.raises(InvalidInputError, match=r"another observer|damaged"):
+            mhe.load_state_dict(state)
+    for other in (None, qpmhe.Gate(reopen=9), qpmhe.HuberInnovation(), qpmhe.Gate(groups=[[0, 1]])):
+        another = estimator(pendulum(), watching(other), FAR)
+        check(InvalidInputError, ["observer"], another.load_state_dict, mhe.state_dict())
 
 
 @pytest.mark.parametrize("make", FILTERS)
-@pytest.mark.parametrize(
-    "innovation", [qpmhe.Gate(), qpmhe.Gate(reopen=1), qpmhe.HuberInnovation()]
-)
+@pytest.mark.parametrize("innovation", [qpmhe.Gate(reopen=1), qpmhe.HuberInnovation()])
 def test_corrections_vanish_with_the_error_and_are_bounded_by_it(make, innovation):
     """L(z, 0) = 0 and (eq:kappa), whatever the counts."""
-    rng, system = np.random.default_rng(9), pendulum()
-    observer = make(prior=P0, disturbance=Q, noise=R, innovation=innovation)
-    ratios = []
-    for _ in range(300):
+    rng, system, observer = np.random.default_rng(9), pendulum(), watching(innovation, make)
+    for _ in range(60):
         z, root = rng.standard_normal(3), rng.standard_normal((3, 3))
         sample = qpmhe.Sample(
             system, np.zeros(0), f_slope(z), h_slope(z), covariance=root @ root.T * rng.uniform(),
             rejections=rng.integers(0, 15, 4),
         )
-        nothing, _ = observer.correct(z, np.zeros(4), sample)
-        assert (nothing == 0.0).all()
+        assert (observer.correct(z, np.zeros(4), sample)[0] == 0.0).all()
         v = rng.standard_normal(4) * 10.0 ** rng.uniform(-3, 8)
         correction, covariance = observer.correct(z, v, sample)
         values = np.linalg.eigvalsh(covariance)
         assert values[0] > -1e-12 * values[-1]
-        ratios.append(np.linalg.norm(correction) / np.linalg.norm(v))
-    assert max(ratios) < 500.0
+        assert np.linalg.norm(correction) < 500.0 * np.linalg.norm(v)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("make", FILTERS)
 @pytest.mark.parametrize("innovation", [
     qpmhe.Gate(reopen=1), qpmhe.Gate(reopen=2, groups=[[0, 1, 2]]), qpmhe.HuberInnovation(reopen=1),
 ])
-def test_degenerate_geometry_raises_nothing(make, engine, innovation):
+def test_degenerate_geometry_raises_nothing(make, innovation):
     """Outputs that are equal, that say nothing, and states that are known exactly."""
     system = qpmhe.System(
-        lambda x: np.array([x[0] + 0.1 * x[1], x[1]]),
-        lambda x: np.array([x[0], x[0], 0.0 * x[1] + 3.0]), n=2, p=3,
+        lambda x: A @ x, lambda x: np.array([x[0], x[0], 0.0 * x[1] + 3.0]), n=2, p=3
     )
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=1e6 * np.eye(2), noise=np.eye(3))
     rng = np.random.default_rng(10)
     for prior in (np.zeros((2, 2)), np.diag([1e-12, 0.0]), np.diag([1e9, 1e-9])):
-        observer = make(
-            prior=prior, disturbance=np.zeros((2, 2)), noise=1e-10 * np.eye(3),
-            innovation=innovation,
-        )
-        cost = qpmhe.QuadraticCost.from_covariances(
-            prior=np.eye(2), disturbance=1e-6 * np.eye(2), noise=np.eye(3)
-        )
+        covariances = {"disturbance": np.zeros((2, 2)), "noise": 1e-10 * np.eye(3)}
         mhe = qpmhe.MovingHorizonEstimator(
-            system, observer, cost, horizon=3, initial_state=[0.0, 0.0], engine=engine, max_qps=1
+            system, watching(innovation, make, prior=prior, **covariances), cost, horizon=3,
+            initial_state=[0.0, 0.0], max_qps=1,
         )
         for t in range(30):
             y = np.array([5.0, 5.0, 3.0]) + 1e-5 * rng.standard_normal(3)
@@ -457,63 +354,50 @@ def test_degenerate_geometry_raises_nothing(make, engine, innovation):
             assert estimate.cost <= estimate.candidate_cost
 
 
-@pytest.mark.parametrize("units", [2.0**30, 2.0**-30, 1e9])
-@pytest.mark.parametrize("innovation", [
-    qpmhe.Gate(reopen=2), qpmhe.Gate(reopen=2, groups=[[0, 2]]), qpmhe.HuberInnovation(reopen=2),
-])
 @pytest.mark.parametrize("make", FILTERS)
-def test_no_unit_matters(make, innovation, units):
+@pytest.mark.parametrize("innovation", [
+    qpmhe.Gate(reopen=2, groups=[[0, 2]]), qpmhe.HuberInnovation(reopen=2),
+])
+def test_no_unit_matters(make, innovation):
     A, C = np.array([[1.0, 0.1], [-0.1, 0.95]]), np.array([[1.0, 0.0], [0.3, 1.0], [1.0, -1.0]])
-    rng = np.random.default_rng(11)
-    Y = rng.standard_normal((60, 3)) * 0.1
+    Y = np.random.default_rng(11).standard_normal((60, 3)) * 0.1
     Y[20:35, 0] += 5.0
     found = []
-    for one in (1.0, units):
-        T = np.diag([one, 1.0 / one])
-        D = np.diag([1.0, one, 1.0])
+    for one in (1.0, 2.0**30, 1e9):
+        T, D = np.diag([one, 1.0 / one]), np.diag([1.0, one, 1.0])
         a, c = T @ A @ np.linalg.inv(T), D @ C @ np.linalg.inv(T)
         system = qpmhe.System(lambda x, a=a: a @ x, lambda x, c=c: c @ x, n=2, p=3)
-        observer = make(
-            prior=T @ T * 0.01, disturbance=1e-4 * T @ T, noise=0.01 * D @ D, innovation=innovation
-        )
+        covariances = {"prior": T @ T * 0.01, "disturbance": 1e-4 * T @ T, "noise": 0.01 * D @ D}
+        observer = watching(innovation, make, **covariances)
         run = estimator(system, observer, T @ [2.0, -2.0]).run(Y @ D)
         found.append((run.observer_states @ np.linalg.inv(T), run.rejected_sensors))
-    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(found[1][1], found[0][1])
+        np.testing.assert_allclose(found[-1][0], found[0][0], rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(found[-1][1], found[0][1])
 
 
-@pytest.mark.parametrize(("make", "message"), [
-    (lambda: qpmhe.Gate(probability=0.0), "probability is 0.0"),
-    (lambda: qpmhe.Gate(probability=1.0), "probability is 1.0"),
-    (lambda: qpmhe.Gate(probability=-0.5), "probability is -0.5"),
-    (lambda: qpmhe.Gate(probability=np.nan), "probability is nan"),
-    (lambda: qpmhe.Gate(probability="high"), "probability is 'high'"),
-    (lambda: qpmhe.Gate(reopen=0), "reopen is 0"),
-    (lambda: qpmhe.Gate(reopen=2.5), "reopen is 2.5"),
-    (lambda: qpmhe.Gate(groups=3), "groups is 3"),
-    (lambda: qpmhe.Gate(groups=[[]]), "groups is"),
-    (lambda: qpmhe.Gate(groups=[[0, -1]]), "numbers from 0 on"),
-    (lambda: qpmhe.Gate(groups=[[0, 1], [1, 2]]), "one group at most"),
-    (lambda: qpmhe.HuberInnovation(threshold=0.0), "threshold is 0.0"),
-    (lambda: qpmhe.HuberInnovation(threshold=-1.0), "threshold is -1.0"),
-    (lambda: qpmhe.HuberInnovation(threshold=np.inf), "threshold is inf"),
-    (lambda: qpmhe.HuberInnovation(reopen=-3), "reopen is -3"),
-    (lambda: qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R, innovation=3.0),
-     r"innovation is 3.0; expected qpmhe.Gate\(...\)"),
-    (lambda: qpmhe.UnscentedKalman(prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate),
-     "innovation is"),
-    (lambda: qpmhe.ExtendedKalman(
-        prior=P0, disturbance=Q, noise=R, innovation=qpmhe.Gate(groups=[[0, 4]])
-    ), "groups has the output 4; expected outputs from 0 to 3"),
-])
-def test_what_fits_nothing_is_refused(make, message):
-    with pytest.raises(OptionError, match=message):
-        make()
+def test_what_fits_nothing_is_refused():
+    Gate, Huber = qpmhe.Gate, qpmhe.HuberInnovation
+    for make, options, text in (
+        (Gate, {"probability": 0.0}, "probability is 0.0"),
+        (Gate, {"probability": 1.0}, "probability is 1.0"),
+        (Gate, {"probability": "high"}, "probability is 'high'"),
+        (Gate, {"reopen": 0}, "reopen is 0"),
+        (Gate, {"groups": 3}, "groups is 3"),
+        (Gate, {"groups": [[]]}, "groups is"),
+        (Gate, {"groups": [[0, -1]]}, "numbers from 0 on"),
+        (Gate, {"groups": [[0, 1], [1, 2]]}, "one group at most"),
+        (Huber, {"threshold": 0.0}, "threshold is 0.0"),
+        (Huber, {"threshold": math.inf}, "threshold is inf"),
+        (Huber, {"reopen": -3}, "reopen is -3"),
+        (watching, {"innovation": 3.0}, "innovation is 3.0; expected qpmhe.Gate(...)"),
+        (watching, {"innovation": Gate, "make": FILTERS[1]}, "innovation is"),
+        (watching, {"innovation": Gate(groups=[[0, 4]])},
+         "groups has the output 4; expected outputs from 0 to 3"),
+    ):
+        check(OptionError, [text], make, **options)
 
 
 def test_sensors_are_in_the_order_of_their_first_outputs():
-    gate = qpmhe.Gate(groups=[[4, 2], [3, 0]])
-    assert gate.sensors(6) == ((3, 0), (1,), (4, 2), (5,))
-    np.testing.assert_allclose(
-        qpmhe.Gate(groups=[[0, 1, 2]]).limits(4), list(CHI2.values()), rtol=1e-6
-    )
+    assert qpmhe.Gate(groups=[[4, 2], [3, 0]]).sensors(6) == ((3, 0), (1,), (4, 2), (5,))
+    limits = qpmhe.Gate(groups=[[0, 1, 2]]).limits(4)
+    np.testing.assert_allclose(limits, list(CHI2.values()), rtol=1e-6)

@@ -1,127 +1,84 @@
-"""Outputs that are not there: None, NaN, infinities, masked or absurdly large numbers."""
+"""What stands for a missing measurement, and what is no measurement at all."""
+
+import subprocess
+import sys
+from datetime import datetime, timedelta
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.errors import InvalidInputError
 
-from .plain import Record, spd
+from .spoil import check, cost_of, estimator, system_of, unharmed
 from .untraced import untraced
 
-GENERATOR = np.random.default_rng(1)
-P, Q, R = spd(GENERATOR, 2), spd(GENERATOR, 2), spd(GENERATOR, 2)
-GAIN = np.array([[0.3, 0.05], [0.1, 0.2]])
-START = [0.5, 0.0]
-MEASURED = 0.5 * np.random.default_rng(2).standard_normal((8, 2))
+NAT = np.datetime64("NaT")
+NOTHING = [
+    None, [None, None], (None, np.nan), [np.inf, -np.inf], np.array([1e200, -1e300]), [pd.NA] * 2,
+    [NAT, NAT], pd.Series([pd.NaT, pd.NaT]), np.ma.array([1.0, 2.0], mask=[True, True]),
+    np.ma.masked_all(2, "M8[s]"), np.array(["NaT"] * 2, "m8[s]"),
+]
+PARTLY = [
+    [None, 2.0], (pd.NA, 2.0), [pd.NaT, 2.0], [NAT, 2.0], [-np.inf, 2.0], [1e200, 2.0],
+    pd.array([pd.NA, 2.0]), pd.array([pd.NA, 2]), pd.Series([pd.NA, 2], dtype="Int64"),
+    np.array([pd.NA, 2], object), np.ma.array([7.0, 2.0], mask=[True, False]),
+    np.ma.array([7.0, 2.0], mask=[True, False], dtype=object),
+    pd.DataFrame({"a": pd.array([pd.NA]), "b": [2.0]}).loc[0],
+]
 
 
-def swing(x):
-    return np.stack(
-        [x[..., 0] + 0.2 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
+def two(system=None, cost=None, **options):
+    return estimator(
+        system or system_of(h=lambda x: x, p=2), qpmhe.Luenberger(0.1 * np.eye(2)),
+        cost or cost_of(2, 2), **options,
     )
 
 
-def seen(x):
-    return np.stack([x[..., 0] + 0.1 * x[..., 1] ** 2, x[..., 1]], axis=-1)
+@pytest.mark.parametrize(("ways", "plainly"), [(NOTHING, [np.nan] * 2), (PARTLY, [np.nan, 2.0])])
+def test_every_way_of_saying_that_something_is_missing(ways, plainly):
+    expected, found = two(), two()
+    for way in ways:
+        for t in range(5):
+            one = found.update(way if t == 2 else [1.0, t])
+            other = expected.update(plainly if t == 2 else [1.0, t])
+            np.testing.assert_array_equal(one.trajectory, other.trajectory)
+            np.testing.assert_array_equal(one.noises, other.noises)
+            assert one.status == other.status
+            assert (Status.MISSING in one.status) is (t == 2)
+        expected.reset()
+        found.reset()
 
 
-def estimator(sets=None, **options):
-    system = qpmhe.System(swing, seen, n=2, p=2, **(sets or {}))
-    return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(GAIN), qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R),
-        **{"horizon": 4, "initial_state": START} | options,
+def test_the_only_output_is_missing():
+    mhe = estimator()
+    for way in (None, pd.NA, pd.NaT, NAT, [pd.NaT], np.array([NAT])):
+        assert np.isnan(mhe.update(way).noises).all()
+
+
+def test_records_with_gaps():
+    frame = pd.DataFrame({"a": pd.array([1, pd.NA, 3]), "b": pd.array([pd.NA, 0.5, None])})
+    found, expected = two().run(frame), two().run([[1, np.nan], [np.nan, 0.5], [3, np.nan]])
+    assert found.states.tolist() == expected.states.tolist()
+    batch = qpmhe.BatchEstimator(
+        system_of(), qpmhe.Luenberger([[0.3], [0.1]]), cost_of(), members=2, horizon=3,
+        initial_states=[1.0, 2.0],
     )
-
-
-NOTHING = {
-    "None": None,
-    "list of None": [None, None],
-    "tuple of None": (None, None),
-    "NaN": np.full(2, np.nan),
-    "infinite": np.array([np.inf, -np.inf]),
-    "None and NaN": [None, float("nan")],
-    "masked": np.ma.masked_array([1.0, 2.0], mask=[True, True]),
-    "large": np.array([1e200, -1e300]),
-}
-PARTLY = {
-    "None": [None, 0.7],
-    "NaN": np.array([np.nan, 0.7]),
-    "infinite": [np.inf, 0.7],
-    "masked": np.ma.masked_array([1.0, 0.7], mask=[True, False]),
-    "large": [1e200, 0.7],
-}
-
-
-@pytest.mark.parametrize("way", NOTHING)
-def test_every_way_of_saying_that_nothing_was_measured(way):
-    mhe, kept = estimator(), Record(seen, GAIN, START, (P, Q, R), 4)
-    for t, y in enumerate(MEASURED):
-        missing = t in (0, 3, 4)
-        estimate = mhe.update(NOTHING[way] if missing else y)
-        kept.push(swing, [np.nan] * 2 if missing else y)
-        assert (Status.MISSING in estimate.status) is missing
-        np.testing.assert_allclose(estimate.candidate, kept.candidate, rtol=1e-12)
-        assert estimate.candidate_cost == pytest.approx(kept.cost(kept.candidate), rel=1e-10)
-        assert estimate.cost == pytest.approx(kept.cost(estimate.trajectory), rel=1e-10)
-        gone = [time in (0, 3, 4) for time in range(kept.first, t + 1)]
-        np.testing.assert_array_equal(np.isnan(estimate.noises), np.transpose([gone, gone]))
-
-
-@pytest.mark.parametrize("way", PARTLY)
-def test_every_way_of_saying_that_a_component_was_not_measured(way):
-    mhe, kept = estimator(), Record(seen, GAIN, START, (P, Q, R), 4)
-    for t, y in enumerate(MEASURED):
-        missing = t in (0, 3, 4)
-        estimate = mhe.update(PARTLY[way] if missing else y)
-        kept.push(swing, [np.nan, 0.7] if missing else y)
-        assert (Status.MISSING in estimate.status) is missing
-        assert estimate.candidate_cost == pytest.approx(kept.cost(kept.candidate), rel=1e-10)
-        assert estimate.cost == pytest.approx(kept.cost(estimate.trajectory), rel=1e-10)
-        assert np.isfinite(estimate.noises[:, 1]).all()
-
-
-def test_nothing_is_one_and_the_same_bit_for_bit():
-    states = []
-    for nothing in (None, [None, None], np.full(2, np.nan), [np.inf, None]):
-        mhe = estimator()
-        for t, y in enumerate(MEASURED):
-            estimate = mhe.update(nothing if t % 3 == 1 else y)
-        states.append(estimate.trajectory)
-    for other in states[1:]:
-        np.testing.assert_array_equal(other, states[0])
-
-
-@pytest.mark.parametrize("backend", qpmhe.solvers.available())
-def test_every_backend_takes_missing_outputs(backend):
-    mhe, kept = estimator(backend=backend, max_qps=2), Record(seen, GAIN, START, (P, Q, R), 4)
-    for y in MEASURED * np.where(np.arange(16).reshape(8, 2) % 3 == 0, np.nan, 1.0):
-        estimate = mhe.update(y)
-        kept.push(swing, y)
-        assert estimate.cost == pytest.approx(kept.cost(estimate.trajectory), rel=1e-10)
-        assert estimate.improved
-
-
-def test_a_whole_record_without_measurements_is_the_simulation():
-    x = [np.array(START)]
-    for _ in range(12):
-        x.append(swing(x[-1]))
-    run = estimator().run(np.full((12, 2), np.nan))
-    np.testing.assert_allclose(run.states, x, rtol=1e-12)
-    np.testing.assert_array_equal(run.costs, np.zeros(12))
+    run = batch.run([[1.0, pd.NA, 2.0], [1.0, np.nan, 2.0]])
+    assert run.states[0].tolist() == run.states[1].tolist()
 
 
 def test_a_missing_component_is_not_judged_against_its_set():
     # The noise that the state would have is far outside of V where y is not there.
-    sets = {"noises": qpmhe.Box([-1.0, -1.0], [1.0, 1.0])}
-    mhe = estimator(sets, initial_state=[40.0, 0.0], max_qps=3)
+    system = system_of(h=lambda x: x, p=2, noises=qpmhe.Box([-1.0, -1.0], [1.0, 1.0]))
+    cost = cost_of(2, 2, disturbance=100.0 * np.eye(2))
+    mhe = two(system, cost, initial_state=[40.0, 0.0], max_qps=3)
     for t in range(6):
-        z = mhe.state
-        estimate = mhe.update([None, z[1] + 0.2] if t % 2 else None)
+        estimate = mhe.update([None, mhe.state[1] + 0.2] if t % 2 else None)
         assert estimate.dropped == ()
         assert not estimate.status & (Status.CANDIDATE_OUTSIDE | Status.ROWS_DROPPED)
-        noises = estimate.noises[:, 1]
-        assert np.abs(noises[np.isfinite(noises)]).max(initial=0.0) <= 1.0 + 1e-8
     # The component that is there is judged.
     assert estimate.improved
     estimate = mhe.update([None, mhe.state[1] + 30.0])
@@ -129,22 +86,55 @@ def test_a_missing_component_is_not_judged_against_its_set():
     assert estimate.dropped == (("noises", 1, "upper", 6),)
 
 
-@pytest.mark.parametrize("y", [np.full(2, np.nan), np.array([np.inf, 0.7])], ids=str)
-def test_the_model_is_called_once_at_the_candidate_all_the_same(y):
+def test_the_model_is_called_once_at_the_candidate_all_the_same():
     calls = []
 
     def counting(x):
-        if x.ndim == 1:
-            calls.append(x.tolist())
-        return swing(x)
+        calls.append(x.ndim)
+        return 0.9 * x
 
-    jacobian = qpmhe.System(swing, seen, n=2, p=2).f_jacobian.direct
-    mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(untraced(counting), seen, n=2, p=2, f_jacobian=jacobian),
-        qpmhe.Luenberger(GAIN), qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R),
-        horizon=4, initial_state=START,
+    mhe = two(qpmhe.System(
+        untraced(counting), lambda x: x, n=2, p=2,
+        f_jacobian=lambda x: np.broadcast_to(0.9 * np.eye(2), (*x.shape, 2)),
+    ))
+    mhe.update([1.0, 2.0])
+    for y in (None, [np.inf, 0.7]):
+        calls.clear()
+        mhe.update(y)
+        assert calls.count(1) == 1
+
+
+DATE, DURATION = np.datetime64("2026-01-01T00:00:05"), np.timedelta64(5, "s")
+TIMES = [
+    np.array([DATE]), DATE, DURATION, [DURATION], [datetime(2026, 1, 1)], [timedelta(seconds=5)],
+    [pd.Timestamp(DATE)], [pd.Timedelta(DURATION)], pd.Series([DATE]), pd.DatetimeIndex([DATE]),
+    np.array([DURATION], object), np.ma.array([DURATION], mask=[False]),
+]
+
+
+def test_times_are_no_measurements():
+    calls, words = [], "not an array of real numbers"
+    for y in TIMES:
+        record = [y, y] if np.ndim(y) else [[y], [y]]
+        calls += [
+            (InvalidInputError, ["y is ", words], lambda mhe, y=y: mhe.update(y)),
+            (InvalidInputError, ["measurements is ", words], lambda mhe, Y=record: mhe.run(Y)),
+        ]
+    unharmed(estimator, calls, ([1.5],))
+    text = ["dates or durations", "(t - t[0]) / numpy.timedelta64(1, 's')"]
+    check(InvalidInputError, text, estimator().update, TIMES[0])
+    text = ["gain is [nan, 1.0]", "finite"]
+    check(InvalidInputError, text, qpmhe.Luenberger, [pd.NA, 1.0])
+
+
+def test_neither_scipy_nor_pandas_is_imported():
+    code = (
+        "import sys, numpy as np, qpmhe.observers\n"
+        "assert not [name for name in sys.modules if name.startswith('scipy')]\n"
+        "system, observer, cost, scenario = qpmhe.models.batch_reactor()\n"
+        "mhe = qpmhe.MovingHorizonEstimator(system, observer, cost, horizon=3,\n"
+        "    initial_state=[3.0, 0.0])\n"
+        "mhe.update([None]), mhe.update(np.array([7.0], object))\n"
+        "assert 'pandas' not in sys.modules\n"
     )
-    mhe.update(MEASURED[0])
-    calls.clear()
-    mhe.update(y)
-    assert len(calls) == 1
+    subprocess.run([sys.executable, "-c", code], check=True)

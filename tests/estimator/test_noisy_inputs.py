@@ -14,7 +14,7 @@ from .plain import spd
 class Plant:
     """A random linear system whose inputs, some of them measured with noise, act on y as well."""
 
-    def __init__(self, seed, n=3, p=2, m=2, noisy=(0, 1), steps=60):
+    def __init__(self, seed, n=3, p=2, m=2, noisy=(0, 1), steps=40):
         rng = np.random.default_rng(seed)
         a = rng.standard_normal((n, n))
         self.A = a * (0.95 / np.abs(np.linalg.eigvals(a)).max())
@@ -22,14 +22,12 @@ class Plant:
         self.P, self.Q, self.R = spd(rng, n), 0.1 * spd(rng, n), spd(rng, p)
         self.noisy, self.Qu = list(noisy), spd(rng, len(noisy))
         self.start, self.U = rng.standard_normal(n), rng.standard_normal((steps, m))
-        x, self.Y, self.X = self.start + rng.standard_normal(n), [], []
+        x, self.Y = self.start + rng.standard_normal(n), []
         for u in self.U:
             acting = u.copy()
             acting[self.noisy] += np.linalg.cholesky(self.Qu) @ rng.standard_normal(len(noisy))
             self.Y.append(self.C @ x + np.linalg.cholesky(self.R) @ rng.standard_normal(p))
             x = self.A @ x + self.B @ acting + np.linalg.cholesky(self.Q) @ rng.standard_normal(n)
-            self.X.append(x)
-        self.Y = np.array(self.Y)
 
     def kalman(self):
         """Predicted and filtered states with the process noise Q + B Qu B'."""
@@ -48,48 +46,37 @@ class Plant:
         plant = qpmhe.System(
             lambda x, u: x @ A.T + u @ B.T, lambda x: x @ C.T, n=len(A), p=len(C), m=B.shape[1]
         )
-        prior, disturbance = block_diag(self.P, self.Qu), block_diag(self.Q, self.Qu)
+        covariances = {"disturbance": block_diag(self.Q, self.Qu), "noise": self.R}
         return qpmhe.MovingHorizonEstimator(
             qpmhe.noisy_inputs(plant, self.noisy),
-            qpmhe.ExtendedKalman(prior=prior, disturbance=disturbance, noise=self.R),
-            qpmhe.QuadraticCost.from_covariances(
-                prior=qpmhe.ObserverPrior(), disturbance=disturbance, noise=self.R
-            ),
+            qpmhe.ExtendedKalman(prior=block_diag(self.P, self.Qu), **covariances),
+            qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(), **covariances),
             horizon=horizon, initial_state=[*self.start, *np.zeros(k)], **options,
         )
 
 
-@pytest.mark.parametrize("horizon", [1, 2, 5, 20])
+@pytest.mark.parametrize("horizon", [1, 5, 20])
 @pytest.mark.parametrize("noisy", [(0, 1), (1,)])
 def test_it_is_the_kalman_filter_with_the_inputs_covariance(noisy, horizon):
-    for seed in range(3):
-        plant = Plant(seed, noisy=noisy)
-        predicted, filtered = plant.kalman()
-        mhe = plant.estimator(horizon)
-        for t, (y, u) in enumerate(zip(plant.Y, plant.U, strict=True)):
-            estimate = mhe.update(y, u)
-            mean, covariance = predicted[t]
-            np.testing.assert_allclose(estimate.state[:3], mean, rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(estimate.filtered[:3], filtered[t], rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(
-                mhe.covariances()[-1], block_diag(covariance, plant.Qu), rtol=1e-8, atol=1e-9
-            )
-
-
-def test_errors_of_inputs_are_estimated_within_the_window():
-    """What the estimate calls e is what it needs besides w to explain the record."""
-    plant = Plant(7, noisy=(1,))
-    mhe = plant.estimator(10)
+    plant = Plant(horizon, noisy=noisy)
+    predicted, filtered = plant.kalman()
+    mhe = plant.estimator(horizon)
     for t, (y, u) in enumerate(zip(plant.Y, plant.U, strict=True)):
         estimate = mhe.update(y, u)
+        mean, covariance = predicted[t]
+        np.testing.assert_allclose(estimate.state[:3], mean, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(estimate.filtered[:3], filtered[t], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            mhe.covariances()[-1], block_diag(covariance, plant.Qu), rtol=1e-8, atol=1e-9
+        )
+        # What the estimate calls e is what it needs besides w to explain the record.
         x, e = estimate.trajectory[:, :3], estimate.trajectory[:, 3:]
         inputs = plant.U[t + 1 - len(estimate.noises) : t + 1].copy()
-        inputs[:, 1:] += e[:-1]
+        inputs[:, plant.noisy] += e[:-1]
         w = x[1:] - x[:-1] @ plant.A.T - inputs @ plant.B.T
-        np.testing.assert_allclose(estimate.disturbances[:, :3], w, atol=1e-12)
-        np.testing.assert_allclose(estimate.disturbances[:, 3:], e[1:], atol=1e-12)
+        np.testing.assert_allclose(estimate.disturbances, np.hstack((w, e[1:])), atol=1e-11)
         assert np.abs(e[-1]).max() < 1e-9  # no measurement has seen it yet
-    assert np.abs(e[:-1]).max() > 0.05
+    assert horizon == 1 or np.abs(e[:-1]).max() > 0.05
 
 
 def tank(x, u):
@@ -155,92 +142,47 @@ def test_ipopt_finds_the_same_minimum_on_a_nonlinear_plant():
 
 
 def test_a_plant_of_which_only_one_function_takes_inputs():
-    for f, h in (
-        (lambda x, u: 0.5 * x + u, lambda x: x), (lambda x: 0.5 * x, lambda x, u: x + u),
+    for f, h, ahead, output in (
+        (lambda x, u: 0.5 * x + u, lambda x: x, [2.25, 0.0], [2.0]),
+        (lambda x: 0.5 * x, lambda x, u: x + u, [1.0, 0.0], [3.25]),
     ):
         system = qpmhe.noisy_inputs(qpmhe.System(f, h, n=1, p=1, m=1))
         z, u = np.array([2.0, 0.25]), np.ones(1)
-        expected = [0.5 * 2.0 + (1.25 if f.__code__.co_argcount == 2 else 0.0), 0.0]
-        np.testing.assert_array_equal(system.f(z, u), expected)
-        np.testing.assert_array_equal(
-            system.h(z, u), [2.0 + (1.25 if h.__code__.co_argcount == 2 else 0.0)]
-        )
+        np.testing.assert_array_equal(system.f(z, u), ahead)
+        np.testing.assert_array_equal(system.h(z, u), output)
 
 
 def test_finite_differences_have_the_scales_of_the_augmented_state():
     """A model that refuses complex numbers, in tiny units."""
-
     def rigid(x, u):
         return np.array([0.9 * float(x[0]) + 1e-3 * float(u[0])])
 
-    system = qpmhe.noisy_inputs(qpmhe.System(rigid, lambda x: x[:1], n=1, p=1, m=1))
-    cost = qpmhe.QuadraticCost.from_covariances(
-        prior=np.diag([1e-18, 1e-12]), disturbance=np.diag([1e-20, 1e-12]), noise=1e-19
-    )
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.2, 0.0]), cost, horizon=5, initial_state=[1e-9, 0.0]
-    )
-    assert system.f_jacobian.method == "finite differences"
-    y = 1e-9 * np.sin(np.arange(10.0))
-    run = mhe.run(y, np.full((10, 1), 1e-6))
-    large = qpmhe.MovingHorizonEstimator(
-        qpmhe.noisy_inputs(qpmhe.System(
-            lambda x, u: 0.9 * x + u, lambda x: x, n=1, p=1, m=1
-        )),
-        qpmhe.Luenberger([0.2, 0.0]),
-        qpmhe.QuadraticCost.from_covariances(
-            prior=np.eye(2), disturbance=np.diag([1e-2, 1.0]), noise=1e-1
-        ), horizon=5, initial_state=[1.0, 0.0],
-    ).run(1e9 * y, np.ones((10, 1)))
-    np.testing.assert_allclose(1e9 * run.states[:, 0], large.states[:, 0], rtol=1e-7)
-
-
-def swing(x, u):
-    return np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0])], axis=-1)
-
-
-def angle(x):
-    return x[..., :1]
-
-
-@pytest.mark.parametrize("stop", [2, 9, 15])
-def test_irregular_steps_and_snapshots(stop):
-    plant = qpmhe.System.from_ode(swing, angle, dt=0.1, n=2, p=1, m=1)
-    cost = qpmhe.QuadraticCost.from_covariances(
-        prior=np.diag([0.1, 0.1, 0.04]), disturbance=np.diag([1e-4, 1e-4, 0.04]), noise=1e-2
-    )
-
-    def made():
-        return qpmhe.MovingHorizonEstimator(
-            qpmhe.noisy_inputs(plant), qpmhe.Luenberger([0.2, 0.1, 0.0]), cost, horizon=5,
-            initial_state=[0.3, 0.0, 0.0],
+    found, y = [], np.sin(np.arange(10.0))
+    for f, unit, u in ((rigid, 1e-9, 1e-6), (lambda x, u: 0.9 * x + u, 1.0, 1.0)):
+        system = qpmhe.noisy_inputs(qpmhe.System(f, lambda x: x[:1], n=1, p=1, m=1))
+        prior, disturbance = np.diag([unit**2, u**2]), np.diag([1e-2 * unit**2, u**2])
+        cost = qpmhe.QuadraticCost.from_covariances(
+            prior=prior, disturbance=disturbance, noise=1e-1 * unit**2
         )
-
-    def feed(mhe, times):
-        return [
-            mhe.update([0.3 * np.cos(t)], [0.1], dt=0.25 if t % 4 == 3 else None) for t in times
-        ]
-
-    whole, loaded = made(), made()
-    feed(whole, range(stop))
-    loaded.load_state_dict(whole.state_dict())
-    restored = pickle.loads(pickle.dumps(whole))
-    expected = feed(whole, range(stop, 20))
-    for one in (loaded, restored):
-        for found, other in zip(feed(one, range(stop, 20)), expected, strict=True):
-            assert (found.trajectory == other.trajectory).all()
-    x, e = expected[-1].trajectory[:, :2], expected[-1].trajectory[:, 2:]
-    step = plant.timed.f(x[-2], np.append(0.1 + e[-2], 0.25))
-    np.testing.assert_allclose(expected[-1].disturbances[-1, :2], x[-1] - step, atol=1e-14)
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.2, 0.0]), cost, horizon=5, initial_state=[unit, 0.0]
+        )
+        found.append(mhe.run(unit * y, np.full((10, 1), u)).states[:, 0] / unit)
+        assert (system.f_jacobian.method == "finite differences") == (f is rigid)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-7)
 
 
 def spring(x, u):
     return np.stack([x[..., 1], u[..., 0] - u[..., 1] * x[..., 0]], axis=-1)
 
 
+def position(x):
+    return x[..., :1]
+
+
 @pytest.mark.parametrize("second", ["parameter", "noisy input"])
 def test_a_system_with_noisy_inputs_is_augmented_with_its_sampling_time(second):
-    plant = qpmhe.System.from_ode(spring, angle, dt=0.1, n=2, p=1, m=2)
+    plant = qpmhe.System.from_ode(spring, position, dt=0.1, n=2, p=1, m=2)
     noisy = qpmhe.noisy_inputs(plant, [0])
     if second == "parameter":
         system, more, known = qpmhe.augment_parameters(noisy, nominal=[3.0]), 3.0, [0.5]
@@ -255,14 +197,8 @@ def test_a_system_with_noisy_inputs_is_augmented_with_its_sampling_time(second):
             found = one.timed.f(z, np.append(known, step))
             np.testing.assert_allclose(found, np.append(expected, kept), rtol=1e-14)
         np.testing.assert_allclose(one.f(z, np.array(known)), one.timed.f(z, np.append(known, 0.1)))
-
-
-def test_all_inputs_may_be_parameters_of_a_system_with_noisy_inputs():
-    plant = qpmhe.System.from_ode(spring, angle, dt=0.1, n=2, p=1, m=2)
-    system = qpmhe.augment_parameters(qpmhe.noisy_inputs(plant, [0]), nominal=[0.5, 3.0])
-    z = np.array([0.3, -0.2, 0.1, 0.5, 3.0])
-    expected = plant.f(z[:2], np.array([0.6, 3.0]))
-    np.testing.assert_allclose(
-        system.f(z, np.zeros(0)), np.append(expected, [0.0, 0.5, 3.0]), rtol=1e-14
-    )
+    system = qpmhe.augment_parameters(noisy, nominal=[0.5, 3.0])  # all inputs are parameters
+    z, expected = np.array([0.3, -0.2, 0.1, 0.5, 3.0]), plant.f(z[:2], np.array([0.6, 3.0]))
+    found = system.f(z, np.zeros(0))
+    np.testing.assert_allclose(found, np.append(expected, [0.0, 0.5, 3.0]), rtol=1e-14)
     assert system.dt == 0.1

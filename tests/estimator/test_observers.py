@@ -1,296 +1,465 @@
+"""Observers: their gains and covariances, what they refuse, and the state beside each estimate."""
+
 import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.errors import ModelError
+from qpmhe import Status
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, ShapeError, WeightError
+from qpmhe.observers import (
+    ExtendedKalman,
+    HighGain,
+    Luenberger,
+    OutputInjection,
+    Sample,
+    SteadyStateKalman,
+    UnscentedKalman,
+    design_luenberger,
+)
+
+from .plain import spd
+from .spoil import check, cost_of
+
+DT = 0.05
+NONE = np.zeros(0)
 
 
-def spd(generator, n):
-    root = generator.standard_normal((n, n))
-    return root @ root.T + 0.5 * np.eye(n)
+def linear(A, C, **options):
+    A, C = np.array(A, dtype=float), np.array(C, dtype=float)
+    return qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=len(A), p=len(C), **options)
 
 
-def linear_system(a, c, b=None):
-    if b is None:
-        return qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=len(a), p=len(c))
-    return qpmhe.System(
-        lambda x, u: x @ a.T + u @ b.T, lambda x: x @ c.T, n=len(a), p=len(c), m=b.shape[1]
-    )
-
-
-def observer_alone(system, observer, start, **options):
-    n, p = system.n, system.p
-    cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=np.eye(p))
+def estimator(system, observer, start, **options):
+    """Of the observer alone, if nothing else is asked for."""
     return qpmhe.MovingHorizonEstimator(
-        system, observer, cost, initial_state=start, max_qps=0, **{"horizon": 3, **options}
+        system, observer, cost_of(system.n, system.p), initial_state=start,
+        **{"horizon": 3, "max_qps": 0} | options,
     )
 
 
-# Luenberger
+class Plant:
+    """A random observable linear system with dense covariances."""
+
+    def __init__(self, seed, n=3, p=2, radius=1.05):
+        rng = np.random.default_rng(seed)
+        a = rng.standard_normal((n, n))
+        self.A = a * (radius / np.abs(np.linalg.eigvals(a)).max())
+        self.C, self.start = rng.standard_normal((p, n)), rng.standard_normal(n)
+        self.P = spd(rng, n)
+        self.covariances = {"disturbance": spd(rng, n), "noise": spd(rng, p)}
+        self.system = linear(self.A, self.C)
+
+    def sample(self, P, seen=None):
+        return Sample(self.system, NONE, self.A, self.C, seen, covariance=P)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (2, 1), (3, 2), (2, 3)])
-def test_kappa_is_the_least_bound_of_the_correction(shape):
-    generator = np.random.default_rng(1)
-    observer = qpmhe.Luenberger(generator.standard_normal(shape))
-    n, p = shape
-    sample = qpmhe.Sample(linear_system(np.eye(n), np.ones((p, n))), np.zeros(0))
-    ratios = []
-    for _ in range(2000):
-        v = generator.standard_normal(p)
-        correction, covariance = observer.correct(np.zeros(n), v, sample)
-        assert covariance is None
-        ratios.append(np.linalg.norm(correction) / np.linalg.norm(v))
-    assert max(ratios) <= observer.kappa * (1 + 1e-12)
-    worst = np.linalg.svd(observer.gain)[2][0]
-    correction, _ = observer.correct(np.zeros(n), worst, sample)
-    assert np.linalg.norm(correction) == pytest.approx(observer.kappa, rel=1e-12)
+def poles_of(matrix):
+    return np.sort_complex(np.linalg.eigvals(matrix))
 
 
-@pytest.mark.parametrize(
-    ("gain", "shape"),
-    [
-        (0.3, (1, 1)),
-        ([0.3], (1, 1)),
-        ([[0.3]], (1, 1)),
-        ([0.3, 0.1], (2, 1)),
-        ([[0.3], [0.1]], (2, 1)),
-        ([[0.3, 0.2]], (1, 2)),
-        (np.ones((3, 2), dtype=int), (3, 2)),
-    ],
-    ids=str,
-)
-def test_gain_shapes(gain, shape):
-    n, p = shape
-    observer = qpmhe.Luenberger(gain)
-    assert observer.gain.shape == shape
-    mhe = observer_alone(linear_system(0.5 * np.eye(n), np.ones((p, n))), observer, np.zeros(n))
-    y = np.arange(1.0, p + 1.0)
-    expected = np.array(gain, dtype=float).reshape(shape) @ y
-    np.testing.assert_allclose(mhe.update(y).state, expected, rtol=1e-15)
+def oscillator():
+    def rate(x):
+        return np.stack([x[..., 1], (1 - x[..., 0] ** 2) * x[..., 1] - x[..., 0]], axis=-1)
+
+    return qpmhe.System.from_ode(rate, lambda x: x[..., :1], dt=DT, n=2, p=1)
 
 
-def test_the_gain_is_a_copy():
-    gain = np.array([[0.3], [0.1]])
-    observer = qpmhe.Luenberger(gain)
-    gain[0, 0] = 9.0
-    assert observer.gain[0, 0] == 0.3
+# Gains and corrections of one's own
 
 
-# Output injection
+def test_luenberger():
+    for gain, shape in (
+        (0.3, (1, 1)), ([0.3, 0.1], (2, 1)), ([[0.3, 0.2]], (1, 2)), (np.ones((3, 2), int), (3, 2))
+    ):
+        assert Luenberger(gain).gain.shape == shape
+    gain = np.random.default_rng(1).standard_normal((3, 2))
+    observer, sample = Luenberger(gain), Sample(linear(np.eye(3), np.ones((2, 3))), NONE)
+    left, values, right = np.linalg.svd(gain)
+    gain[...] = np.nan  # it keeps a copy
+    correction, covariance = observer.correct(np.zeros(3), right[0], sample)
+    np.testing.assert_allclose(correction, values[0] * left[:, 0], rtol=1e-12)
+    assert observer.kappa == pytest.approx(values[0], rel=1e-12)
+    assert covariance is None
 
 
-def injection_case(correction, start=(1.0, -2.0)):
-    system = linear_system(0.5 * np.eye(2), np.eye(2))
-    return observer_alone(system, qpmhe.OutputInjection(correction), start)
-
-
-@pytest.mark.parametrize(
-    ("correction", "value"),
-    [
-        pytest.param(lambda z, v: v + 1e-9, "1e-09", id="offset"),
-        pytest.param(lambda z, v: v + 0.01 * z, "0.01", id="of the state"),
-        pytest.param(lambda z, v: np.array([v[0], z[0] - 1.0]), "[0.0, ", id="not at the start"),
-        pytest.param(lambda z, v: v / np.linalg.norm(v), "nan", id="undefined at zero"),
-        pytest.param(lambda z, v: np.array([np.inf, 0.0]), "inf", id="infinite"),
-    ],
-)
-def test_a_correction_that_does_not_vanish_is_refused(correction, value):
-    with pytest.raises(ModelError) as caught:
-        injection_case(correction)
-    text = str(caught.value)
-    assert value in text
-    assert "L(z, 0) = 0" in text
-
-
-@pytest.mark.parametrize(
-    ("correction", "shape"),
-    [
-        pytest.param(lambda z, v: 0.1 * v[:1], "(1,)", id="short"),
-        pytest.param(lambda z, v: 0.1 * v[:, None], "(2, 1)", id="column"),
-        pytest.param(lambda z, v: 0.1 * v[0], "()", id="scalar"),
-    ],
-)
-def test_a_correction_of_the_wrong_shape_is_refused(correction, shape):
-    with pytest.raises(ModelError) as caught:
-        injection_case(correction)
-    assert f"correction returned shape {shape}" in str(caught.value)
-    assert "(2,)" in str(caught.value)
-
-
-def test_a_correction_that_raises_is_refused():
+def changing(which):
     def correction(z, v):
-        raise ZeroDivisionError("no luck")
-
-    with pytest.raises(ModelError, match=r"ZeroDivisionError: no luck at z = \[1.0, -2.0\]"):
-        injection_case(correction)
-
-
-def test_a_correction_that_is_no_function_is_refused():
-    with pytest.raises(ModelError, match=r"correction is 0.3; expected a function"):
-        qpmhe.OutputInjection(0.3)
-
-
-@pytest.mark.parametrize("which", ["z", "v"])
-def test_a_correction_that_changes_its_argument_is_refused(which):
-    def correction(z, v):
-        written = z if which == "z" else v
-        written *= 0.5
+        (z if which == "z" else v)[...] *= 0.5
         return 0.1 * v
 
-    with pytest.raises(ModelError, match="in place"):
-        injection_case(correction)
+    return correction
+
+
+def test_output_injection():
+    system, start = linear(0.5 * np.eye(2), np.eye(2)), [1.0, -2.0]
+    listed = estimator(system, OutputInjection(lambda z, v: [0.1 * v[0] - v[1], 0.3 * v[1]]), start)
+    matrix = estimator(system, Luenberger([[0.1, -1.0], [0.0, 0.3]]), start)
+    Y = np.random.default_rng(2).standard_normal((9, 2))
+    np.testing.assert_allclose(listed.run(Y).states, matrix.run(Y).states, rtol=1e-13, atol=1e-15)
+    nothing = "L(z, 0) = 0"
+    for correction, text in (
+        (lambda z, v: v + 1e-9, ["1e-09", nothing]),
+        (lambda z, v: v + 0.01 * z, ["0.01", nothing]),
+        (lambda z, v: np.array([v[0], z[0] - 1.0]), ["[0.0, ", nothing]),  # not at the start
+        (lambda z, v: v / np.linalg.norm(v), ["nan", nothing]),
+        (lambda z, v: np.array([np.inf, 0.0]), ["inf", nothing]),
+        (lambda z, v: 0.1 * v[:, None], ["correction returned shape (2, 1)", "(2,)"]),
+        (lambda z, v: 0.1 * v[0], ["correction returned shape ()", "(2,)"]),
+        (lambda z, v: [][0], ["IndexError: ", "at z = [1.0, -2.0]"]),
+        (changing("z"), ["in place"]),
+        (changing("v"), ["in place"]),
+    ):
+        check(ModelError, text, estimator, system, OutputInjection(correction), start)
+    check(ModelError, ["correction is 0.3; expected a function"], OutputInjection, 0.3)
+
+
+# Kalman-type observers
+
+
+def test_the_extended_covariance_stays_symmetric_and_positive():
+    rng = np.random.default_rng(5)
+    for prior, disturbance, noise in (
+        (1.0, 1e-2, 1e-2), (1e-6, 1.0, 1e3), (1e6, 1e-6, 1e-4), (1e8, 1e-4, 1e-4)
+    ):
+        plant, P = Plant(int(rng.integers(99)), 4, 2, 1.0), prior * np.eye(4)
+        covariances = {"disturbance": disturbance * np.eye(4), "noise": noise * np.eye(2)}
+        observer = ExtendedKalman(prior=P, **covariances)
+        for _ in range(50):
+            sample = plant.sample(P, rng.random(2) < 0.8)
+            _, P = observer.correct(np.zeros(4), np.zeros(2), sample)
+            values = np.linalg.eigvalsh(P)
+            assert np.abs(P - P.T).max() <= 1e-14 * values[-1]
+            # P+ >= Q, up to the rounding of P+ itself.
+            assert values[0] >= 0.99 * disturbance - 1e-12 * values[-1]
+
+
+def test_one_observer_serves_several_estimators():
+    plant, Y = Plant(8), np.random.default_rng(8).standard_normal((20, 2))
+    prior = plant.P.copy()
+    for observer in (
+        ExtendedKalman(prior=prior, **plant.covariances),
+        SteadyStateKalman(plant.system, plant.start, **plant.covariances, prior=prior),
+    ):
+        first = estimator(plant.system, observer, plant.start)
+        expected = first.run(Y).states
+        second = estimator(plant.system, observer, plant.start)
+        first.reset(plant.start + 5.0)
+        for y in Y:
+            first.update(y)
+            second.update(y)
+        np.testing.assert_array_equal(second.state, expected[-1])
+        prior[...] = np.nan  # of which there is a copy
+        np.testing.assert_array_equal(observer.initial_covariance(), plant.P)
+        prior[...] = plant.P
+
+
+@pytest.mark.parametrize(("n", "p", "radius"), [(1, 1, 1.2), (2, 1, 0.7), (3, 2, 1.05), (4, 3, 1)])
+def test_the_steady_gain_is_the_limit_of_the_extended_kalman_observer(n, p, radius):
+    plant = Plant(n, n, p, radius)
+    steady = SteadyStateKalman(plant.system, plant.start, **plant.covariances)
+    moving, P = ExtendedKalman(prior=plant.P, **plant.covariances), plant.P
+    for _ in range(400):
+        _, P = moving.correct(plant.start, np.zeros(p), plant.sample(P))
+    gain = [moving.correct(plant.start, v, plant.sample(P))[0] for v in np.eye(p)]
+    np.testing.assert_allclose(steady.gain, np.transpose(gain), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(steady.covariance, P, rtol=1e-8)
+    np.testing.assert_array_equal(
+        steady.gain, design_luenberger(plant.system, plant.start, **plant.covariances).gain
+    )
+
+
+def test_unscented_moments():
+    # f = x^2 about z = 0: the mean square of f(z + d) - f(z) is E d^4 = 3 P^2, its covariance
+    # only 2 P^2; the extended Kalman filter sees nothing at all. E f h = E d^3 = 0.
+    system = qpmhe.System(lambda x: x**2, lambda x: x + x**3, n=1, p=1)
+    observer = UnscentedKalman(prior=[[2.0]], disturbance=[[0.5]], noise=[[1.0]])
+    sample = Sample(system, NONE, covariance=np.array([[2.0]]))
+    correction, following = observer.correct(np.zeros(1), np.ones(1), sample)
+    np.testing.assert_allclose(following, [[3 * 2.0**2 + 0.5]])
+    np.testing.assert_allclose(correction, 0.0, atol=1e-15)
+    # Without spread they are those of the linearisation.
+    system, z, v = oscillator(), np.array([1.0, -2.0]), np.array([0.3])
+    noises = {"prior": np.eye(2), "disturbance": 0.01 * np.eye(2), "noise": [[0.1]]}
+    sample = Sample(
+        system, NONE, system.f_jacobian(z, NONE), system.h_jacobian(z, NONE),
+        covariance=np.array([[0.5, 0.2], [0.2, 0.7]]),
+    )
+    expected = ExtendedKalman(**noises).correct(z, v, sample)
+    found = UnscentedKalman(**noises, spread=1e-5).correct(z, v, sample)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_sigma_points_stay_within_the_bounds():
+    # A model that ends where the bounds do. Torricelli: the tank's outflow is a root.
+    def f(x):
+        return x - 0.05 * np.sqrt(x) + 0.04
+
+    observer = UnscentedKalman(prior=[[1.0]], disturbance=[[1e-3]], noise=[[0.1]])
+    Y = 0.5 + 0.3 * np.random.default_rng(1).standard_normal(60)
+    for states, fails in ((qpmhe.Box([0.0], [np.inf]), False), (None, True)):
+        system = qpmhe.System(f, lambda x: x, n=1, p=1, states=states)
+        run = estimator(system, observer, [0.1]).run(Y)
+        assert (run.share(Status.MODEL_FAILED) > 0) == fails
+    # On a linear system they change nothing.
+    plant, v = Plant(32, n=2, p=1), np.array([0.7])
+    observer = UnscentedKalman(prior=plant.P, **plant.covariances)
+    expected = observer.correct(plant.start, v, plant.sample(plant.P))
+    for below in ([10.0, 5.0], [0.3, 1.0], [0.0, 0.0], [-1.0, 2.0]):
+        box = qpmhe.Box(plant.start - below, plant.start + np.array([5.0, np.inf]))
+        sample = Sample(linear(plant.A, plant.C, states=box), NONE, covariance=plant.P)
+        for one, other in zip(observer.correct(plant.start, v, sample), expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9)
+
+
+# Designed gains
 
 
 @pytest.mark.parametrize(
-    "correction",
+    ("n", "p", "poles"),
     [
-        pytest.param(lambda z, v: np.array([0.1 * v[0] - v[1], 0.3 * v[1]]), id="array"),
-        pytest.param(lambda z, v: [0.1 * v[0] - v[1], 0.3 * v[1]], id="list"),
-        pytest.param(lambda z, v: np.array([[0.1, -1.0], [0.0, 0.3]]) @ v, id="matrix"),
+        (1, 2, [0.3]), (2, 1, [0.5 + 0.2j, 0.5 - 0.2j]), (2, 2, [0.4, 0.4]), (3, 1, [0.0] * 3),
+        (3, 1, [0.6, 0.6, -0.2]), (4, 2, [0.3 - 0.6j, 0.9, 0.3 + 0.6j, -0.5]),
+        (5, 3, [0.1, 0.2, 0.3, 0.4, 0.5]),
     ],
 )
-def test_a_linear_correction_equals_luenberger(correction):
-    system = linear_system(0.5 * np.eye(2), np.eye(2))
-    gain = qpmhe.Luenberger([[0.1, -1.0], [0.0, 0.3]])
-    ys = np.random.default_rng(2).standard_normal((20, 2))
-    runs = [
-        observer_alone(system, observer, [1.0, -2.0]).run(ys)
-        for observer in (gain, qpmhe.OutputInjection(correction))
-    ]
-    np.testing.assert_allclose(runs[0].states, runs[1].states, rtol=1e-14, atol=1e-15)
-    np.testing.assert_allclose(runs[0].costs, runs[1].costs, rtol=1e-13)
+def test_poles_are_placed_as_asked(n, p, poles):
+    plant = Plant(20 + n + p, n, p)
+    gain = design_luenberger(plant.system, plant.start, poles=poles).gain
+    assert gain.shape == (n, p)
+    np.testing.assert_allclose(
+        np.poly(plant.A - gain @ plant.C), np.poly(poles).real, rtol=0, atol=1e-8
+    )
 
 
-def test_a_nonlinear_correction_drives_the_observer():
-    def correction(z, v):
-        return 0.1 * np.tanh(v) * (1.0 + z**2)
-
-    mhe = injection_case(correction)
-    z = np.array([1.0, -2.0])
-    for y in np.random.default_rng(3).uniform(-1.0, 1.0, (10, 2)):
-        z = 0.5 * z + 0.1 * np.tanh(y - z) * (1.0 + z**2)
-        np.testing.assert_allclose(mhe.update(y).state, z, rtol=1e-13)
-
-
-# Extended Kalman
-
-
-def kalman_predictor(a, c, prior, q, r, start, ys, drive):
-    """Textbook filter in measurement and time update; rows of y may be NaN in part."""
-    x, covariance, states, covariances = np.array(start), prior, [np.array(start)], [prior]
-    for y, shift in zip(ys, drive, strict=True):
-        there = ~np.isnan(y)
-        if there.any():
-            cy, ry = c[there], r[np.ix_(there, there)]
-            gain = covariance @ cy.T @ np.linalg.inv(cy @ covariance @ cy.T + ry)
-            x = x + gain @ (y[there] - cy @ x)
-            rest = np.eye(len(x)) - gain @ cy
-            covariance = rest @ covariance @ rest.T + gain @ ry @ gain.T
-        x, covariance = a @ x + shift, a @ covariance @ a.T + q
-        states.append(x)
-        covariances.append(covariance)
-    return np.array(states), np.array(covariances)
+def test_poles_of_odd_systems():
+    for step in (1.0, 1e-2, 1e-4):  # close to 1 in short steps
+        A, poles = np.eye(4) + step * np.eye(4, k=1), np.exp(-step * np.arange(1.0, 5.0))
+        gain = design_luenberger(linear(A, np.eye(1, 4)), np.zeros(4), poles=poles).gain
+        rates = (1.0 - np.linalg.eigvals(A - gain @ np.eye(1, 4))) / step
+        np.testing.assert_allclose(np.sort(rates.real), np.sort((1.0 - poles) / step), rtol=1e-4)
+    # Two outputs that say the same are one.
+    A, C = np.eye(3) + 0.1 * np.eye(3, k=1), np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    gain = design_luenberger(linear(A, C), np.zeros(3), poles=[0.3, 0.4, 0.5]).gain
+    np.testing.assert_allclose(poles_of(A - gain @ C), [0.3, 0.4, 0.5], atol=1e-8)
+    # An unobservable mode that decays is left alone.
+    A, C = np.array([[1.1, 0.0], [0.3, 0.5]]), np.eye(1, 2)
+    gain = design_luenberger(linear(A, C), [0.0, 0.0], disturbance=np.eye(2), noise=1.0).gain
+    poles = poles_of(A - gain @ C)
+    assert np.abs(poles).max() < 1
+    assert np.abs(poles - 0.5).min() < 1e-12
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize(("n", "p", "m"), [(1, 1, 0), (2, 1, 0), (3, 2, 0), (2, 3, 1), (4, 2, 2)])
-def test_extended_kalman_is_the_kalman_predictor_on_linear_systems(n, p, m, missing):
-    generator = np.random.default_rng(10 * n + p)
-    a = generator.standard_normal((n, n))
-    a /= 1.05 * np.abs(np.linalg.eigvals(a)).max()
-    c, b = generator.standard_normal((p, n)), generator.standard_normal((n, m))
-    prior, q, r = spd(generator, n), spd(generator, n), spd(generator, p)
-    start = generator.standard_normal(n)
-    ys, us = generator.standard_normal((40, p)), generator.standard_normal((40, m))
-    ys[generator.random((40, p)) < missing] = np.nan
-    states, covariances = kalman_predictor(a, c, prior, q, r, start, ys, us @ b.T)
+def test_a_gain_is_for_the_point_and_the_input():
+    def f(x, u):
+        return np.array([x[0] + 0.1 * x[1], x[1] - 0.1 * u[0] * np.sin(x[0])])
 
-    observer = qpmhe.ExtendedKalman(prior=prior, disturbance=q, noise=r)
-    system = linear_system(a, c, b if m else None)
-    run = observer_alone(system, observer, start).run(ys, us if m else None)
-    np.testing.assert_allclose(run.states, states, rtol=1e-9, atol=1e-10)
-
-    covariance = observer.initial_covariance()
-    for t, y in enumerate(ys):
-        there = ~np.isnan(y)
-        sample = qpmhe.Sample(
-            system, us[t], f_jacobian=a, h_jacobian=c,
-            observed=None if there.all() else there, covariance=covariance,
-        )
-        _, covariance = observer.correct(
-            states[t], np.where(there, y - c @ states[t], 0.0), sample
-        )
-        np.testing.assert_allclose(covariance, covariances[t + 1], rtol=1e-9, atol=1e-10)
+    system = qpmhe.System(f, lambda x: x[0], n=2, p=1, m=1)
+    gain = design_luenberger(system, [2.0, 0.5], [3.0], poles=[0.4, 0.6]).gain
+    A = np.array([[1.0, 0.1], [-0.3 * np.cos(2.0), 1.0]])
+    np.testing.assert_allclose(poles_of(A - gain @ np.eye(1, 2)), [0.4, 0.6], atol=1e-9)
+    noises = {"disturbance": np.eye(2), "noise": 1.0}
+    check(
+        InvalidInputError, ["u is missing; the system has 1 inputs"],
+        SteadyStateKalman, system, [0.0, 0.0], **noises,
+    )
 
 
-def test_extended_kalman_linearises_at_its_own_state():
+def test_a_hidden_mode_is_named_in_any_coordinates():
+    # The first state shows the second, and neither shows the others.
+    hidden = np.array([
+        [0.9, 0.3, 0.0, 0.0], [0.0, 0.8, 0.0, 0.0], [0.2, 0.4, 1.25, 0.0], [0.1, 0.0, 0.5, 0.7]
+    ])
+    for seed in range(3):
+        T = np.random.default_rng(seed).standard_normal((4, 4))
+        system = linear(T @ hidden @ np.linalg.inv(T), np.eye(1, 4) @ np.linalg.inv(T))
+        with pytest.raises(ModelError, match=r"not detectable: .* eigenvalue 1\.25, which does"):
+            design_luenberger(system, np.zeros(4), disturbance=np.eye(4), noise=[[1.0]])
+        with pytest.raises(ModelError, match=r"not observable: .* (1\.25, 0\.7|0\.7, 1\.25), and"):
+            design_luenberger(system, np.zeros(4), poles=[0.1, 0.2, 0.3, 0.4])
+    # y = x1 x2: at x2 = 0 the constant x1 is not seen.
     system = qpmhe.System(
-        lambda x: np.stack([x[..., 0] * x[..., 1], np.sin(x[..., 0])], axis=-1),
-        lambda x: x[..., :1] ** 2, n=2, p=1,
+        lambda x: x * np.array([1.0, 0.9]), lambda x: x[..., :1] * x[..., 1:], n=2, p=1
     )
-    prior, q, r = np.array([[2.0, 0.3], [0.3, 1.0]]), 0.1 * np.eye(2), np.array([[0.5]])
-    observer = qpmhe.ExtendedKalman(prior=prior, disturbance=q, noise=r)
-    mhe = observer_alone(system, observer, [1.2, 0.7])
-    z, covariance = np.array([1.2, 0.7]), prior
-    for y in (1.0, 1.5, 0.3, 0.8):
-        a = np.array([[z[1], z[0]], [np.cos(z[0]), 0.0]])
-        c = np.array([[2.0 * z[0], 0.0]])
-        spread = c @ covariance @ c.T + r
-        gain = a @ covariance @ c.T / spread
-        z = np.array([z[0] * z[1], np.sin(z[0])]) + gain[:, 0] * (y - z[0] ** 2)
-        covariance = a @ covariance @ a.T + q - spread * gain @ gain.T
-        np.testing.assert_allclose(mhe.update([y]).state, z, rtol=1e-11)
+    noises = {"disturbance": np.diag([1.0, 2.0]), "noise": [[1.0]]}
+    with pytest.raises(ModelError, match=r"at x = \[1\.0, 0\.0\] is not detectable.* 1, which"):
+        design_luenberger(system, [1.0, 0.0], **noises)
+    design_luenberger(system, [1.0, 1.0], **noises)
 
 
-@pytest.mark.parametrize(
-    ("prior", "disturbance", "noise"),
-    [(1.0, 1e-2, 1e-2), (1e-6, 1.0, 1e3), (1e6, 1e-6, 1e-4), (1e8, 1e-4, 1e-4)],
-)
-def test_the_covariance_stays_symmetric_and_positive(prior, disturbance, noise):
-    generator = np.random.default_rng(5)
-    n, p = 4, 2
-    for share in (1.0, 0.8) * 5:
-        a = generator.standard_normal((n, n))
-        a /= np.abs(np.linalg.eigvals(a)).max()
-        c = generator.standard_normal((p, n))
-        observer = qpmhe.ExtendedKalman(
-            prior=prior * np.eye(n), disturbance=disturbance * np.eye(n), noise=noise * np.eye(p)
-        )
-        covariance = observer.initial_covariance()
-        system = linear_system(a, c)
-        for _ in range(50):
-            there = generator.random(p) < share
-            sample = qpmhe.Sample(
-                system, np.zeros(0), f_jacobian=a, h_jacobian=c,
-                observed=None if there.all() else there, covariance=covariance,
+def test_designs_that_cannot_be():
+    def cold(x):
+        if x[0] < -5:
+            raise ValueError("too cold")
+        return np.sqrt(x[:1])
+
+    rooted = {"system": qpmhe.System(lambda x: 0.9 * x, cold, n=1, p=1), "poles": [0.5]}
+    for options, kind, text in (
+        ({}, OptionError, ["given: none of them; expected either the poles, or"]),
+        ({"poles": [0.1, 0.2], "noise": 1.0}, OptionError, ["given: poles, noise; expected"]),
+        ({"noise": [[1.0]]}, OptionError, ["given: noise; expected either"]),
+        ({"poles": [0.1]}, ShapeError, ["poles has shape (1,); expected (n,) = (2,)"]),
+        ({"poles": [0.1, 1.0]}, OptionError, ["poles 1 do not lie inside the unit", "exp(s dt)"]),
+        ({"poles": [0.1, np.nan]}, OptionError, ["nan do not lie inside the unit circle"]),
+        ({"poles": [0.5j, 0.5j]}, OptionError, ["poles is ", "complex poles in conjugate"]),
+        ({"poles": [0.5] * 3, "system": Plant(23).system, "at": np.zeros(3)}, OptionError,
+         ["pole 0.5 is given 3 times", "rank C = 2 times"]),
+        ({"poles": "slow"}, InvalidInputError, ["'slow', not an array of numbers"]),
+        ({"poles": [0.1, 0.2], "at": [1.0]}, ShapeError, ["at has shape (1,); expected (2,)"]),
+        ({"poles": [0.1, 0.2], "u": [1.0]}, ShapeError, ["u has shape (1,); expected (0,)"]),
+        (rooted | {"at": [-1.0]}, ModelError, ["h is [nan] at x = [-1.0]", "expected finite"]),
+        (rooted | {"at": [-6.0]}, ModelError, ["h cannot be linearised at ", "ValueError: too"]),
+        ({"poles": np.linspace(0.1, 0.6, 6), "at": np.zeros(6),
+          "system": linear(np.eye(6) + 1e-4 * np.eye(6, k=1), np.eye(1, 6) + 0.3)},
+         ModelError, ["come out as ", "instead of ", "too ill-conditioned"]),
+    ):
+        given = {"system": linear([[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]]), "at": [0.0, 0.0]}
+        check(kind, text, design_luenberger, **given | options)
+
+
+def test_kalman_type_observers_that_do_not_fit():
+    plant = Plant(9)
+    right = {"prior": plant.P, **plant.covariances}
+    for wrong, kind, text in (
+        ({"noise": -np.eye(2)}, WeightError, ["noise covariance has the eigenvalue -1"]),
+        ({"disturbance": np.eye(2)}, ShapeError, ["disturbance covariance", "expected (3, 3)"]),
+        ({"prior": np.eye(2)}, ShapeError, ["prior covariance", "expected (3, 3)"]),
+    ):
+        given = right | wrong
+        check(kind, text, SteadyStateKalman, plant.system, plant.start, **given)
+        check(kind, text, lambda given=given: estimator(
+            plant.system, UnscentedKalman(**given), plant.start
+        ))
+    text = ["at has shape (1,); expected (3,)"]
+    check(ShapeError, text, SteadyStateKalman, plant.system, [0.0], **right)
+    text = ["spread is 0.0; expected a finite number > 0"]
+    check(OptionError, text, UnscentedKalman, **right, spread=0.0)
+    steady = SteadyStateKalman(plant.system, plant.start, **right)
+    text = ["for 3 states and 2 outputs; expected 2 and 1"]
+    check(ShapeError, text, estimator, oscillator(), steady, np.zeros(2))
+
+
+# The high-gain observer
+
+
+def chain(n, step, sampling="exact"):
+    shift, term = step * np.eye(n, k=1), np.eye(n)
+    A = np.eye(n) + shift
+    if sampling == "exact":
+        A, factor = np.zeros((n, n)), 1.0
+        for k in range(n):
+            A, term, factor = A + term / factor, term @ shift, factor * (k + 1)
+    return A
+
+
+@pytest.mark.parametrize("sampling", ["exact", "euler"])
+def test_high_gain_gives_the_chain_the_sampled_poles(sampling):
+    for n, epsilon in ((1, 0.2), (2, 0.02), (3, 3.0), (4, 0.2)):
+        coefficients = np.poly(-np.arange(1.0, n + 1))[1:]
+        options = {"coefficients": coefficients, "sampling": sampling}
+        gain = HighGain(n, epsilon=epsilon, dt=DT, **options).gain
+        expected = np.exp(-np.arange(n, 0.0, -1) * DT / epsilon)
+        found = poles_of(chain(n, DT, sampling) - gain @ np.eye(1, n))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        # In coordinates whose unit of time is another, the same observer.
+        other = HighGain(n, epsilon=1000 * epsilon, dt=1000 * DT, **options).gain[:, 0]
+        np.testing.assert_allclose(gain[:, 0], other * 1000.0 ** np.arange(n), rtol=1e-9)
+    slow = HighGain(3, epsilon=1.0, dt=1e-5, sampling=sampling).gain[:, 0]
+    np.testing.assert_allclose(slow, 1e-5 * np.array([3.0, 3.0, 1.0]), rtol=1e-4)
+    fast = HighGain(3, epsilon=1e-9, dt=DT, sampling=sampling).gain
+    error = np.linalg.matrix_power(chain(3, DT, sampling) - fast @ np.eye(1, 3), 3)
+    np.testing.assert_allclose(error, 0.0, atol=1e-9)
+
+
+def test_high_gain_observers_that_make_no_sense():
+    for options, kind, text in (
+        ({"n": 0}, OptionError, ["n is 0; expected an integer >= 1"]),
+        ({"epsilon": 0.0}, OptionError, ["epsilon is 0.0; expected a finite number > 0"]),
+        ({"dt": -1.0}, OptionError, ["dt is -1.0; expected a finite number > 0"]),
+        ({"sampling": "rk4"}, OptionError, ["sampling is 'rk4'; expected one of 'exact', 'euler'"]),
+        ({"coefficients": [1.0]}, ShapeError, ["coefficients has shape (1,); expected (2,)"]),
+        ({"coefficients": [2.0, 0.0]}, OptionError, ["[2.0, 0.0]", "real part 0; expected all"]),
+        ({"coefficients": [-2.0, 1.0]}, OptionError, ["real part 1", "roots in the left"]),
+    ):
+        check(kind, text, HighGain, **{"n": 2, "epsilon": 0.1, "dt": DT, **options})
+    observer = HighGain(2, epsilon=0.1, dt=2 * DT)
+    for system, kind, text in (
+        (linear(np.eye(2), np.eye(2)), ShapeError, ["the system has 2 outputs; expected 1"]),
+        (linear(np.eye(3), np.eye(1, 3)), ShapeError, ["is for n = 2; expected 3 states"]),
+        (linear(chain(2, DT), [[0.0, 1.0]]), ModelError, ["radius ", "at the initial state"]),
+        (linear(chain(2, DT), [[-1.0, 0.0]]), ModelError, ["C is [[-1.0, 0.0]]"]),
+        (oscillator(), InvalidInputError, ["dt of the high-gain observer is 0.1; expected 0.05"]),
+    ):
+        check(kind, text, estimator, system, observer, np.zeros(system.n))
+
+
+# All of them
+
+
+def test_nothing_is_corrected_where_the_output_fits():
+    system, rng = oscillator(), np.random.default_rng(40)
+    noises = {"disturbance": 0.02**2 * np.eye(2), "noise": [[0.1**2]]}
+    for observer in (
+        SteadyStateKalman(system, [0.5, 0.5], **noises), HighGain(2, epsilon=0.3, dt=DT),
+        UnscentedKalman(prior=np.eye(2), **noises), ExtendedKalman(prior=np.eye(2), **noises),
+        ExtendedKalman(prior=np.eye(2), **noises, innovation=qpmhe.Gate()),
+        UnscentedKalman(prior=np.eye(2), **noises, innovation=qpmhe.HuberInnovation()),
+        design_luenberger(system, [0.5, 0.5], poles=[0.7, 0.8]),
+    ):
+        for seen in (None, np.array([True]), np.array([False])):
+            z = 3 * rng.standard_normal(2)
+            sample = Sample(
+                system, NONE, system.f_jacobian(z, NONE), system.h_jacobian(z, NONE), seen,
+                covariance=spd(rng, 2),
             )
-            _, covariance = observer.correct(np.zeros(n), np.zeros(p), sample)
-            eigenvalues = np.linalg.eigvalsh(covariance)
-            assert np.abs(covariance - covariance.T).max() <= 1e-14 * eigenvalues[-1]
-            # P+ >= Q, up to the rounding of P+ itself.
-            assert eigenvalues[0] >= 0.99 * disturbance - 1e-12 * eigenvalues[-1]
+            assert (observer.correct(z, np.zeros(1), sample)[0] == 0.0).all()
+            if seen is None:
+                assert np.abs(observer.correct(z, np.ones(1), sample)[0]).max() > 1e-3
 
 
-def test_the_initial_covariance_survives_a_run():
-    prior = np.array([[2.0, 0.3], [0.3, 1.0]])
-    observer = qpmhe.ExtendedKalman(prior=prior, disturbance=np.eye(2), noise=[[1.0]])
-    mhe = observer_alone(linear_system(0.9 * np.eye(2), np.ones((1, 2))), observer, [0.0, 0.0])
-    first = mhe.run([[1.0], [2.0], [3.0]]).states
-    np.testing.assert_array_equal(observer.initial_covariance(), prior)
-    mhe.reset([0.0, 0.0])
-    np.testing.assert_array_equal(mhe.run([[1.0], [2.0], [3.0]]).states, first)
+# Its state, beside each estimate and along a run
+
+A, GAIN = np.array([[0.9, 0.2], [-0.1, 0.7]]), np.array([[0.4], [0.1]])
+Y = np.random.default_rng(0).standard_normal((9, 1))
 
 
-def test_covariances_are_copies_and_scalars_will_do():
-    prior = np.array([[2.0]])
-    observer = qpmhe.ExtendedKalman(prior=prior, disturbance=0.5, noise=1)
-    prior[0, 0] = 9.0
-    np.testing.assert_array_equal(observer.initial_covariance(), [[2.0]])
-    a, c = np.array([[0.5]]), np.array([[1.0]])
-    sample = qpmhe.Sample(
-        linear_system(a, c), np.zeros(0), f_jacobian=a, h_jacobian=c, covariance=np.array([[2.0]])
-    )
-    correction, covariance = observer.correct(np.zeros(1), np.array([3.0]), sample)
-    np.testing.assert_allclose(correction, [3.0 * 0.5 * 2.0 / 3.0])
-    np.testing.assert_allclose(covariance, [[0.5 * 2.0 * 0.5 + 0.5 - (1.0 / 3.0) ** 2 * 3.0]])
+def observed(f=lambda x: x @ A.T, **options):
+    system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
+    options = {"max_qps": 1, "warm_start": True} | options
+    return estimator(system, Luenberger(GAIN), [1.0, -1.0], **options)
+
+
+@pytest.mark.parametrize("arrival", ["observer", "smoothed"])
+def test_it_is_the_observer_whatever_becomes_of_the_estimate(arrival):
+    mhe, z = observed(arrival=arrival), [np.array([1.0, -1.0])]
+    for y in Y:
+        np.testing.assert_array_equal(mhe.observer_state, z[-1])
+        z.append(A @ z[-1] + GAIN[:, 0] * (y - z[-1][0]))
+        estimate = mhe.update(y)
+        np.testing.assert_allclose(estimate.observer_state, z[-1], rtol=1e-12)
+        assert not np.allclose(estimate.state, z[-1])
+        z[-1] = estimate.observer_state.copy()
+        estimate.observer_state[:] = 1e6
+    mhe = observed(arrival=arrival)
+    first, second = mhe.run(Y[:4]), mhe.run(Y[4:])
+    np.testing.assert_array_equal(first.observer_states, z[:5])
+    np.testing.assert_array_equal(second.observer_states, z[4:])
+
+
+def test_an_observer_that_starts_again_has_the_state_that_it_starts_from():
+    def f(x):
+        if x[0] > 50.0:
+            raise ValueError("too hot")
+        return A @ x
+
+    mhe = observed(f, horizon=2, max_qps=3, warm_start=False)
+    mhe.run([0.5, 200.0])
+    failed = mhe.update(0.5)
+    assert Status.MODEL_FAILED in failed.status
+    expected = failed.state if failed.improved else failed.candidate[-1]
+    np.testing.assert_array_equal(failed.observer_state, expected)
+    np.testing.assert_array_equal(mhe.update(0.4).candidate[-2], expected)
+    mhe = observed(candidate="reinitialized")
+    for y in Y:
+        estimate = mhe.update(y)
+        np.testing.assert_array_equal(estimate.observer_state, estimate.candidate[-1])
