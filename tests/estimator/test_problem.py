@@ -1,327 +1,382 @@
+"""Window, J with its verdict, and the QP of a step, against plain loops and dense algebra."""
+
 import math
 
 import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe import Status
+from qpmhe.estimation.window import Window
 
-from .plain import assembled, spd
+from .plain import Record, assembled, differences, spd
 
 NONE = np.zeros(0)
+NAMES = ("states", "disturbances", "noises")
 
 
-def nonlinear(n, p, m, **sets):
-    generator = np.random.default_rng(n + p + m)
-    a, b = 0.6 * generator.standard_normal((n, n)), generator.standard_normal((n, max(m, 1)))
-    c = generator.standard_normal((p, n))
-    if m:
-        return qpmhe.System(
-            lambda x, u: np.sin(x @ a.T) + u @ b.T,
-            lambda x, u: x @ c.T + u[..., :1] * x[..., :1], n=n, p=p, m=m, **sets,
+def roomy(kind, d):
+    """A set around the origin that holds every candidate here, and a component without bounds."""
+    generator = np.random.default_rng(d)
+    box = qpmhe.Box([-20.0] * (d - 1) + [-np.inf], [np.inf] * (d - 1) + [18.0])
+    rows = qpmhe.Polytope(generator.standard_normal((d + 1, d)), np.full(d + 1, 12.0))
+    return {"box": box, "rows": rows, "both": rows & box}[kind]
+
+
+def inequalities(one):
+    """(index, coefficients, lower, upper) of bounds and rows that are not both infinite."""
+    identity = np.eye(one.dimension)
+    for j in range(one.dimension):
+        if np.isfinite(one.lower[j]) or np.isfinite(one.upper[j]):
+            yield j, identity[j], one.lower[j], one.upper[j]
+    for k, rest in enumerate(zip(one.matrix, one.row_lower, one.row_upper, strict=True)):
+        yield one.dimension + k, *rest
+
+
+class Case:
+    """What a step consists of, beside the record in plain lists."""
+
+    def __init__(self, sizes, *, horizon=4, missing=0.0, kalman=False, sets=None):
+        self.n, self.p, self.m = sizes
+        self.generator = generator = np.random.default_rng(1)
+        self.a, self.c = (generator.standard_normal((k, self.n)) for k in (self.n, self.p))
+        self.b = generator.standard_normal((self.n, max(self.m, 1)))
+        self.missing, self.sets = missing, sets or {}
+        self.weights = spd(generator, self.n), spd(generator, self.n), spd(generator, self.p)
+        gain, start = 0.1 * np.ones((self.n, self.p)), generator.standard_normal(self.n)
+        f = (lambda x, u: self.f(x, u)) if self.m else (lambda x: self.f(x))
+        system = qpmhe.System(f, self.h, n=self.n, p=self.p, m=self.m, **self.sets)
+        observer, given = qpmhe.Luenberger(gain), dict(zip(
+            ("prior", "disturbance", "noise"), self.weights, strict=True
+        ))
+        if kalman:
+            observer = qpmhe.ExtendedKalman(**given)
+            given["prior"] = qpmhe.ObserverPrior()
+        self.window, self.formulation, self.subproblem = assembled(
+            system, observer, qpmhe.QuadraticCost(**given), horizon, start
         )
-    return qpmhe.System(
-        lambda x: np.sin(x @ a.T), lambda x: x @ c.T + x[..., :1] ** 2, n=n, p=p, **sets
-    )
+        self.kept = Record(self.h, gain, start, self.weights, horizon)
+
+    def f(self, x, u=None):
+        ahead = np.sin(0.6 * x @ self.a.T)
+        return ahead if u is None else ahead + u @ self.b.T
+
+    def h(self, x):
+        return x @ self.c.T + 0.1 * x[..., :1] ** 2
+
+    def push(self):
+        y, u = self.generator.standard_normal(self.p), self.generator.standard_normal(self.m)
+        y[self.generator.random(self.p) < self.missing] = np.nan
+        self.window.push(y, u)
+        self.problem = self.formulation.problem(self.window)
+        self.kept.push(lambda x: self.f(x, u if self.m else None), y)
+        if self.window.prior_covariance is not None:  # the filter is judged by its own tests
+            self.kept.P = np.linalg.inv(self.window.prior_covariance)
+            self.kept.z[self.kept.first :] = list(self.window.candidate)
+
+    def trajectory(self, scale=0.7):
+        shape = self.window.candidate.shape
+        return self.window.candidate + scale * self.generator.standard_normal(shape)
+
+    def trials(self):
+        """The candidate, whose terms are kept from sample to sample, and another trajectory."""
+        yield self.problem.candidate, self.window.candidate.copy()
+        trajectory = self.trajectory()
+        yield self.problem.evaluate(trajectory), trajectory
+
+    def check(self):
+        kept, window = self.kept, self.window
+        assert (window.time, window.length) == (len(kept.ys), kept.count)
+        np.testing.assert_allclose(window.candidate, kept.candidate, rtol=1e-12, atol=1e-13)
+        assert self.problem.candidate.cost == window.candidate_cost
+        for trial, trajectory in self.trials():
+            assert trial.cost == pytest.approx(kept.cost(trajectory), rel=1e-10)
+            there = np.hstack((np.ones((kept.count, self.n), bool), window.observed))
+            np.testing.assert_allclose(
+                trial.residuals[there], kept.residuals(trajectory)[there], rtol=1e-10, atol=1e-12
+            )
+            qp = self.subproblem.at(self.problem, trial)
+            for found, expected in (
+                (qp.gradient, 0.5 * kept.gradient(trajectory)),
+                (qp.dense(), kept.hessian(trajectory)),
+            ):
+                scale = np.abs(expected).max() + 1.0
+                np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11 * scale)
+
+    def missed(self, trajectory):
+        """The inequalities that are missed, each with its miss in the row's scale."""
+        residuals, found = self.kept.residuals(trajectory), {}
+        points = {
+            "states": trajectory, "disturbances": residuals[:, : self.n],
+            "noises": residuals[:, self.n :],
+        }
+        for name, weight in zip(NAMES, self.weights, strict=True):
+            for k, point in enumerate(points[name] if name in self.sets else ()):
+                for index, row, low, high in inequalities(self.sets[name]):
+                    if name == "noises" and row[~self.window.observed[k]].any():
+                        continue
+                    scale = min(np.sqrt(row @ np.linalg.inv(weight) @ row), high - low)
+                    for side, miss in (("lower", low - row @ point), ("upper", row @ point - high)):
+                        if miss > 0.0:
+                            found[name, index, side, self.kept.first + k] = miss / scale
+        return found
+
+    def check_rows(self, qp, trajectory):
+        """Every linearised inequality is there once, and nothing else."""
+        residuals = self.kept.residuals(trajectory)
+        slopes, expected = differences(self.kept.residuals, trajectory), []
+        parts = {"disturbances": slice(0, self.n), "noises": slice(self.n, None)}
+        for name, one in self.sets.items():
+            for k in range(len(trajectory) if name == "states" else len(residuals)):
+                for _, row, low, high in inequalities(one):
+                    if name == "states":
+                        slope, value = np.zeros(trajectory.shape), row @ trajectory[k]
+                        slope[k] = row
+                    else:
+                        slope, value = row @ slopes[k, parts[name]], row @ residuals[k, parts[name]]
+                    if name != "noises" or not row[~self.window.observed[k]].any():
+                        sides = clipped(low - value, high - value)
+                        expected.append(np.append(slope.ravel(), sides))
+        found = [
+            np.append(slope, clipped(low, high))
+            for slopes, lower, upper in (
+                (qp.dense_rows(), qp.row_lower, qp.row_upper), (np.eye(qp.size), qp.lower, qp.upper)
+            )
+            for slope, low, high in zip(slopes, lower.ravel(), upper.ravel(), strict=True)
+            if np.isfinite(low) or np.isfinite(high)
+        ]
+        assert len(found) == len(expected)
+        if expected:
+            gap = np.abs(np.array(found)[:, None] - np.array(expected)[None]).max(axis=2)
+            assert max(gap.min(axis=0).max(), gap.min(axis=1).max()) < 1e-9
 
 
-def filled(system, cost, samples, *, horizon=4, observer=None, missing=0.0, seed=1):
-    """A window after some samples, and its problem."""
-    generator = np.random.default_rng(seed)
-    observer = observer or qpmhe.Luenberger(0.1 * np.ones((system.n, system.p)))
-    start = generator.standard_normal(system.n)
-    window, formulation, _ = assembled(system, observer, cost, horizon, start)
-    for _ in range(samples):
-        y, u = generator.standard_normal(system.p), generator.standard_normal(system.m)
-        y[generator.random(system.p) < missing] = np.nan
-        window.push(y, u)
-    return window, formulation.problem(window)
+def clipped(low, high):
+    """Sides, infinite ones as large numbers."""
+    return np.clip([low, high], -1e6, 1e6)
 
 
-def random_cost(n, p, seed=2):
-    generator = np.random.default_rng(seed)
-    return qpmhe.QuadraticCost(
-        prior=spd(generator, n), disturbance=spd(generator, n), noise=spd(generator, p)
-    )
-
-
-def square(vector, weight):
-    return sum(
-        vector[i] * weight[i, j] * vector[j]
-        for i in range(len(vector))
-        for j in range(len(vector))
-    )
-
-
-def plain_cost(system, cost, window, trajectory, prior_weight):
-    """J from its definition: (eq:costfunction) with the weight of what is there."""
-    total = square(trajectory[0] - window.candidate[0], prior_weight)
-    for i, (x, u) in enumerate(zip(trajectory[:-1], window.inputs, strict=True)):
-        total += square(trajectory[i + 1] - system.f(x, u), cost.disturbance)
-        there = window.observed[i]
-        v = (window.measurements[i] - system.h(x, u))[there]
-        if there.any():
-            total += square(v, np.linalg.inv(np.linalg.inv(cost.noise)[np.ix_(there, there)]))
-    return total
-
-
+@pytest.mark.parametrize("kalman", [False, True])
 @pytest.mark.parametrize("missing", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("samples", [1, 2, 4, 9])
-@pytest.mark.parametrize("sizes", [(1, 1, 0), (2, 1, 1), (3, 2, 0), (2, 3, 2)])
-def test_the_cost_of_any_trajectory(sizes, samples, missing):
-    system, cost = nonlinear(*sizes), random_cost(*sizes[:2])
-    window, problem = filled(system, cost, samples, missing=missing)
-    generator = np.random.default_rng(3)
-    for _ in range(5):
-        trajectory = window.candidate + generator.standard_normal(window.candidate.shape)
-        trial = problem.evaluate(trajectory)
-        expected = plain_cost(system, cost, window, trajectory, cost.prior)
-        assert trial.cost == pytest.approx(expected, rel=1e-11)
-        assert trial.trajectory is trajectory
+@pytest.mark.parametrize("sizes", [(1, 1, 0), (3, 2, 1), (2, 3, 2)])
+def test_cost_gradient_and_hessian_of_growing_and_sliding_windows(sizes, missing, kalman):
+    for horizon in (1, 4):
+        case = Case(sizes, horizon=horizon, missing=missing, kalman=kalman)
+        for _ in range(horizon + 3):
+            case.push()
+            case.check()
 
 
-@pytest.mark.parametrize("missing", [0.0, 0.4])
-@pytest.mark.parametrize("samples", [1, 9])
-def test_residuals_and_their_weights(samples, missing):
-    n, p = 2, 3
-    system, cost = nonlinear(n, p, 1), random_cost(n, p)
-    window, problem = filled(system, cost, samples, missing=missing)
-    trajectory = window.candidate + np.random.default_rng(4).standard_normal(
-        window.candidate.shape
-    )
-    trial = problem.evaluate(trajectory)
-    for i, u in enumerate(window.inputs):
-        w = trajectory[i + 1] - system.f(trajectory[i], u)
-        v = window.measurements[i] - system.h(trajectory[i], u)
-        np.testing.assert_allclose(trial.residuals[i, :n], w, rtol=1e-12, atol=1e-13)
-        there = window.observed[i]
-        np.testing.assert_allclose(trial.residuals[i, n:][there], v[there], rtol=1e-12)
-
-
-@pytest.mark.parametrize("missing", [0.0, 0.4])
-@pytest.mark.parametrize("samples", [1, 3, 9])
-def test_the_candidate_has_no_prior_cost_and_its_stages_cost(samples, missing):
-    system, cost = nonlinear(3, 2, 0), random_cost(3, 2)
-    window, problem = filled(system, cost, samples, missing=missing)
-    trial = problem.candidate
-    np.testing.assert_array_equal(problem.prior, window.candidate[0])
-    assert trial.cost == window.candidate_cost
-    assert problem.evaluate(window.candidate.copy()).cost == pytest.approx(trial.cost, rel=1e-11)
-    assert trial.cost == pytest.approx(
-        plain_cost(system, cost, window, window.candidate, cost.prior), rel=1e-11
-    )
-
-
-def test_the_prior_weight_from_the_observer():
-    system, generator = nonlinear(3, 2, 0), np.random.default_rng(5)
-    observer = qpmhe.ExtendedKalman(
-        prior=spd(generator, 3), disturbance=spd(generator, 3), noise=spd(generator, 2)
-    )
-    cost = qpmhe.QuadraticCost(
-        prior=qpmhe.ObserverPrior(), disturbance=spd(generator, 3), noise=spd(generator, 2)
-    )
-    for samples in (1, 4, 9):
-        window, problem = filled(system, cost, samples, observer=observer)
-        weight = np.linalg.inv(window.prior_covariance)
-        trajectory = window.candidate + generator.standard_normal(window.candidate.shape)
-        found = problem.prior_weight_at(trajectory[0] - window.candidate[0])
-        np.testing.assert_allclose(found, weight, rtol=1e-10, atol=1e-11)
-        assert problem.evaluate(trajectory).cost == pytest.approx(
-            plain_cost(system, cost, window, trajectory, weight), rel=1e-10
-        )
-
-
-def test_a_constant_prior_weight_ignores_the_observers_covariance():
-    system, cost = nonlinear(2, 1, 0), random_cost(2, 1)
-    observer = qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
-    _, problem = filled(system, cost, 9, observer=observer)
-    np.testing.assert_array_equal(problem.prior_weight_at(np.ones(2)), cost.prior)
+@pytest.mark.parametrize(
+    ("sizes", "horizon", "kalman"), [((2, 2, 1), 3, False), ((1, 1, 0), 66, True)]
+)
+def test_windows_that_slide_to_the_front_of_their_memory(sizes, horizon, kalman):
+    case = Case(sizes, horizon=horizon, missing=0.02, kalman=kalman)
+    for t in range(2 * max(64, horizon) + horizon + 10):
+        case.push()
+        if t % 64 < 5 and (horizon == 3 or t in (128, 132, 195)):
+            case.check()
 
 
 # Sets
 
 
-def plain_rows(name, box, points, weight, first):
-    """The rows that points miss, each with its miss in the row's scale."""
-    spread, found = np.sqrt(np.linalg.inv(weight).diagonal()), {}
-    for k, j in np.ndindex(points.shape) if box else ():
-        scale, s = min(spread[j], box.upper[j] - box.lower[j]), points[k, j]
-        for side, missed in (("lower", box.lower[j] - s), ("upper", s - box.upper[j])):
-            if missed > 0.0:
-                found[name, j, side, first + k] = missed / scale
-    return found
+@pytest.mark.parametrize("missing", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("kind", ["box", "rows", "both"])
+@pytest.mark.parametrize("names", [*((name,) for name in NAMES), NAMES], ids="-".join)
+def test_verdict_and_rows(names, kind, missing):
+    sizes = {"states": 2, "disturbances": 2, "noises": 3}
+    sets = {name: roomy(kind, sizes[name]) for name in names}
+    case, inside = Case((2, 3, 0), missing=missing, sets=sets), set()
+    for _ in range(6):
+        case.push()
+        assert case.problem.candidate.violation == 0.0
+        for trial, trajectory in case.trials():
+            case.check_rows(case.subproblem.at(case.problem, trial), trajectory)
+        for scale in (0.1, 3.0, 7.0, 40.0):
+            trajectory = case.trajectory(scale)
+            trial, missed = case.problem.evaluate(trajectory), case.missed(trajectory)
+            expected = max(missed.values(), default=0.0)
+            assert trial.violation == pytest.approx(expected, rel=1e-10, abs=1e-12)
+            assert set(case.problem.missed_rows(trial)) == set(missed)
+            cost = math.inf if missed else case.kept.cost(trajectory)
+            assert trial.cost == pytest.approx(cost, rel=1e-10)
+            inside.add(not missed)
+    assert inside == ({True} if names == ("noises",) and missing == 1.0 else {True, False})
 
 
-def roomy_sets(n, p):
-    """Sets that hold every candidate here, with some open ends."""
-    return {
-        "states": qpmhe.Box([-20.0] * n, [20.0] * (n - 1) + [np.inf]),
-        "disturbances": qpmhe.Box([-np.inf] + [-15.0] * (n - 1), [15.0] * n),
-        "noises": qpmhe.Box([-20.0] * p, [25.0] * p),
-    }
-
-
-NAMES = ("states", "disturbances", "noises")
-
-
-@pytest.mark.parametrize(
-    "names",
-    [(), ("states",), ("disturbances",), ("noises",), ("states", "noises"), NAMES],
-    ids="-".join,
-)
-@pytest.mark.parametrize("sizes", [(1, 1, 0), (2, 1, 1), (3, 2, 0)])
-def test_violation_and_cost_with_sets(sizes, names):
-    n, p, _ = sizes
-    sets = {name: box for name, box in roomy_sets(n, p).items() if name in names}
-    system, cost = nonlinear(*sizes, **sets), random_cost(n, p)
-    window, problem = filled(system, cost, 6)
-    assert problem.candidate.violation == 0.0
-    generator = np.random.default_rng(6)
-    seen = set()
-    for scale in [0.1, 1.0, 5.0, 10.0, 40.0] * 6:
-        trajectory = window.candidate + scale * generator.standard_normal(window.candidate.shape)
-        trial = problem.evaluate(trajectory)
-        w, v = trial.residuals[:, :n], trial.residuals[:, n:]
-        missed = plain_rows("states", system.states, trajectory, cost.prior, 2)
-        missed |= plain_rows("disturbances", system.disturbances, w, cost.disturbance, 2)
-        missed |= plain_rows("noises", system.noises, v, cost.noise, 2)
-        expected = max(missed.values(), default=0.0)
-        assert trial.violation == pytest.approx(expected, rel=1e-11, abs=1e-12)
-        assert set(problem.missed_rows(trial)) == set(missed)
-        seen.add(math.isfinite(trial.cost))
-        if missed:
-            assert trial.cost == math.inf
-        else:
-            assert trial.cost == pytest.approx(
-                plain_cost(system, cost, window, trajectory, cost.prior), rel=1e-11
-            )
-    assert seen == ({True, False} if names else {True})
-
-
-@pytest.mark.parametrize("stage", [0, 2, 4])
-@pytest.mark.parametrize("beyond", [-1e-3, -1e-12, 1e-12, 1e-6])
-def test_the_last_state_counts_and_rounding_does_not(stage, beyond):
-    system = qpmhe.System(
-        lambda x: 0.5 * x, lambda x: x, n=1, p=1, states=qpmhe.Box([-100.0], [30.0])
+def filled(observer, samples=3, cost=1.0, horizon=4, start=1.0, f=lambda x: 0.5 * x, **options):
+    """Window, problem and subproblem of one state that is measured, after measurements of 1."""
+    system = qpmhe.System(f, options.pop("h", lambda x: x), n=1, p=1, **options)
+    weights = qpmhe.QuadraticCost(prior=cost, disturbance=cost, noise=cost)
+    window, formulation, subproblem = assembled(
+        system, observer, weights, horizon, np.full(1, start), project=False
     )
-    window, problem = filled(system, random_cost(1, 1), 6)
-    trajectory = window.candidate.copy()
-    trajectory[stage] = 30.0 + beyond
-    assert math.isfinite(problem.evaluate(trajectory).cost) is (beyond < 1e-9)
+    for _ in range(samples):
+        window.push(np.ones(1), NONE)
+    return window, formulation, subproblem
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_rows_that_the_candidate_violates_are_left_out_and_come_back(name):
-    tight = {
-        "states": qpmhe.Box([-3.0], [3.0]),
-        "disturbances": qpmhe.Box([-1.0], [1.0]),
-        "noises": qpmhe.Box([-4.0], [4.0]),
-    }
-    # Which y, met at z = 0, leaves just this set: states z+ = L, disturbances L, noises y.
-    gain, y = {"states": (1.0, 3.5), "disturbances": (0.5, 3.0), "noises": (0.1, 5.0)}[name]
-    sets = dict(tight, disturbances=qpmhe.Box([-9.0], [9.0])) if name == "states" else tight
-    system, cost = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1, **sets), random_cost(1, 1)
-    window, formulation, _ = assembled(
-        system, qpmhe.Luenberger([gain]), cost, 2, np.zeros(1), project=False
+def test_the_last_state_counts_and_rounding_does_not():
+    states = qpmhe.Box([-100.0], [30.0])
+    window, formulation, _ = filled(qpmhe.Luenberger([0.1]), 6, states=states)
+    for stage in (0, 2, 4):
+        for beyond in (-1e-3, -1e-12, 1e-12, 1e-6):
+            trajectory = window.candidate.copy()
+            trajectory[stage] = 30.0 + beyond
+            cost = formulation.problem(window).evaluate(trajectory).cost
+            assert math.isfinite(cost) is (beyond < 1e-9)
+
+
+def test_sides_that_the_candidate_violates_are_left_out_and_come_back():
+    box = qpmhe.Box([-2.0], [2.0])
+    window, formulation, subproblem = filled(
+        qpmhe.Luenberger([0.8]), 0, horizon=2, start=0.0, f=lambda x: 0.8 * x,
+        states=box, disturbances=box, noises=box,
     )
-    history = []
-    for value in (0.0, y, None, None, None, None):
-        measured = window.candidate[-1] if value is None else np.array([value])
-        window.push(measured.copy(), NONE)
+    missing = []
+    for y in (0.5, 0.5, 9.0, 0.0, 0.0, -9.0, 0.0, 0.0, 0.0, 0.0, 0.0):
+        window.push(np.array([y]), NONE)
         problem, candidate = formulation.problem(window), window.candidate.copy()
-        w, v = window.residuals[:, :1], window.residuals[:, 1:]
-        first = window.time - window.length
-        missed = plain_rows("states", sets["states"], candidate, cost.prior, first)
-        missed |= plain_rows("disturbances", sets["disturbances"], w, cost.disturbance, first)
-        missed |= plain_rows("noises", sets["noises"], v, cost.noise, first)
-        assert set(problem.missed_rows(problem.candidate)) == set(missed)
+        missed = set(problem.missed_rows(problem.candidate))
         assert (problem.evaluate(candidate).cost == math.inf) is bool(missed)
-        assert problem.candidate.cost == window.candidate_cost
         relaxed = problem.without_violated()
         assert math.isfinite(relaxed.evaluate(candidate).cost)
-        # The other side of such a row holds, and so do the rows of other stages.
         for far in (-30.0, 30.0):
-            found = problem.missed_rows(problem.evaluate(candidate + far))
             left = relaxed.missed_rows(relaxed.evaluate(candidate + far))
-            assert set(left) == set(found) - set(missed)
-        assert (problem.evaluate(candidate).cost == math.inf) is bool(missed)
-        history.append({row[0] for row in missed})
-    assert {name} in history
-    assert history[0] == history[-1] == set()
+            assert set(left) == set(problem.missed_rows(problem.evaluate(candidate + far))) - missed
+        qp = subproblem.at(relaxed, relaxed.candidate)
+        sides = (
+            (candidate, qp.lower, qp.upper),
+            (window.residuals, qp.row_lower[:-1], qp.row_upper[:-1]),
+        )
+        for points, lower, upper in sides:
+            np.testing.assert_array_equal(lower, np.where(points < -2.0, -np.inf, -2.0 - points))
+            np.testing.assert_array_equal(upper, np.where(points > 2.0, np.inf, 2.0 - points))
+        missing.append([int(np.isinf(side).sum()) for _, *both in sides for side in both])
+    assert np.max(missing, axis=0).min() > 0
+    assert missing[0] == missing[-1] == [0, 0, 0, 0]
 
 
-@pytest.mark.parametrize("fixed", [0.0, 0.3])
-def test_noise_free_rows_are_never_left_out(fixed):
-    box = qpmhe.Box([fixed, -0.1], [fixed, 0.1])
-    system = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=2, p=2, disturbances=box)
-    window, problem = filled(system, random_cost(2, 2), 3)
-    candidate, relaxed = window.candidate.copy(), problem.without_violated()
-    missed = {row.row for row in problem.missed_rows(problem.candidate)}
-    assert missed == {0, 1}
-    assert {row.row for row in relaxed.missed_rows(problem.candidate)} == {0}
-    # A trial is rolled out along them.
-    trial = relaxed.evaluate(candidate)
-    np.testing.assert_allclose(trial.residuals[:, 0], fixed, atol=1e-15)
-
-
-def test_a_missing_output_has_no_noise_that_could_leave_its_set():
-    system = qpmhe.System(
-        lambda x: x, lambda x: x, n=2, p=2, noises=qpmhe.Box([-1.0, -1.0], [1.0, 1.0])
-    )
-    cost = random_cost(2, 2)
-    start = np.array([50.0, -70.0])
-    observer = qpmhe.Luenberger(np.zeros((2, 2)))
-    window, formulation, _ = assembled(system, observer, cost, 3, start)
-    for y in ([50.5, np.nan], [np.nan, np.nan], [np.nan, -70.5], [50.5, -70.5]):
-        window.push(np.array(y), NONE)
+def test_noise_free_rows_are_never_left_out():
+    for fixed in (0.0, 0.3):
+        box = qpmhe.Box([fixed, -0.1], [fixed, 0.1])
+        system = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=2, p=2, disturbances=box)
+        cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(2))
+        window, formulation, _ = assembled(
+            system, qpmhe.Luenberger(np.eye(2)), cost, 4, np.ones(2)
+        )
+        for _ in range(3):
+            window.push(np.array([4.0, -4.0]), NONE)
         problem = formulation.problem(window)
-        assert problem.candidate.violation == 0.0
-        for inside in (0.0, 0.4):
-            trajectory = window.candidate + inside
-            assert problem.evaluate(trajectory).cost == pytest.approx(
-                plain_cost(system, cost, window, trajectory, cost.prior), rel=1e-11
-            )
-        outside = window.candidate.copy()
-        outside[0] += 2.0
-        seen = window.observed[0].any()
-        assert (problem.evaluate(outside).cost == math.inf) is bool(seen)
+        relaxed = problem.without_violated()
+        assert {row.row for row in problem.missed_rows(problem.candidate)} == {0, 1}
+        assert {row.row for row in relaxed.missed_rows(problem.candidate)} == {0}
+        # A trial is rolled out along them.
+        trial = relaxed.evaluate(window.candidate.copy())
+        np.testing.assert_allclose(trial.residuals[:, 0], fixed, atol=1e-15)
 
 
 # Models that cannot be evaluated everywhere
 
 
+def root_or_nan(x):
+    return np.sqrt(x)
+
+
+def root_or_raise(x):
+    return np.array([math.sqrt(x[0])])
+
+
+@pytest.mark.parametrize("root", [root_or_nan, root_or_raise, lambda x: x / (x > 0)])
 @pytest.mark.parametrize("where", ["f", "h"])
+def test_a_trajectory_without_model_costs_infinitely(root, where):
+    with np.errstate(all="ignore"):
+        window, formulation, _ = filled(qpmhe.Luenberger([0.1]), 4, **{where: root})
+        for stage, value in ((0, -1.0), (3, -1.0), (0, np.nan), (2, np.inf), (4, 1e200)):
+            trajectory = np.maximum(window.candidate, 0.1)
+            assert math.isfinite(formulation.problem(window).evaluate(trajectory).cost)
+            trajectory[stage] = value
+            assert formulation.problem(window).evaluate(trajectory).cost == math.inf
+
+
 @pytest.mark.parametrize(
-    "root",
+    "jacobian",
     [
-        pytest.param(np.sqrt, id="NaN"),
-        pytest.param(lambda x: [math.sqrt(x[0])], id="raises"),
-        pytest.param(lambda x: x / (x > 0), id="infinite"),
+        lambda x: np.array([[0.5 / np.sqrt(x[0])]]),  # infinite
+        lambda x: [[x[0] / (x[0] * abs(x[0]) ** 0.5) / 2]],  # NaN
+        lambda x: [[0.5 / float(x[0]) ** 0.5]],  # raises
     ],
 )
-@pytest.mark.parametrize("stage", [0, 3])
-def test_a_trajectory_without_model_costs_infinitely(root, where, stage):
-    functions = {"f": lambda x: 0.5 * x + 1.0, "h": lambda x: x, where: root}
+def test_there_is_no_qp_where_there_is_no_jacobian(jacobian):
     with np.errstate(all="ignore"):
-        system = qpmhe.System(functions["f"], functions["h"], n=1, p=1)
-        cost = random_cost(1, 1)
-        observer = qpmhe.Luenberger([0.1])
-        window, formulation, _ = assembled(system, observer, cost, 4, np.ones(1))
-        for _ in range(4):
-            window.push(np.ones(1), NONE)
-        problem = formulation.problem(window)
-        assert math.isfinite(problem.evaluate(window.candidate.copy()).cost)
-        trajectory = window.candidate.copy()
-        trajectory[stage] = -1.0
-        assert problem.evaluate(trajectory).cost == math.inf
+        window, formulation, subproblem = filled(
+            qpmhe.Luenberger([0.1]), f=root_or_nan, f_jacobian=jacobian
+        )
+        problem, trajectory = formulation.problem(window), np.ones((4, 1))
+        assert subproblem.at(problem, problem.evaluate(trajectory)) is not None
+        for stage in (0, 1, 2):
+            trajectory = np.ones((4, 1))
+            trajectory[stage] = 0.0
+            trial = problem.evaluate(trajectory)
+            assert np.isfinite(trial.cost)
+            assert subproblem.at(problem, trial) is None
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
-@pytest.mark.parametrize("stage", [0, 2, 4])
-@pytest.mark.parametrize("bounded", [False, True])
-def test_a_trajectory_that_is_not_finite_costs_infinitely(bad, stage, bounded):
-    sets = roomy_sets(2, 1) if bounded else {}
-    window, problem = filled(nonlinear(2, 1, 0, **sets), random_cost(2, 1), 6)
-    trajectory = window.candidate.copy()
-    trajectory[stage, 1] = bad
-    with np.errstate(all="ignore"):
-        assert problem.evaluate(trajectory).cost == math.inf
+@pytest.mark.parametrize("kalman", [False, True])
+@pytest.mark.parametrize("root", [root_or_nan, root_or_raise])
+@pytest.mark.parametrize("where", ["f", "h"])
+def test_a_failed_stage_steps_back_and_costs_infinitely(where, root, kalman):
+    functions = {"f": lambda x: 0.5 * x, "h": lambda x: x, where: root}
+    slope = {f"{name}_jacobian": lambda x: np.full((*np.shape(x), 1), 0.5) for name in "fh"}
+    slope[f"{where}_jacobian"] = lambda x: 0.5 / np.sqrt(x)[..., None]
+    if where == "f":
+        slope["h_jacobian"] = lambda x: np.ones((*np.shape(x), 1))
+    system = qpmhe.System(**functions, n=1, p=1, **slope)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=3.0)
+    observer = qpmhe.Luenberger([1.0])
+    if kalman:
+        observer = qpmhe.ExtendedKalman(prior=1.0, disturbance=1.0, noise=0.1)
+    window = Window(system, observer, cost, 3, np.array([4.0]), True, True)
+    with np.errstate(invalid="ignore"):
+        for y in (4.0, -500.0):
+            window.push(np.array([y]), NONE)
+            assert window.events == 0
+        below = window.candidate[-1].copy()
+        assert below[0] < 0.0
+        assert math.isfinite(window.candidate_cost)
+        window.push(np.array([1.0]), NONE)
+        assert window.newest_failed
+        assert window.events == Status.MODEL_FAILED.value
+        # From there on, the observer goes on where the model last worked.
+        np.testing.assert_array_equal(window.candidate[-2:], [below, window.candidate[1]])
+        assert (window.candidate_cost, window.time, window.length) == (math.inf, 3, 3)
+        window.restart(np.array([4.0]))
+        for left in (True, True, False):
+            window.push(np.array([4.0]), NONE)
+            assert window.events == 0
+            assert (window.candidate_cost == math.inf) is left
+    kept = slice(window.start, window.start + 3)
+    assert np.isfinite(window.terms.panel[kept]).all()
+
+
+def test_a_stage_without_jacobian_keeps_its_residual_and_cost():
+    system = qpmhe.System(
+        lambda x: np.sqrt(x), lambda x: x, n=1, p=1,
+        f_jacobian=lambda x: 0.5 / np.sqrt(x)[..., None], h_jacobian=lambda x: np.eye(1),
+    )
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=3.0)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.5]), cost, horizon=4, initial_state=[0.0]
+    )
+    ys = [1.0, 1.2, 1.1]
+    for t, y in enumerate(ys):
+        estimate = mhe.update([y])
+        assert (Status.MODEL_FAILED in estimate.status) or t
+        z = estimate.candidate[:, 0]
+        true = sum(
+            2.0 * (z[i + 1] - math.sqrt(z[i])) ** 2 + 3.0 * (ys[i] - z[i]) ** 2
+            for i in range(t + 1)
+        )
+        assert estimate.candidate_cost == pytest.approx(true, rel=1e-12)
+        assert estimate.cost <= true * (1 + 1e-12)

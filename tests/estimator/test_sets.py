@@ -1,90 +1,11 @@
+"""Boxes, polytopes and intersections, and the same estimates however a set is written."""
+
 import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe import Status
 from qpmhe.errors import SetError
-
-
-def distance_outside(box, points):
-    worst = 0.0
-    for point in points.reshape(-1, box.dimension):
-        for value, low, high in zip(point, box.lower, box.upper, strict=True):
-            worst = max(worst, low - value, value - high)
-    return worst
-
-
-@pytest.mark.parametrize("lead", [(), (1,), (7,), (3, 4)])
-@pytest.mark.parametrize("d", [1, 2, 5])
-def test_violation_is_the_largest_distance_outside(d, lead):
-    generator = np.random.default_rng(d)
-    for _ in range(20):
-        lower = generator.standard_normal(d)
-        upper = lower + generator.exponential(size=d)
-        lower[generator.random(d) < 0.3] = -np.inf
-        upper[generator.random(d) < 0.3] = np.inf
-        box = qpmhe.Box(lower, upper)
-        points = 1.5 * generator.standard_normal((*lead, d))
-        assert box.violation(points) == distance_outside(box, points)
-
-
-@pytest.mark.parametrize(
-    ("point", "expected"),
-    [
-        ([0.0, 5.0], 0.0),
-        ([-1.0, 1.0], 0.0),
-        ([1.0, 1e300], 0.0),
-        ([1.5, 5.0], 0.5),
-        ([-3.0, 5.0], 2.0),
-        ([0.0, 0.75], 0.25),
-        ([-3.0, 0.0], 2.0),
-        ([1.25, -3.0], 4.0),
-    ],
-)
-def test_the_boundary_is_inside(point, expected):
-    assert qpmhe.Box([-1.0, 1.0], [1.0, np.inf]).violation(np.array(point)) == expected
-
-
-def test_nan_is_not_inside():
-    box = qpmhe.Box([0.0, 0.0], [1.0, 1.0])
-    assert not box.violation(np.array([[0.5, np.nan], [0.5, 0.5]])) <= 0.0
-
-
-def test_a_box_may_be_a_point_or_everything():
-    point = qpmhe.Box([0.0, 2.0], [0.0, 2.0])
-    assert point.violation(np.array([0.0, 2.0])) == 0.0
-    assert point.violation(np.array([0.0, 2.5])) == 0.5
-    assert qpmhe.Box([-np.inf], [np.inf]).violation(np.array([1e300])) == 0.0
-
-
-def test_scalars_bound_one_component():
-    box = qpmhe.Box(-1, 2)
-    assert box.dimension == 1
-    assert box.violation(np.array([[3.5]])) == 1.5
-
-
-def test_bounds_are_copies():
-    lower, upper = np.zeros(2), np.ones(2)
-    box = qpmhe.Box(lower, upper)
-    lower[0], upper[0] = -9.0, 9.0
-    np.testing.assert_array_equal(box.lower, [0.0, 0.0])
-    np.testing.assert_array_equal(box.upper, [1.0, 1.0])
-
-
-def test_a_box_shows_its_bounds():
-    assert repr(qpmhe.Box([0, -np.inf], [1, 2])) == "Box(lower=[0.0, -inf], upper=[1.0, 2.0])"
-
-
-@pytest.mark.parametrize("component", [0, 1, 2])
-def test_the_empty_component_is_named(component):
-    lower, upper = np.zeros(3), np.ones(3)
-    lower[component] = 1.5
-    with pytest.raises(SetError) as caught:
-        qpmhe.Box(lower, upper)
-    assert f"component {component} has lower 1.5 and upper 1.0" in str(caught.value)
-    assert "lower <= upper" in str(caught.value)
-
-
-# Polytopes and intersections
 
 
 def plain_violation(one, point):
@@ -98,103 +19,66 @@ def plain_violation(one, point):
     return worst
 
 
-def random_polytope(generator, d, rows):
-    """Rows in random directions that the origin satisfies."""
-    matrix = generator.standard_normal((rows, d))
-    return qpmhe.Polytope(matrix, generator.exponential(size=rows))
-
-
-@pytest.mark.parametrize("lead", [(), (1,), (7,), (3, 4)])
-@pytest.mark.parametrize(("d", "rows"), [(1, 1), (2, 3), (4, 2), (3, 7)])
-def test_a_polytope_is_missed_by_its_worst_row(d, rows, lead):
-    generator = np.random.default_rng(10 * d + rows)
-    inside = []
-    for _ in range(20):
-        matrix, bound = generator.standard_normal((rows, d)), generator.exponential(size=rows)
-        polytope = qpmhe.Polytope(matrix, bound)
-        points = 0.7 * generator.standard_normal((*lead, d))
-        expected = max(
-            max(0.0, *(matrix @ point - bound)) for point in points.reshape(-1, d)
-        )
-        assert polytope.violation(points) == pytest.approx(expected, rel=1e-12, abs=1e-14)
-        inside.append(expected == 0.0)
-    assert False in inside
-    assert lead or True in inside
-
-
-def test_the_parts_of_a_polytope():
-    polytope = qpmhe.Polytope([[1.0, -2.0], [0.0, 3.0], [0.0, -1.0]], [4.0, 5.0, 6.0])
-    assert polytope.dimension == 2
-    np.testing.assert_array_equal(polytope.matrix, [[1.0, -2.0], [0.0, 3.0], [0.0, -1.0]])
-    np.testing.assert_array_equal(polytope.row_upper, [4.0, 5.0, 6.0])
-    assert np.all(polytope.row_lower == -np.inf)
-    assert polytope.bounded_components.size == polytope.fixed_components.size == 0
-    assert "3 rows" in repr(polytope)
-    assert repr(polytope).startswith("Polytope(")
-
-
-def test_a_single_row_may_be_a_vector():
-    polytope = qpmhe.Polytope([1.0, 2.0], 3.0)
-    assert polytope.matrix.shape == (1, 2)
-    assert polytope.violation(np.array([1.0, 1.0])) == 0.0
-    assert polytope.violation(np.array([2.0, 1.0])) == 1.0
-
-
-def test_the_numbers_of_a_polytope_are_copies():
-    matrix, bound = np.eye(2), np.ones(2)
-    polytope = qpmhe.Polytope(matrix, bound)
-    matrix[0, 0], bound[0] = 9.0, 9.0
-    np.testing.assert_array_equal(polytope.matrix, np.eye(2))
-    np.testing.assert_array_equal(polytope.row_upper, [1.0, 1.0])
-
-
-@pytest.mark.parametrize("component", [0, 1])
-def test_nan_is_in_no_polytope(component):
-    point = np.array([0.0, 0.0])
-    point[component] = np.nan
-    assert not qpmhe.Polytope([[1.0, 1.0]], [1.0]).violation(point) <= 0.0
-
-
-def test_components_of_a_box():
-    box = qpmhe.Box([-np.inf, 0.0, -1.0, -np.inf], [np.inf, 0.0, np.inf, 2.0])
-    np.testing.assert_array_equal(box.bounded_components, [1, 2, 3])
-    np.testing.assert_array_equal(box.fixed_components, [1])
-    assert box.matrix.shape == (0, 4)
-
-
-@pytest.mark.parametrize("kinds", ["bb", "bp", "pb", "pp", "bpp", "pbb"])
+@pytest.mark.parametrize("kinds", ["b", "p", "bb", "pp", "bpp", "pbb"])
 def test_a_point_is_in_an_intersection_as_far_as_in_each_part(kinds):
-    generator = np.random.default_rng(3)
-    seen = set()
-    for _ in range(30):
+    generator, seen = np.random.default_rng(3), set()
+    for k in range(30):
+        d, lead = int(generator.integers(1, 4)), [(), (1,), (7,), (3, 4)][k % 4]
         parts = []
         for kind in kinds:
-            lower = np.where(generator.random(3) < 0.3, -np.inf, -generator.exponential(size=3))
-            upper = np.where(generator.random(3) < 0.3, np.inf, generator.exponential(size=3))
+            lower = np.where(generator.random(d) < 0.3, -np.inf, -generator.exponential(size=d))
+            upper = np.where(generator.random(d) < 0.3, np.inf, generator.exponential(size=d))
+            rows = generator.standard_normal((2, d))
             parts.append(
-                qpmhe.Box(lower, upper) if kind == "b" else random_polytope(generator, 3, 2)
+                qpmhe.Box(lower, upper) if kind == "b"
+                else qpmhe.Polytope(rows, generator.exponential(size=2))
             )
-        both = parts[0]
+        whole, before = parts[0], repr(parts)
         for part in parts[1:]:
-            both = both & part
-        assert both.dimension == 3
-        assert both.matrix.shape == (2 * kinds.count("p"), 3)
-        point = 0.6 * generator.standard_normal(3)
-        expected = max(plain_violation(part, point) for part in parts)
-        assert both.violation(point) == pytest.approx(expected, rel=1e-12, abs=1e-14)
+            whole = whole & part
+        assert (whole.dimension, repr(parts)) == (d, before)
+        assert whole.matrix.shape == (2 * kinds.count("p"), d)
+        points = 0.6 * generator.standard_normal((*lead, d))
+        expected = max(
+            plain_violation(part, point) for part in parts for point in points.reshape(-1, d)
+        )
+        assert whole.violation(points) == pytest.approx(expected, rel=1e-12, abs=1e-14)
+        points[..., -1] = np.nan
+        bounded = np.isfinite([whole.lower[-1], whole.upper[-1]]).any() or len(whole.matrix)
+        assert not bounded or not whole.violation(points) <= 0.0
         seen.add(expected > 0.0)
     assert seen == {True, False}
 
 
-def test_intersections_leave_their_parts_alone():
-    box, polytope = qpmhe.Box([-1.0, -2.0], [1.0, np.inf]), qpmhe.Polytope([[1.0, 1.0]], [1.5])
-    both = box & polytope & qpmhe.Box([-9.0, -1.0], [0.5, 9.0])
-    assert isinstance(both, qpmhe.ConvexSet)
-    np.testing.assert_array_equal(both.lower, [-1.0, -1.0])
-    np.testing.assert_array_equal(both.upper, [0.5, 9.0])
-    np.testing.assert_array_equal(box.upper, [1.0, np.inf])
-    assert box.matrix.shape == (0, 2)
-    np.testing.assert_array_equal(polytope.lower, [-np.inf, -np.inf])
+def test_boxes_of_points_and_of_one_component():
+    box = qpmhe.Box([-1.0, 1.0], [1.0, np.inf])
+    assert [box.violation(np.array(x)) for x in ([-1.0, 1.0], [1.0, 1e300], [1.25, -3.0])] == [
+        0.0, 0.0, 4.0
+    ]
+    point = qpmhe.Box([0.0, 2.0], [0.0, 2.0])
+    assert [point.violation(np.array([0.0, x])) for x in (2.0, 2.5)] == [0.0, 0.5]
+    assert qpmhe.Box(-1, 2).violation(np.array([[3.5]])) == 1.5
+    assert qpmhe.Polytope([1.0, 2.0], 3.0).violation(np.array([2.0, 1.0])) == 1.0
+    wide = qpmhe.Box([-np.inf, 0.0, -1.0, -np.inf], [np.inf, 0.0, np.inf, 2.0])
+    np.testing.assert_array_equal(wide.bounded_components, [1, 2, 3])
+    np.testing.assert_array_equal(wide.fixed_components, [1])
+    assert repr(qpmhe.Box([0, -np.inf], [1, 2])) == "Box(lower=[0.0, -inf], upper=[1.0, 2.0])"
+    assert "3 rows" in repr(qpmhe.Polytope(np.ones((3, 2)), np.ones(3)))
+
+
+def test_the_numbers_of_sets_are_copies():
+    lower, upper, matrix = np.zeros(2), np.ones(2), np.eye(2)
+    box, polytope = qpmhe.Box(lower, upper), qpmhe.Polytope(matrix, upper)
+    for array in (lower, upper, matrix):
+        array[...] = 9.0
+    np.testing.assert_array_equal([box.lower, box.upper], [[0.0, 0.0], [1.0, 1.0]])
+    np.testing.assert_array_equal(polytope.matrix, np.eye(2))
+    np.testing.assert_array_equal(polytope.row_upper, [1.0, 1.0])
+
+
+def test_the_empty_component_is_named():
+    with pytest.raises(SetError, match=r"component 1 has lower 1.5 and upper 1.0.*lower <= upper"):
+        qpmhe.Box([0.0, 1.5, 0.0], [1.0, 1.0, 1.0])
 
 
 def test_sets_that_only_touch_are_not_empty():
@@ -204,27 +88,91 @@ def test_sets_that_only_touch_are_not_empty():
     assert corner.violation(np.array([1.0, 1.0])) == 0.0
 
 
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-9, 1e9), (1e9, 1e6), (1e-12, 1e-9)])
+@pytest.mark.parametrize("row", [1e-9, 1.0, 1e12])
+def test_whether_a_set_is_empty_depends_on_no_unit(units, row):
+    units = np.array(units)
+    matrix = row * np.array([[1.0, 1.0], [-1.0, -0.5], [0.0, -1.0]]) / units
+    made = qpmhe.Polytope(matrix, row * np.array([1.0, -0.9, 0.0]))
+    assert (made & qpmhe.Box(0.1 * units, units)).dimension == 2
+    with pytest.raises(SetError, match="empty"):
+        made & qpmhe.Box([-np.inf, 0.6 * units[1]], [np.inf, np.inf])
+    with pytest.raises(SetError, match="empty"):
+        qpmhe.Polytope(matrix, row * np.array([1.0, -1.2, 0.0]))
+
+
 def test_inequalities_on_unknown_components_do_not_count():
     one = qpmhe.Box([-1.0, -2.0, -3.0], [1.0, 2.0, np.inf]) & qpmhe.Polytope(
         [[1.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 1.0, 1.0]], [2.5, 2.0, 3.0]
     )
     # Component 0 is out by 6, 1 by 2, 2 by 4; the rows by 8.5, 5 and 1.
     point = np.array([7.0, 4.0, -7.0])
-    known = {
-        (True, True, True): 8.5,
-        (True, True, False): 8.5,
-        (True, False, True): 6.0,
-        (False, True, True): 5.0,
-        (False, False, True): 5.0,
-        (False, True, False): 2.0,
-        (True, False, False): 6.0,
-        (False, False, False): 0.0,
-    }
-    for mask, expected in known.items():
-        assert one.violation(point, np.array(mask)) == expected
-    masks = np.array([[False] * 3, [False, True, False], [False] * 3])
-    assert one.violation(np.tile(point, (3, 1)), masks) == 2.0
+    for known, expected in (
+        ([1, 1, 1], 8.5), ([1, 1, 0], 8.5), ([1, 0, 1], 6.0), ([0, 1, 1], 5.0), ([0, 0, 1], 5.0),
+        ([0, 1, 0], 2.0), ([1, 0, 0], 6.0), ([0, 0, 0], 0.0),
+    ):
+        assert one.violation(point, np.array(known, bool)) == expected
     rows = one.touched(np.array([[True, False, False], [False, False, True], [False] * 3]))
-    np.testing.assert_array_equal(
-        rows, [[True, False, True], [False, True, True], [False, False, False]]
+    np.testing.assert_array_equal(rows, [[1, 0, 1], [0, 1, 1], [0, 0, 0]])
+
+
+# The estimator
+
+C = np.array([[1.0, 0.2], [0.4, -1.0], [-0.6, 0.5]])
+MEASURED = np.clip(0.7 * np.random.default_rng(3).standard_normal((12, 3)), -1.1, 1.1)
+BOUNDS = {
+    "states": ([-0.2, -0.2], [0.2, 0.15]),
+    "disturbances": ([-0.1, -0.1], [0.1, 0.1]),
+    "noises": ([-0.9, -0.8, -0.66], [0.8, 0.7, 0.9]),
+}
+
+
+def estimator(sets, backend="auto", **options):
+    system = qpmhe.System(
+        lambda x: np.stack(
+            [x[..., 0] + 0.2 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
+        ),
+        lambda x: x @ C.T + 0.1 * x[..., :1] ** 2, n=2, p=3, **sets,
     )
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=2.0 * np.eye(2), noise=np.eye(3))
+    return qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(0.03 * C.T), cost, backend=backend, horizon=4,
+        initial_state=[0.1, -0.1], max_qps=8, solver_tolerance=1e-9, **options,
+    )
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+@pytest.mark.parametrize(
+    "backend", [n for n in qpmhe.solvers.available() if qpmhe.solvers.backend(n).inequalities]
+)
+def test_a_box_written_as_rows_gives_the_same_estimates(backend, name):
+    lower, upper = BOUNDS[name]
+    identity = np.eye(len(lower))
+    rows = qpmhe.Polytope(np.vstack([identity, -identity]), [*upper, *(-s for s in lower)])
+    boxed, other = estimator({name: qpmhe.Box(lower, upper)}), estimator({name: rows}, backend)
+    free, binding = estimator({}), 0
+    for y in MEASURED[:8]:
+        one, two = boxed.update(y), other.update(y)
+        assert one.dropped == two.dropped == ()
+        assert two.cost == pytest.approx(one.cost, rel=2e-4)
+        np.testing.assert_allclose(two.trajectory, one.trajectory, atol=3e-3)
+        assert two.cost <= two.candidate_cost
+        binding += one.cost > free.update(y).cost * (1 + 1e-6)
+    assert binding >= 2
+
+
+@pytest.mark.parametrize("project", [True, False])
+@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
+def test_an_observer_that_leaves_a_polytope(infeasible, project):
+    sets = {"states": qpmhe.Polytope([[1.0, -1.0]], [0.5])}
+    mhe = estimator(sets, infeasible=infeasible, project_observer=project)
+    ys, seen = MEASURED.copy(), Status(0)
+    ys[4] = 30.0 * C @ [1.0, -1.0]
+    for y in ys:
+        estimate = mhe.update(y)
+        seen |= estimate.status
+        assert estimate.cost <= estimate.candidate_cost
+        inside = (estimate.trajectory @ [1.0, -1.0]).max() <= 0.5 + 1e-8
+        assert inside or estimate.dropped or not (project or estimate.improved)
+    assert (Status.OBSERVER_PROJECTED in seen) is (Status.CANDIDATE_OUTSIDE not in seen) is project
+    assert infeasible == "drop_rows" or Status.ROWS_DROPPED not in seen

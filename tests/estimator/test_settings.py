@@ -1,3 +1,5 @@
+"""Options and samples that do not fit are refused by name, and leave the estimator as it was."""
+
 import dataclasses
 import math
 
@@ -5,131 +7,50 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.errors import BackendError, OptionError
+from qpmhe.errors import BackendError, InvalidInputError, OptionError, ShapeError, WeightError
 
-from .spoil import check, estimator
+from .spoil import A, check, cost_of, estimator, system_of, unharmed, with_input
 
-
-@pytest.mark.parametrize(
-    ("name", "value", "least"),
-    [
-        *(("horizon", value, 1) for value in (0, -1, 1.5, 3.0, True, "3", None)),
-        *(("max_qps", value, 0) for value in (-1, 1.5, True, "2")),
-    ],
-)
-def test_counts_out_of_range(name, value, least):
-    check(
-        OptionError, [f"{name} is {value!r}", f"expected an integer >= {least}"],
-        lambda: estimator(**{name: value}),
-    )
+BACKENDS = [entry.name for entry in qpmhe.solvers.backends()]
 
 
-@pytest.mark.parametrize("value", [0, -2, 1.5, True, "5"])
-def test_iteration_caps_out_of_range(value):
-    check(
-        OptionError,
-        [f"max_solver_iterations is {value!r}", "expected an integer >= 1", "max_qps=0"],
-        lambda: estimator(max_solver_iterations=value),
-    )
-
-
-@pytest.mark.parametrize("value", [0, 0.0, -1e-9, math.nan, math.inf, "tight", True, None, [1e-7]])
-@pytest.mark.parametrize("name", ["tolerance", "solver_tolerance"])
-def test_tolerances_out_of_range(name, value):
-    check(
-        OptionError, [f"{name} is {value!r}", "expected a finite number > 0"],
-        lambda: estimator(**{name: value}),
-    )
+def refused(name, values, *words):
+    return [(OptionError, {name: value}, [f"{name} is {value!r}", *words]) for value in values]
 
 
 @pytest.mark.parametrize(
-    "option",
+    ("error", "options", "words"),
     [
-        {"horizon": np.int64(3)},
-        {"max_qps": np.int32(2)},
-        {"max_solver_iterations": np.int64(5)},
-        {"solver_tolerance": np.float32(1e-5)},
-        {"tolerance": np.float64(1e-5)},
-        {"max_qps": None},
-        {"max_solver_iterations": None},
-        {"delay": np.int64(2)},
-        {"time_budget": np.float64(60.0)},
-        {"time_budget": np.float32(60.0)},
-        {"time_budget": np.int64(60)},
-    ],
-    ids=str,
-)
-def test_numbers_of_numpy_are_numbers(option):
-    assert estimator(**option).update([1.0]).state.shape == (2,)
-
-
-@pytest.mark.parametrize("name", ["nosuch", "", "OSQP", None, 3, ["osqp"]])
-def test_an_unknown_backend_lists_the_known_ones(name):
-    known = [entry.name for entry in qpmhe.solvers.backends()]
-    assert "auto" in known
-    check(
-        BackendError, [f"backend {name!r} is not known", *known], lambda: estimator(backend=name)
-    )
-
-
-@pytest.mark.parametrize("backend", qpmhe.solvers.available())
-def test_available_backends_are_accepted(backend):
-    assert estimator(backend=backend).update([1.0]).cost >= 0.0
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "known"),
-    [
-        *(("engine", value, ["python"]) for value in ("fast", "Python", None, 0)),
-        *(
-            ("infeasible", value, ["drop_rows", "keep_candidate"])
-            for value in ("drop", "", "Keep_candidate", None, True, ["drop_rows"])
-        ),
-        *(
-            ("candidate", value, ["observer", "reinitialized"])
-            for value in ("reinitialised", "best", None, 0)
-        ),
-        *(("arrival", value, ["observer", "smoothed"]) for value in ("smooth", None, True)),
+        *refused("horizon", (0, 1.5, True, "3", None), "expected an integer >= 1"),
+        *refused("max_qps", (-1, 1.5, True), "expected an integer >= 0"),
+        *refused("max_solver_iterations", (0, True), "expected an integer >= 1", "max_qps=0"),
+        *refused("tolerance", (0, -1e-9, math.nan, True, None), "a finite number > 0"),
+        *refused("solver_tolerance", (math.inf, "tight", [1e-7]), "a finite number > 0"),
+        *refused("time_budget", (0, math.nan, True, "1"), "expected a finite number > 0"),
+        *refused("delay", (-1, 1.0, True, None), "expected an integer >= 0"),
+        *refused("delay", (4, 100), "at most the horizon, 3"),
+        *refused("engine", ("Python", None), "expected one of", "'python'"),
+        *refused("infeasible", ("drop", None, ["drop_rows"]), "'drop_rows'", "'keep_candidate'"),
+        *refused("candidate", ("reinitialised", 0), "'observer'", "'reinitialized'"),
+        *refused("arrival", ("smooth", None), "'observer'", "'smoothed'"),
+        *refused("warm_start", ("best", 1), "True or False"),
+        *refused("project_observer", (None,), "True or False"),
+        (BackendError, {"backend": "OSQP"}, ["backend 'OSQP' is not known", *BACKENDS]),
+        (BackendError, {"backend": None}, ["backend None is not known"]),
+        (BackendError, {"backend": ["osqp"]}, ["backend ['osqp'] is not known"]),
     ],
 )
-def test_unknown_choices_list_the_known_ones(name, value, known):
-    check(
-        OptionError, [f"{name} is {value!r}", "expected one of", *map(repr, known)],
-        lambda: estimator(**{name: value}),
-    )
+def test_options_out_of_range(error, options, words):
+    check(error, words, lambda: estimator(**options))
 
 
-@pytest.mark.parametrize("name", ["warm_start", "project_observer"])
-@pytest.mark.parametrize("value", ["best", None, 1])
-def test_flags_are_true_or_false(name, value):
-    check(
-        OptionError, [f"{name} is {value!r}", "True or False"], lambda: estimator(**{name: value})
-    )
-
-
-@pytest.mark.parametrize("value", [0, 0.0, -1.0, math.nan, math.inf, True, "1", [0.1]])
-def test_time_budgets_out_of_range(value):
-    check(
-        OptionError, [f"time_budget is {value!r}", "expected a finite number > 0"],
-        lambda: estimator(time_budget=value),
-    )
-
-
-@pytest.mark.parametrize("value", [-1, 1.5, 1.0, True, "1", None])
-def test_delays_that_are_no_count(value):
-    check(
-        OptionError, [f"delay is {value!r}", "expected an integer >= 0"],
-        lambda: estimator(delay=value),
-    )
-
-
-@pytest.mark.parametrize("value", [4, 5, 100])
-def test_delays_beyond_the_horizon(value):
-    assert estimator(horizon=3, delay=3).settings.delay == 3
-    check(
-        OptionError, [f"delay is {value}", "at most the horizon, 3"],
-        lambda: estimator(horizon=3, delay=value),
-    )
+def test_numbers_of_numpy_are_numbers():
+    for option in (
+        {"horizon": np.int64(3)}, {"max_qps": np.int32(2)}, {"max_solver_iterations": np.int64(5)},
+        {"solver_tolerance": np.float32(1e-5)}, {"delay": np.int64(3)}, {"max_qps": None},
+        {"time_budget": np.float32(60.0)}, {"time_budget": np.int64(60)},
+    ):
+        assert estimator(**option).update([1.0]).state.shape == (2,)
 
 
 def test_settings_are_kept_and_frozen():
@@ -144,16 +65,11 @@ def test_settings_are_kept_and_frozen():
     assert given.items() <= dataclasses.asdict(settings).items()
     with pytest.raises(dataclasses.FrozenInstanceError):
         settings.horizon = 5
-    defaults = dataclasses.asdict(estimator().settings)
-    assert (defaults["infeasible"], defaults["warm_start"]) == ("drop_rows", False)
-    assert defaults["project_observer"] is True
-    assert (defaults["candidate"], defaults["time_budget"]) == ("observer", None)
-    assert (defaults["max_qps"], defaults["delay"]) == (1, 0)
-
-
-def test_an_unknown_option_is_a_type_error():
-    with pytest.raises(TypeError, match="max_qp"):
-        estimator(max_qp=3)
+    defaults = {
+        "infeasible": "drop_rows", "warm_start": False, "project_observer": True, "delay": 0,
+        "candidate": "observer", "time_budget": None, "max_qps": 1,
+    }
+    assert defaults.items() <= dataclasses.asdict(estimator().settings).items()
 
 
 def test_a_horizon_beyond_the_memory(monkeypatch):
@@ -161,7 +77,140 @@ def test_a_horizon_beyond_the_memory(monkeypatch):
         raise MemoryError("Unable to allocate 745. GiB")
 
     monkeypatch.setattr("qpmhe.estimation.estimator.engine_for", exhausted)
-    check(
-        OptionError, ["horizon is 10000000", "745. GiB", "take a shorter one"],
-        lambda: estimator(horizon=10_000_000),
-    )
+    words = ["horizon is 10000000", "745. GiB", "take a shorter one"]
+    check(OptionError, words, lambda: estimator(horizon=10_000_000))
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("MovingHorizonEstimator", estimator), ("System", system_of), ("QuadraticCost", cost_of),
+        ("SolverOptions", qpmhe.solvers.SolverOptions),
+        ("RobustCost", lambda **options: qpmhe.RobustCost(
+            prior=np.eye(1), disturbance=np.eye(1), noise=np.eye(1), **options
+        )),
+    ],
+)
+def test_unknown_options_are_refused_with_the_known_ones(name, make):
+    for kind in (OptionError, TypeError):
+        with pytest.raises(kind, match=f"{name} has no option 'nonsense'; expect"):
+            make(nonsense=1)
+    with pytest.raises(OptionError, match="Did you mean max_qps"):
+        estimator(max_qp=2)
+
+
+# Samples
+
+
+def in_time():
+    return estimator(qpmhe.System.from_ode(
+        lambda x: x @ (A - np.eye(2)), lambda x: x[..., :1], dt=0.1, n=2, p=1
+    ))
+
+
+def two_outputs():
+    observer = qpmhe.Luenberger(0.1 * np.eye(2))
+    return estimator(system_of(h=lambda x: x, p=2), observer, cost_of(2, 2))
+
+
+def update(*arguments, **own):
+    return lambda mhe: mhe.update(*arguments, **own)
+
+
+def run(*arguments):
+    return lambda mhe: mhe.run(*arguments)
+
+
+ONES = np.ones((5, 1))
+OF_ONE = [
+    (ShapeError, ["y has shape (2,)", "expected (1,)"], update([1.0, 2.0])),
+    (ShapeError, ["y has shape (0,)", "expected (1,)"], update([])),
+    (InvalidInputError, ["y is [1j]", "real numbers"], update([1j])),
+    (InvalidInputError, ["y is [[1.0], 2.0]", "real numbers"], update([[1.0], 2.0])),
+    (InvalidInputError, ["u was given", "no inputs"], update([1.0], [0.0])),
+    (InvalidInputError, ["u was given", "no inputs"], update([1.0], [])),
+    (InvalidInputError, ["the system is discrete", "System.from_ode"], update([1.0], dt=0.1)),
+    (WeightError, ["noise_weight has the eigenvalue 0", "positive definite"],
+     update([1.0], noise_weight=0.0)),
+    (InvalidInputError, ["noise_weight is nan", "finite"], update([1.0], noise_weight=math.nan)),
+    (ShapeError, ["noise_weight has shape (2,)", "np.diag"], update([1.0], noise_weight=[1, 2])),
+    (InvalidInputError, ["noise_weight is 'heavy'", "real"], update([1.0], noise_weight="heavy")),
+    (ShapeError, ["measurements has shape (5, 2)", "(T, 1)"], run(np.ones((5, 2)))),
+    (ShapeError, ["measurements has shape ()", "(T, 1)"], run(1.0)),
+    (InvalidInputError, ["measurements"], run([[1.0], [1.0, 2.0]])),
+    (InvalidInputError, ["measurements", "high"], run([[1.0], ["high"]])),
+    (InvalidInputError, ["inputs"], run(ONES, ONES)),
+    (InvalidInputError, ["inputs"], run(ONES, np.ones((5, 0)))),
+]
+OF_TWO = [
+    (ShapeError, ["y has shape ()", "expected (2,)"], update(1.0)),
+    (ShapeError, ["y has shape (1,)", "expected (2,)"], update([1.0])),
+    (WeightError, ["noise_weight is not symmetric", "by 0.5"],
+     update([1.0, 2.0], noise_weight=[[1.0, 0.5], [0.0, 1.0]])),
+    (ShapeError, ["noise_weight has shape (1, 1)", "(2, 2)"], update([1.0, 2.0], noise_weight=3.0)),
+]
+WITH_INPUT = [
+    (InvalidInputError, ["u is missing", "2 inputs", "update(y, u)"], update([1.0])),
+    (ShapeError, ["u has shape (1,)", "expected (2,)"], update([1.0], [1.0])),
+    (ShapeError, ["u has shape ()", "expected (2,)"], update([1.0], 1.0)),
+    (ShapeError, ["u has shape (1, 2)", "expected (2,)"], update([1.0], [[1.0, 2.0]])),
+    (InvalidInputError, ["u is 'up'", "real numbers"], update([1.0], "up")),
+    (InvalidInputError, ["u is missing", "2 inputs"], run(ONES, None)),
+    (ShapeError, ["inputs has 4 samples", "expected 5"], run(ONES, np.ones((4, 2)))),
+    (ShapeError, ["inputs has shape (5, 3)", "(T, 2)"], run(ONES, np.ones((5, 3)))),
+    (InvalidInputError, ["inputs"], run(ONES, [[1.0, 2.0]] * 4 + [[1.0]])),
+]
+IN_TIME = [
+    (OptionError, [f"dt is {dt!r}", "finite number > 0"], update([1.0], dt=dt))
+    for dt in (0, -0.1, math.nan, True, "0.1", [0.1])
+]
+
+
+def amend(age, y=(1.0,)):
+    return lambda mhe: mhe.amend(mhe.time - 1 - age if isinstance(age, int) else age[0], y)
+
+
+# The horizon is 3, and two samples are there before the first of these.
+LATE = [
+    (InvalidInputError, ["time is ", "an integer from ", "samples in the window", "longer horizon"],
+     amend(7)),
+    (InvalidInputError, ["time is ", "an integer from "], amend(-1)),
+    *((InvalidInputError, [f"time is {time!r}", "an integer"], amend([time]))
+      for time in (1.0, True, None, "1", [1])),
+    (ShapeError, ["y has shape (2,)", "expected (1,)"], amend(0, [1.0, 2.0])),
+    (ShapeError, ["y has shape (0,)", "expected (1,)"], amend(1, [])),
+    (InvalidInputError, ["y is [1j]", "real numbers"], amend(1, [1j])),
+]
+
+
+def begun():
+    mhe = estimator()
+    mhe.run([1.0, 1.2])
+    return mhe
+
+
+@pytest.mark.parametrize(
+    ("build", "wrong", "sample"),
+    [
+        (estimator, OF_ONE, ([1.5],)), (two_outputs, OF_TWO, ([1.0, 2.0],)),
+        (with_input, WITH_INPUT, ([1.5], [0.1, 0.2])), (in_time, IN_TIME, ([1.5],)),
+        (begun, LATE, ([1.5],)),
+    ],
+)
+def test_samples_that_do_not_fit_leave_the_estimator_as_it_was(build, wrong, sample):
+    unharmed(build, wrong, sample)
+
+
+def test_late_measurements_are_those_of_samples_in_the_window():
+    mhe = estimator()
+    check(InvalidInputError, ["time is 0", "no sample yet", "update first"],
+          lambda: mhe.amend(0, [1.0]))
+    for after in (1, 2, 3, 4, 9):
+        while mhe.time < after:
+            mhe.update([0.1])
+        oldest = max(0, after - 3)
+        for time in (oldest - 1, oldest - 100, after):
+            words = [f"time is {time}", f"an integer from {oldest} to {after - 1}"]
+            check(InvalidInputError, words, lambda time=time: mhe.amend(time, [1.0]))
+        for time in range(oldest, after):
+            mhe.amend(np.int64(time), [1.0])
