@@ -57,7 +57,7 @@ def test_unconstrained_where_one_inequality_is_violated(side):
     qp.upper[...] = qp.row_upper[...] = wide
     solution = solved(qp)
     assert solution.status is SOLVED
-    assert not (solution.bound_duals.any() or solution.row_duals.any())
+    assert not np.append(solution.bound_duals, solution.row_duals).any()
     value = dense.matrix @ x if side.startswith("row") else x
     sign = 1.0 if side.endswith("lower") else -1.0
     getattr(qp, side).flat[3] = value[3] + 0.5 * sign
