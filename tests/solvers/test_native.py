@@ -314,29 +314,29 @@ class Kept(NativeSolver):
         return Answer(np.zeros(layout.size), np.arange(1.0, 13.0), False, True, 1, "")
 
 
-@pytest.mark.parametrize("count", range(5))
-def test_multipliers_move_with_the_trajectory(count):
-    qp, solver = sample(4, 2, 1, bounds="all", sides="two"), Kept()
-    bounds, rows = np.arange(1.0, 9.0).reshape(4, 2), np.arange(9.0, 13.0)
-    moved = np.concatenate([
-        np.append(one[count:], np.zeros_like(one[:count])) for one in (bounds, rows)
-    ])
-    solver.shift()  # before anything is kept
-    solver.solve(qp)
-    for _ in range(count):
-        solver.shift()
-    solver.solve(qp)
-    solver.solve(qp)
-    assert solver.starts[0] is None
-    if count == 4:  # nothing is left
-        assert solver.starts[1] is None
-    else:
-        np.testing.assert_array_equal(solver.starts[1], moved)
-    np.testing.assert_array_equal(solver.starts[2], np.arange(1.0, 13.0))
-    cold = Kept(SolverOptions(warm_start=False))
-    cold.solve(qp)
-    cold.solve(qp)
-    assert cold.starts == [None, None]
+def test_multipliers_move_with_the_trajectory():
+    for count in [0, 1, 2, 3, 4]:
+        qp, solver = sample(4, 2, 1, bounds="all", sides="two"), Kept()
+        bounds, rows = np.arange(1.0, 9.0).reshape(4, 2), np.arange(9.0, 13.0)
+        moved = np.concatenate([
+            np.append(one[count:], np.zeros_like(one[:count])) for one in (bounds, rows)
+        ])
+        solver.shift()  # before anything is kept
+        solver.solve(qp)
+        for _ in range(count):
+            solver.shift()
+        solver.solve(qp)
+        solver.solve(qp)
+        assert solver.starts[0] is None
+        if count == 4:  # nothing is left
+            assert solver.starts[1] is None
+        else:
+            np.testing.assert_array_equal(solver.starts[1], moved)
+        np.testing.assert_array_equal(solver.starts[2], np.arange(1.0, 13.0))
+        cold = Kept(SolverOptions(warm_start=False))
+        cold.solve(qp)
+        cold.solve(qp)
+        assert cold.starts == [None, None]
 
 
 def test_multipliers_and_active_sets_of_the_last_solve_save_iterations():

@@ -144,19 +144,16 @@ def test_finite_sees_nan_everywhere_and_allows_infinite_limits(name):
         assert qp.finite() is allowed
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_sizes_out_of_range():
+    for arguments, message in [
         ((0, 1), "stages is 0; a QP needs an integer stages >= 1"),
         ((1, -3), "n is -3; a QP needs an integer n >= 1"),
         ((1, 1, -1), "rows is -1; a QP needs an integer rows >= 0"),
         ((2.5, 1), r"stages is 2\.5"), ((1, "3"), "n is '?3"), ((1, 1, 0.5), r"rows is 0\.5"),
-    ],
-)
-def test_sizes_out_of_range(arguments, message):
-    with pytest.raises(ShapeError, match=message) as caught:
-        QP(*arguments)
-    assert isinstance(caught.value, InvalidInputError)
+    ]:
+        with pytest.raises(ShapeError, match=message) as caught:
+            QP(*arguments)
+        assert isinstance(caught.value, InvalidInputError)
 
 
 @pytest.mark.parametrize("bounded", [True, False])
@@ -209,10 +206,16 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(SolverOptions)])
-def test_options_are_validated(name):
-    default, good, bad, expectation = OPTIONS[name]
+def test_options_are_validated():
     options = SolverOptions()
+    assert set(OPTIONS) == {field.name for field in dataclasses.fields(options)}
+    for name, (default, good, bad, expectation) in OPTIONS.items():
+        check_option(options, name, default, good, bad, expectation)
+    with pytest.raises(TypeError, match="max_iter"):
+        SolverOptions(max_iter=3)
+
+
+def check_option(options, name, default, good, bad, expectation):
     assert getattr(options, name) == default
     with pytest.raises(dataclasses.FrozenInstanceError, match=name):
         setattr(options, name, default)
@@ -224,5 +227,3 @@ def test_options_are_validated(name):
         assert isinstance(caught.value, InvalidInputError)
         assert isinstance(caught.value, QpmheError)
         assert isinstance(caught.value, ValueError)
-    with pytest.raises(TypeError, match="max_iter"):
-        SolverOptions(max_iter=3)

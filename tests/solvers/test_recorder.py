@@ -257,19 +257,16 @@ def test_two_recordings_of_one_backend_do_not_mix(tmp_path):
     assert len(list((tmp_path / "a").iterdir())) == 2
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "words"),
-    [
+def test_bad_arguments(tmp_path):
+    for arguments, error, words in [
         ({"backend": "nonsense"}, BackendError, "'nonsense' is not known"),
         ({"only": "bad"}, OptionError, "only is 'bad'; expected one of 'suspicious', 'failed'"),
         ({"limit": 0}, OptionError, "limit is 0"), ({"limit": True}, OptionError, "limit is True"),
         ({"folder": "file"}, InvalidInputError, "cannot make the folder"),
         ({"folder": "file/below"}, InvalidInputError, "cannot make the folder"),
-    ],
-)
-def test_bad_arguments(tmp_path, arguments, error, words):
-    (tmp_path / "file").write_text("")
-    arguments["folder"] = tmp_path / arguments.get("folder", "folder")
-    with pytest.raises(error, match=words):
-        Recording(**arguments)
-    assert not (tmp_path / "folder").exists()
+    ]:
+        (tmp_path / "file").write_text("")
+        arguments["folder"] = tmp_path / arguments.get("folder", "folder")
+        with pytest.raises(error, match=words):
+            Recording(**arguments)
+        assert not (tmp_path / "folder").exists()

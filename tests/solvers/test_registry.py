@@ -78,9 +78,8 @@ KINDS = "expected one of 'banded', 'csc', 'dense'"
 PACKAGE = "or None if it needs no package"
 
 
-@pytest.mark.parametrize(
-    ("field", "values", "words"),
-    [
+def test_an_entry_that_can_never_work_is_refused():
+    for field, values, words in [
         ("factory", [None, "Nothing"], "expected a callable"),
         ("factory", [Nothing(SolverOptions())], "give the class itself"),
         ("matrices", ["weird", None, ["csc"]], KINDS),
@@ -88,16 +87,14 @@ PACKAGE = "or None if it needs no package"
         ("module", [3, ""], PACKAGE), ("distribution", [b"daqp"], PACKAGE),
         ("iteration_cap", ["yes"], "expected True or False"),
         ("inequalities", [None], "expected True or False"),
-    ],
-)
-def test_an_entry_that_can_never_work_is_refused(field, values, words):
-    for value in values:
-        with pytest.raises(BackendError) as caught:
-            Backend(**{"name": "mine", "factory": Nothing, "method": "none", field: value})
-        for part in (field, repr(value), "'mine'", words):
-            assert part in str(caught.value)
-    with pytest.raises(OptionError, match="Did you mean inequalities"):
-        Backend("mine", Nothing, "none", inequality=False)
+    ]:
+        for value in values:
+            with pytest.raises(BackendError) as caught:
+                Backend(**{"name": "mine", "factory": Nothing, "method": "none", field: value})
+            for part in (field, repr(value), "'mine'", words):
+                assert part in str(caught.value)
+        with pytest.raises(OptionError, match="Did you mean inequalities"):
+            Backend("mine", Nothing, "none", inequality=False)
 
 
 class Abstract(Solver):
@@ -113,9 +110,8 @@ def broken(options):
     raise ImportError("broken")
 
 
-@pytest.mark.parametrize(
-    ("factory", "words"),
-    [
+def test_a_factory_that_makes_no_solver():
+    for factory, words in [
         (dict, "TypeError: .*; correct the factory"),
         (Abstract, "TypeError: .*abstract.*; correct the factory"),
         (lambda: None, "TypeError: .*; correct the factory"),
@@ -124,16 +120,14 @@ def broken(options):
         (lambda options: Nothing, "made <class .*; expected an instance of a subclass"),
         (Without, r"has no options; call super\(\).__init__\(options\)"),
         (broken, "ImportError: broken; reinstall numpy"),
-    ],
-)
-def test_a_factory_that_makes_no_solver(factory, words):
-    package = ("numpy", "numpy") if factory is broken else ()
-    with registered(Backend("mine", factory, "none at all", *package)):
-        for ask in (create, qpmhe.solvers.check):
-            with pytest.raises(BackendError, match=f"backend 'mine' .*{words}") as caught:
-                ask("mine")
-    if factory is broken:
-        assert isinstance(caught.value.__cause__, ImportError)
+    ]:
+        package = ("numpy", "numpy") if factory is broken else ()
+        with registered(Backend("mine", factory, "none at all", *package)):
+            for ask in (create, qpmhe.solvers.check):
+                with pytest.raises(BackendError, match=f"backend 'mine' .*{words}") as caught:
+                    ask("mine")
+        if factory is broken:
+            assert isinstance(caught.value.__cause__, ImportError)
 
 
 def test_our_own_errors_leave_a_factory_as_they_are():
@@ -144,32 +138,31 @@ def test_our_own_errors_leave_a_factory_as_they_are():
         create("mine")
 
 
-@pytest.mark.parametrize("options", [3, {"max_iterations": 3}, "fast", SolverOptions], ids=repr)
-def test_options_that_are_none_are_refused(options):
-    for name in ("auto", "banded"):
-        with pytest.raises(OptionError, match=r"options is .*; expected qpmhe\.solvers\.Solver"):
-            create(name, options)
+def test_options_that_are_none_are_refused():
+    for options in [3, {"max_iterations": 3}, "fast", SolverOptions]:
+        for name in ("auto", "banded"):
+            with pytest.raises(OptionError, match=r"options is .*; expected qpmhe\.solvers"):
+                create(name, options)
 
 
-@pytest.mark.parametrize(
-    ("module", "distribution"),
-    [("no_such_module", "no-such-package"), ("no_such_module", None), ("no_such.part", None)],
-)
-def test_an_absent_package_is_named(module, distribution):
-    entry = Backend("ghost", broken, "none at all", module=module, distribution=distribution)
-    with registered(entry):
-        assert not entry.available
-        assert entry.version == ""
-        assert "ghost" not in available()
-        assert entry in backends()
-        with pytest.raises(BackendError) as caught:
-            create("ghost")
-    package = distribution or module
-    for part in (
-        f"backend 'ghost' needs the package {package}", f"pip install {package}",
-        ", ".join(available()),
-    ):
-        assert part in str(caught.value)
+def test_an_absent_package_is_named():
+    for module, distribution in [
+        ("no_such_module", "no-such-package"), ("no_such_module", None), ("no_such.part", None),
+    ]:
+        entry = Backend("ghost", broken, "none at all", module=module, distribution=distribution)
+        with registered(entry):
+            assert not entry.available
+            assert entry.version == ""
+            assert "ghost" not in available()
+            assert entry in backends()
+            with pytest.raises(BackendError) as caught:
+                create("ghost")
+        package = distribution or module
+        for part in (
+            f"backend 'ghost' needs the package {package}", f"pip install {package}",
+            ", ".join(available()),
+        ):
+            assert part in str(caught.value)
 
 
 @pytest.mark.parametrize("entry", backends(), ids=NAMES)
