@@ -14,7 +14,12 @@ class Hostile(Solver):
 
     count = 0
 
+    def misbehave(self, qp):
+        pass
+
     def _solve(self, qp, start):
+        if qp.gradient[0, 0] > 0.0:
+            self.misbehave(qp)
         self.count += 1
         return RawSolution(-qp.gradient / qp.band[:, :, 0], True, self.count, np.zeros(qp.size))
 
@@ -29,32 +34,30 @@ class Hostile(Solver):
 
 
 class Crashing(Hostile):
-    def _solve(self, qp, start):
-        if qp.gradient[0, 0] > 0.0:
-            os.kill(os.getpid(), signal.SIGSEGV)
-        return super()._solve(qp, start)
+    def misbehave(self, qp):
+        os.kill(os.getpid(), signal.SIGSEGV)
 
 
-class CrashingOnce(Hostile):
+class CrashingOnce(Crashing):
     """At the only window of six states, while it grows."""
 
     def _solve(self, qp, start):
         if qp.stages == 6:
-            os.kill(os.getpid(), signal.SIGSEGV)
+            super().misbehave(qp)
         return super()._solve(qp, start)
+
+    def misbehave(self, qp):
+        pass
 
 
 class Hanging(Hostile):
-    def _solve(self, qp, start):
-        if qp.gradient[0, 0] > 0.0:
-            time.sleep(60.0)
-        return super()._solve(qp, start)
+    def misbehave(self, qp):
+        time.sleep(60.0)
 
 
 class Printing(Hostile):
-    def _solve(self, qp, start):
+    def misbehave(self, qp):
         os.write(1, b"words of a solver\n")
-        return super()._solve(qp, start)
 
 
 class Overriding(Hostile):

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from qpmhe_solvers import QP, available, backend, register, unregister
+from qpmhe_solvers import (
+    QP,
+    Backend,
+    SolverOptions,
+    available,
+    backend,
+    native,
+    register,
+    unregister,
+)
+from qpmhe_solvers.qp import ARRAYS
 from qpmhe_solvers.scaling import Scaling
 
 EVERY = available()
 WITH_INEQUALITIES = [name for name in EVERY if backend(name).inequalities]
-
-
-ARRAYS = (
-    "band", "gradient", "lower", "upper", "row_own", "row_next", "row_lower", "row_upper"
-)
+NATIVE = [
+    name for name in EVERY if backend(name).keeps_workspace and name not in ("auto", "banded")
+]
+TIGHT = SolverOptions(absolute_tolerance=1e-9)
 
 
 @contextmanager
@@ -28,6 +36,13 @@ def registered(entry):
         yield entry
     finally:
         unregister(entry.name)
+
+
+def replace_natives(monkeypatch, factory):
+    """Have "auto" choose among backends that this makes."""
+    for name in ("clarabel", "daqp", "osqp", "piqp", "proxqp"):
+        entry = Backend(name, factory, "-", iterate_at_cap=True)
+        monkeypatch.setitem(native.NATIVE, name, entry)
 
 
 def overwrite(qp, other):
@@ -42,80 +57,52 @@ def numbers(qp):
     return {name: getattr(qp, name).copy() for name in ARRAYS}
 
 
-@dataclass
 class Dense:
-    """The QP in the stacked unknown x, from plain loops: min x'Hx/2 + g'x, a <= Fx <= b."""
+    """The QP in the stacked unknown x by full matrices: min x'Hx/2 + g'x, low <= Nx <= high.
 
-    hessian: np.ndarray
-    gradient: np.ndarray
-    matrix: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    row_lower: np.ndarray
-    row_upper: np.ndarray
+    The first rows of N are those of the identity: the bounds are before the general rows.
+    """
+
+    def __init__(self, hessian, gradient, matrix, qp):
+        self.hessian, self.gradient, self.matrix = hessian, gradient, matrix
+        self.normals = np.vstack((np.eye(qp.size), matrix))
+        self.low = np.concatenate((qp.lower, qp.row_lower), axis=None)
+        self.high = np.concatenate((qp.upper, qp.row_upper), axis=None)
 
     def objective(self, d):
         x = np.ravel(d)
         return 0.5 * x @ self.hessian @ x + self.gradient @ x
 
     def violation(self, d):
-        x, worst = np.ravel(d), 0.0
-        for value, low, high in self._sides(x):
-            worst = max(worst, low - value, value - high)
-        return worst
+        value = self.normals @ np.ravel(d)
+        return np.maximum(self.low - value, value - self.high).max(initial=0.0)
 
-    def stationarity(self, d, bound_duals, row_duals):
-        x = np.ravel(d)
-        force = self.hessian @ x + self.gradient + bound_duals + self.matrix.T @ row_duals
+    def stationarity(self, d, duals):
+        force = self.hessian @ np.ravel(d) + self.gradient + self.normals.T @ duals
         return np.abs(force).max()
 
-    def complementarity(self, d, bound_duals, row_duals):
+    def complementarity(self, d, duals):
         """Largest product of a multiplier and the distance to its side; itself if there is none."""
-        x, worst = np.ravel(d), 0.0
-        multipliers = [*bound_duals, *row_duals]
-        for (value, low, high), multiplier in zip(self._sides(x), multipliers, strict=True):
-            distance = high - value if multiplier > 0 else value - low
-            worst = max(worst, abs(multiplier) * (abs(distance) if np.isfinite(distance) else 1.0))
-        return worst
+        value = self.normals @ np.ravel(d)
+        distance = np.where(duals > 0, self.high - value, value - self.low)
+        return np.abs(duals * np.where(np.isfinite(distance), distance, 1.0)).max()
 
-    def gap(self, d, bound_duals, row_duals):
-        x = np.ravel(d)
-        total = x @ self.hessian @ x + self.gradient @ x
-        multipliers = [*bound_duals, *row_duals]
-        for (_, low, high), multiplier in zip(self._sides(x), multipliers, strict=True):
-            if multiplier != 0:
-                total += multiplier * (high if multiplier > 0 else low)
-        return abs(total)
+    def gap(self, d, duals):
+        x, sides = np.ravel(d), np.where(duals > 0, self.high, self.low)
+        return abs(x @ self.hessian @ x + self.gradient @ x + duals @ np.where(duals, sides, 0.0))
 
     def minimiser(self):
         """The solution by quadprog, called directly: min x'Gx/2 - a'x, C'x >= b."""
         quadprog = pytest.importorskip("quadprog")
-        equal, normals, sides = [], [], []
-        for row, low, high in self._rows_and_sides():
-            if low == high:
-                equal.append((row, low))
-                continue
-            if np.isfinite(low):
-                normals.append(row)
-                sides.append(low)
-            if np.isfinite(high):
-                normals.append(-row)
-                sides.append(-high)
-        if not equal and not normals:
+        equal = self.low == self.high
+        above, below = np.isfinite(self.low) & ~equal, np.isfinite(self.high) & ~equal
+        if not (equal | above | below).any():
             return np.linalg.solve(self.hessian, -self.gradient)
-        normals = [row for row, _ in equal] + normals
-        sides = [side for _, side in equal] + sides
+        normals = np.vstack((self.normals[equal], self.normals[above], -self.normals[below]))
+        sides = np.concatenate((self.low[equal], self.low[above], -self.high[below]))
         return quadprog.solve_qp(
-            self.hessian, -self.gradient, np.array(normals).T, np.array(sides), len(equal)
+            self.hessian, -self.gradient, normals.T, sides, np.count_nonzero(equal)
         )[0]
-
-    def _sides(self, x):
-        yield from zip(x, self.lower, self.upper, strict=True)
-        yield from zip(self.matrix @ x, self.row_lower, self.row_upper, strict=True)
-
-    def _rows_and_sides(self):
-        yield from zip(np.eye(self.gradient.size), self.lower, self.upper, strict=True)
-        yield from zip(self.matrix, self.row_lower, self.row_upper, strict=True)
 
 
 def make(stages, n, rows=0, *, seed=0, bounds="none", sides="none", decades=0.0):
@@ -129,33 +116,25 @@ def make(stages, n, rows=0, *, seed=0, bounds="none", sides="none", decades=0.0)
     rng = np.random.default_rng(seed)
     qp = QP(stages, n, rows)
     hessian = np.zeros((qp.size, qp.size))
-    for k in range(stages):
-        width = min(2 * n, qp.size - k * n)
+    for first in range(0, qp.size, n):
+        width = min(2 * n, qp.size - first)
         factor = rng.standard_normal((width, width))
         weights = 10.0 ** rng.uniform(-decades / 2, decades / 2, width)
-        for i in range(width):
-            for j in range(width):
-                curvature = sum(factor[r, i] * weights[r] * factor[r, j] for r in range(width))
-                hessian[k * n + i, k * n + j] += curvature + 0.5 * weights[i] * (i == j)
-    for i in range(qp.size):
-        for j in range(i):
-            hessian[j, i] = hessian[i, j]  # to the last bit, for exact comparisons
-    for k in range(stages):
-        for c in range(n):
-            for o in range(2 * n - c):
-                if k * n + c + o < qp.size:
-                    qp.band[k, c, o] = hessian[k * n + c + o, k * n + c]
+        block = slice(first, first + width)
+        hessian[block, block] += factor.T * weights @ factor + 0.5 * np.diag(weights)
+    hessian = np.tril(hessian) + np.tril(hessian, -1).T  # to the last bit, for exact comparisons
+    for k, c, o in np.ndindex(qp.band.shape):
+        if c + o < 2 * n and k * n + c + o < qp.size:
+            qp.band[k, c, o] = hessian[k * n + c + o, k * n + c]
 
     qp.gradient[:] = 10.0 * rng.standard_normal((stages, n))
-    matrix = np.zeros((stages * rows, qp.size))
-    for k in range(stages):
-        for r in range(rows):
-            for c in range(n):
-                qp.row_own[k, r, c] = matrix[k * rows + r, k * n + c] = rng.standard_normal()
-                # The last stage's is never read, so it may be anything.
-                qp.row_next[k, r, c] = rng.standard_normal()
-                if k + 1 < stages:
-                    matrix[k * rows + r, (k + 1) * n + c] = qp.row_next[k, r, c]
+    # The last stage's is never read, so it may be anything.
+    qp.row_own[...], qp.row_next[...] = np.moveaxis(rng.standard_normal((stages, rows, n, 2)), 3, 0)
+    matrix = np.zeros((stages * rows, qp.size + n))
+    for k, r, c in np.ndindex(stages, rows, n):
+        matrix[k * rows + r, k * n + c] = qp.row_own[k, r, c]
+        matrix[k * rows + r, (k + 1) * n + c] = qp.row_next[k, r, c]
+    matrix = matrix[:, : qp.size]
 
     inside = 0.2 * rng.standard_normal(qp.size)
     qp.bounded = bounds != "none"
@@ -181,10 +160,7 @@ def make(stages, n, rows=0, *, seed=0, bounds="none", sides="none", decades=0.0)
             kind = np.arange(stages * rows).reshape(stages, rows) % 4
             qp.row_lower[kind == 0] = qp.row_upper[kind == 0] = value[kind == 0]
             qp.row_lower[kind == 1], qp.row_upper[kind == 2] = -np.inf, np.inf
-    return qp, Dense(
-        hessian, qp.gradient.ravel().copy(), matrix, qp.lower.ravel().copy(),
-        qp.upper.ravel().copy(), qp.row_lower.ravel().copy(), qp.row_upper.ravel().copy(),
-    )
+    return qp, Dense(hessian, qp.gradient.ravel().copy(), matrix, qp)
 
 
 def of_order_one(qp):
@@ -192,10 +168,22 @@ def of_order_one(qp):
     scaling = Scaling(held=False)
     scaling.scale(qp)
     qp = scaling.qp.copy()
-    return qp, Dense(
-        qp.dense(), qp.gradient.ravel(), qp.dense_rows(), qp.lower.ravel(), qp.upper.ravel(),
-        qp.row_lower.ravel(), qp.row_upper.ravel(),
-    )
+    return qp, Dense(qp.dense(), qp.gradient.ravel(), qp.dense_rows(), qp)
+
+
+def in_units(qp, states, cost, rows):
+    """The same QP for the unknowns ``states * d``, with a cost and rows of other units."""
+    other, n = qp.copy(), qp.n
+    row = (np.arange(n)[:, None] + np.arange(2 * n)) % n
+    other.band *= cost / (states[:, None] * states[row])
+    other.gradient *= cost / states
+    for array in (other.lower, other.upper):
+        array *= states
+    for array in (other.row_own, other.row_next):
+        array *= rows[:, None] / states
+    for array in (other.row_lower, other.row_upper):
+        array *= rows
+    return other
 
 
 # What every backend that knows inequalities must solve.

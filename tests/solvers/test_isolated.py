@@ -7,12 +7,15 @@ import pickle
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 
+import casadi
 import numpy as np
 import pytest
 
 import qpmhe
+import qpmhe_solvers.isolated
 from qpmhe_solvers import (
     QP,
     Backend,
@@ -50,6 +53,14 @@ def isolated(kind, options=None):
         return create(kind.__name__.lower(), options, isolated=True)
 
 
+def program(text, *options):
+    """Run a program of its own."""
+    return subprocess.run(
+        [sys.executable, *options, "-c", textwrap.dedent(text)], capture_output=True, text=True,
+        timeout=60,
+    )
+
+
 def gone(pid):
     try:
         os.kill(pid, 0)
@@ -79,13 +90,14 @@ def test_the_numbers_are_those_of_the_same_process(name):
 @POSIX
 def test_a_crash_is_a_failed_qp_and_the_next_one_is_solved():
     solver = isolated(Crashing)
-    assert solver.solve(small()).status is SolveStatus.SOLVED
+    solver.prepare(7)
+    assert solver.solve(small()).iterations == 7001
     for _ in range(2):
         solution = solver.solve(small(1.0))
         assert solution.status is SolveStatus.FAILED
         assert solution.message == "crashing: its process died: SIGSEGV"
-        solution = solver.solve(small())
-        assert solution.status is SolveStatus.SOLVED, solution.message
+        solution = solver.solve(small())  # by another process, prepared as the first one
+        assert (solution.status, solution.iterations) == (SolveStatus.SOLVED, 7001)
         np.testing.assert_array_equal(solution.d, np.ones((2, 1)))
 
 
@@ -105,69 +117,45 @@ def test_the_time_limit_ends_a_solver_that_hangs():
 
 
 def test_shift_forget_and_prepare_are_forwarded():
-    solver = isolated(Hostile)
-    assert solver.solve(small()).iterations == 1
-    solver.shift()
-    assert solver.solve(small()).iterations == 102
-    solver.forget()
-    assert solver.solve(small()).iterations == 1
-    solver.prepare(7)
-    assert solver.solve(small()).iterations == 7001
+    solver, counts = isolated(Hostile), []
+    for call in (lambda: None, solver.shift, solver.forget, lambda: solver.prepare(7)):
+        call()
+        counts.append(solver.solve(small()).iterations)
+    assert counts == [1, 102, 1, 7001]
 
 
-@POSIX
-def test_another_process_is_prepared_as_the_first_one():
-    solver = isolated(Crashing)
-    solver.prepare(7)
-    assert solver.solve(small(1.0)).status is SolveStatus.FAILED
-    assert solver.solve(small()).iterations == 7001
-
-
-def test_what_it_prints_does_not_get_among_the_answers(capfd):
-    solver = isolated(Printing)
-    assert solver.solve(small()).status is SolveStatus.SOLVED
+def test_what_it_prints_and_overrides_is_contained(capfd):
+    assert isolated(Printing).solve(small(1.0)).status is SolveStatus.SOLVED
     out, err = capfd.readouterr()
     assert out == ""
     assert "words of a solver" in err
-
-
-def test_an_overridden_solve_is_contained():
     solver = isolated(Overriding)
     assert "returned int, not a Solution" in solver.solve(small(1.0)).message
     assert solver.solve(small()).message == "ValueError: what it says"
 
 
 @POSIX
-def test_the_process_ends_with_the_solver():
+def test_the_process_ends_with_the_solver_and_with_its_parent():
     solver = isolated(Hostile)
     pid = solver._child._process.pid
     assert not gone(pid)
     del solver
     gc.collect()
     assert gone(pid)
-
-
-@POSIX
-def test_the_process_ends_with_its_parent(tmp_path):
-    program = textwrap.dedent("""
-        import os, sys
-        from qpmhe_solvers import create
-        solver = create("banded", isolated=True)
-        print(solver._child._process.pid, flush=True)
-        if sys.argv[1] == "killed":
-            os.kill(os.getpid(), 9)
-    """)
-    for how in ("ends", "killed"):
-        ended = subprocess.run(
-            [sys.executable, "-c", program, how], capture_output=True, text=True, timeout=60
-        )
+    for how in ("", "os.kill(os.getpid(), 9)"):
+        ended = program(f"""
+            import os
+            from qpmhe_solvers import create
+            solver = create("banded", isolated=True)
+            print(solver._child._process.pid, flush=True)
+            {how}
+        """)
         assert ended.stderr == ""
-        pid = int(ended.stdout)
         for _ in range(200):
-            if gone(pid):
+            if gone(int(ended.stdout)):
                 break
             time.sleep(0.05)
-        assert gone(pid)
+        assert gone(int(ended.stdout))
 
 
 @pytest.mark.parametrize("way", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
@@ -182,7 +170,7 @@ def test_a_copy_has_a_process_of_its_own(way):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_forked_process_does_not_end_or_use_that_of_its_parent():
     # In a program of its own: other libraries of this one, such as JAX, warn of any fork.
-    program = textwrap.dedent("""
+    ended = program("""
         import os
         from qpmhe_solvers import QP, create
         qp = QP(1, 1)
@@ -197,18 +185,12 @@ def test_a_forked_process_does_not_end_or_use_that_of_its_parent():
         _, status = os.waitpid(pid, 0)
         found = solver.solve(qp).d
         print(status, found == 2.0, solver._child is child)
-    """)
-    ended = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program], capture_output=True, text=True,
-        timeout=60,
-    )
+    """, "-W", "ignore")
     assert (ended.stdout, ended.stderr) == ("0 [[ True]] True\n", "")
 
 
 @POSIX
 def test_an_interrupt_leaves_a_solver_that_goes_on(monkeypatch):
-    from qpmhe_solvers import isolated as module
-
     solver = isolated(Hostile)
     first = solver._child._process.pid
 
@@ -216,7 +198,7 @@ def test_an_interrupt_leaves_a_solver_that_goes_on(monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as context:
-        context.setattr(module._Child, "send", interrupted)
+        context.setattr(qpmhe_solvers.isolated._Child, "send", interrupted)
         with pytest.raises(KeyboardInterrupt):
             solver.solve(small())
     assert gone(first)
@@ -226,7 +208,7 @@ def test_an_interrupt_leaves_a_solver_that_goes_on(monkeypatch):
 def test_what_cannot_be_made_or_sent_is_refused_at_construction():
     with pytest.raises(BackendError, match=r"cannot be isolated: .*no licence"):
         isolated(Unmakeable)
-    lock = __import__("threading").Lock()
+    lock = threading.Lock()
     stuck = Backend("stuck", lambda options, lock=lock: Hostile(options), "theatre")
     with registered(stuck), pytest.raises(BackendError, match=r"cannot be sent .*a module"):
         create("stuck", isolated=True)
@@ -270,16 +252,11 @@ def test_a_backend_of_the_main_script(hidden, tmp_path):
         assert (ended.returncode, ended.stdout) == (0, "SOLVED\n"), ended.stderr
 
 
-def decay(x):
-    return 0.9 * x
-
-
-def itself(x):
-    return x
-
-
 def estimator(**options):
-    system = qpmhe.System(decay, itself, n=1, p=1)
+    x = casadi.SX.sym("x")
+    system = qpmhe.from_casadi(
+        casadi.Function("f", [x], [0.9 * x]), casadi.Function("h", [x], [x]), compiled=False
+    )
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0)
     return qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([0.3]), cost, horizon=4, initial_state=[0.0], **options

@@ -1,3 +1,8 @@
+"""A QP's views and products are those of one matrix; its sizes, data and options are validated."""
+
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,17 +13,17 @@ from qpmhe_solvers import (
     QP,
     Backend,
     InvalidInputError,
+    OptionError,
+    QpmheError,
     RawSolution,
     ShapeError,
     Solver,
     SolverOptions,
-    SolveStatus,
-    backend,
     band_index,
-    create,
 )
+from qpmhe_solvers.qp import ARRAYS
 
-from .problems import ARRAYS, EVERY, make, registered
+from .problems import make, overwrite, registered
 
 # stages, n, rows
 SIZES = [
@@ -28,121 +33,76 @@ SIZES = [
 sizes = pytest.mark.parametrize(("stages", "n", "rows"), SIZES)
 
 
-def check_views(qp, dense):
-    size = qp.size
-    banded = np.zeros((size, size))
-    for column in range(size):
-        for offset in range(2 * qp.n):
-            if column + offset < size:
-                banded[column + offset, column] = qp.lapack_band[offset, column]
-                banded[column, column + offset] = qp.lapack_band[offset, column]
-    np.testing.assert_array_equal(banded, dense.hessian)
-    np.testing.assert_array_equal(qp.dense(), dense.hessian)
-    np.testing.assert_array_equal(qp.csc().toarray(), dense.hessian)
-    assert qp.csc_rows().shape == dense.matrix.shape
-    np.testing.assert_array_equal(qp.csc_rows().toarray(), dense.matrix)
-    np.testing.assert_array_equal(qp.dense_rows(), dense.matrix)
-
-
-def check_products(qp, dense, rng):
-    d = rng.standard_normal((qp.stages, qp.n))
-    y = rng.standard_normal((qp.stages, qp.rows))
-    close = {"rtol": 1e-12, "atol": 1e-12}
-    assert qp.hessian_times(d).shape == d.shape
-    np.testing.assert_allclose(qp.hessian_times(d).ravel(), dense.hessian @ d.ravel(), **close)
-    assert qp.rows_times(d).shape == y.shape
-    np.testing.assert_allclose(qp.rows_times(d).ravel(), dense.matrix @ d.ravel(), **close)
-    assert qp.rows_transposed_times(y).shape == d.shape
-    np.testing.assert_allclose(
-        qp.rows_transposed_times(y).ravel(), dense.matrix.T @ y.ravel(), **close
-    )
-    assert qp.objective(d) == pytest.approx(dense.objective(d), rel=1e-12, abs=1e-12)
-    assert qp.violation(d) == pytest.approx(dense.violation(d), rel=1e-12, abs=1e-12)
-
-
-@sizes
-def test_views_are_one_matrix(stages, n, rows):
-    check_views(*make(stages, n, rows, seed=1))
-
-
-@sizes
-@pytest.mark.parametrize("sides", ["none", "mixed"])
-@pytest.mark.parametrize("bounds", ["none", "part"])
-def test_products_equal_dense(stages, n, rows, bounds, sides):
-    qp, dense = make(stages, n, rows, seed=2, bounds=bounds, sides=sides)
-    check_products(qp, dense, np.random.default_rng(3))
+def check(qp, dense, seed=3):
+    banded = np.zeros((qp.size, qp.size))
+    for offset, column in np.ndindex(qp.lapack_band.shape):
+        if column + offset < qp.size:
+            banded[column + offset, column] = qp.lapack_band[offset, column]
+            banded[column, column + offset] = qp.lapack_band[offset, column]
+    for hessian in (banded, qp.dense(), qp.csc().toarray()):
+        np.testing.assert_array_equal(hessian, dense.hessian)
+    for matrix in (qp.csc_rows().toarray(), qp.dense_rows()):
+        np.testing.assert_array_equal(matrix, dense.matrix)
+    rng = np.random.default_rng(seed)
+    d, y = rng.standard_normal((qp.stages, qp.n)), rng.standard_normal((qp.stages, qp.rows))
+    for found, wanted in (
+        (qp.hessian_times(d), (dense.hessian @ d.ravel()).reshape(d.shape)),
+        (qp.rows_times(d), (dense.matrix @ d.ravel()).reshape(y.shape)),
+        (qp.rows_transposed_times(y), (dense.matrix.T @ y.ravel()).reshape(d.shape)),
+        (qp.objective(d), dense.objective(d)), (qp.violation(d), dense.violation(d)),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
 
 
 @given(
-    stages=st.integers(1, 6), n=st.integers(1, 4), rows=st.integers(0, 3),
+    size=st.one_of(
+        st.sampled_from(SIZES), st.tuples(st.integers(1, 6), st.integers(1, 4), st.integers(0, 3))
+    ),
     bounds=st.sampled_from(["none", "all", "part", "fixed"]),
     sides=st.sampled_from(["none", "two", "one", "equal", "mixed"]), seed=st.integers(0, 10**6),
 )
-@settings(max_examples=60, derandomize=True, deadline=None)
-def test_any_qp_equals_its_dense_twin(stages, n, rows, bounds, sides, seed):
-    qp, dense = make(stages, n, rows, seed=seed, bounds=bounds, sides=sides)
-    check_views(qp, dense)
-    check_products(qp, dense, np.random.default_rng(seed))
+@settings(max_examples=100, derandomize=True, deadline=None)
+def test_any_qp_equals_its_dense_twin(size, bounds, sides, seed):
+    qp, dense = make(*size, seed=seed, bounds=bounds, sides=sides)
+    check(qp, dense, seed)
+    # What is beyond the last stage is never read.
+    for column in range(qp.n):
+        qp.band[-1, column, qp.n - column :] = 1e9
+    qp.row_next[-1] = 1e9
+    assert (qp.csc().toarray() == dense.hessian).all()
+    assert (qp.dense_rows() == dense.matrix).all()
+    np.testing.assert_array_equal(qp.dense(), dense.hessian)
+    assert qp.violation(np.ones((qp.stages, qp.n))) < 1e6
+    # Views follow changed numbers.
+    other, dense = make(*size, seed=seed + 1, bounds=bounds, sides=sides)
+    overwrite(qp, other)
+    check(qp, dense, seed)
 
 
 @sizes
-def test_csc_indices_are_sorted_and_own(stages, n, rows):
+def test_csc_indices_are_sorted_own_and_of_the_sizes_only(stages, n, rows):
     qp, dense = make(stages, n, rows, seed=4)
-    for view, full in ((qp.csc, dense.hessian), (qp.csc_rows, dense.matrix)):
-        first, second = view(), view()
-        for column in range(qp.size):
-            indices = first.indices[first.indptr[column] : first.indptr[column + 1]]
-            assert (np.diff(indices) > 0).all()
+    empty = QP(stages, n, rows)
+    for name, full in (("csc", dense.hessian), ("csc_rows", dense.matrix)):
+        first, second, none = getattr(qp, name)(), getattr(qp, name)(), getattr(empty, name)()
+        assert first.has_sorted_indices
+        assert first.has_canonical_format
         for part in ("data", "indices", "indptr"):
             mine, other = getattr(first, part), getattr(second, part)
+            assert part == "data" or (mine == getattr(none, part)).all()
             assert not np.shares_memory(mine, other)
-            assert not any(np.shares_memory(mine, getattr(qp, name)) for name in ARRAYS)
+            assert not np.shares_memory(mine, qp.numbers)
             mine[...] = 0  # what a solver that works in place might do
-        np.testing.assert_array_equal(view().toarray(), full)
-
-
-def test_csc_pattern_does_not_depend_on_the_numbers():
-    qp, _ = make(4, 2, 1, seed=5)
-    for view, empty in ((qp.csc(), QP(4, 2, 1).csc()), (qp.csc_rows(), QP(4, 2, 1).csc_rows())):
-        np.testing.assert_array_equal(view.indices, empty.indices)
-        np.testing.assert_array_equal(view.indptr, empty.indptr)
-
-
-def test_views_follow_changed_numbers():
-    qp, _ = make(4, 2, 1, seed=6)
-    qp.dense(), qp.csc(), qp.csc_rows(), qp.dense_rows()
-    other, dense = make(4, 2, 1, seed=7)
-    qp.band[...], qp.row_own[...], qp.row_next[...] = other.band, other.row_own, other.row_next
-    check_views(qp, dense)
-
-
-def test_lapack_band_is_a_view():
-    qp, _ = make(3, 2)
-    assert qp.lapack_band.shape == (4, 6)
-    assert qp.lapack_band.flags.f_contiguous
-    assert np.shares_memory(qp.lapack_band, qp.band)
-
-
-@sizes
-def test_entries_beyond_the_last_stage_are_never_read(stages, n, rows):
-    qp, dense = make(stages, n, rows, seed=8, sides="two")
-    for column in range(n):
-        qp.band[-1, column, n - column :] = 1e9
-    qp.row_next[-1] = 1e9
-    np.testing.assert_array_equal(qp.dense(), dense.hessian)
-    np.testing.assert_array_equal(qp.csc().toarray(), dense.hessian)
-    np.testing.assert_array_equal(qp.dense_rows(), dense.matrix)
-    check_products(qp, dense, np.random.default_rng(9))
+        np.testing.assert_array_equal(getattr(qp, name)().toarray(), full)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_band_index_fills_a_panel(n):
     block = np.random.default_rng(n).standard_normal((2 * n, n))
     panel = np.take(np.append(block.ravel(), 0.0), band_index(n)).reshape(n, 2 * n)
-    for column in range(n):
-        for offset in range(2 * n):
-            inside = column + offset < 2 * n
-            assert panel[column, offset] == (block[column + offset, column] if inside else 0.0)
+    for column, offset in np.ndindex(n, 2 * n):
+        inside = column + offset < 2 * n
+        assert panel[column, offset] == (block[column + offset, column] if inside else 0.0)
 
 
 def test_a_new_qp_has_no_inequality_and_looks_for_some():
@@ -153,111 +113,58 @@ def test_a_new_qp_has_no_inequality_and_looks_for_some():
     assert qp.finite()
     assert qp.violation(np.full((3, 2), 1e6)) == 0.0
     assert not np.shares_memory(qp.band, QP(3, 2, 1).band)
+    assert qp.lapack_band.flags.f_contiguous
+    assert np.shares_memory(qp.lapack_band, qp.band)
 
 
 @pytest.mark.parametrize(
     ("name", "index", "value", "missed"),
     [
-        ("lower", (1, 0), 0.25, 0.25),
-        ("upper", (2, 1), -0.5, 0.5),
-        ("row_lower", (0, 0), 1.5, 1.5),
-        ("row_upper", (2, 0), -2.0, 2.0),
+        ("lower", (1, 0), 0.25, 0.25), ("upper", (2, 1), -0.5, 0.5),
+        ("row_lower", (0, 0), 1.5, 1.5), ("row_upper", (2, 0), -2.0, 2.0),
     ],
 )
 def test_violation_sees_every_side(name, index, value, missed):
-    qp, _ = make(3, 2, 1, bounds="none")
+    qp, d = make(3, 2, 1)[0], np.zeros((3, 2))
     qp.bounded = True
-    d = np.zeros((3, 2))
     assert qp.violation(d) == 0.0
     getattr(qp, name)[index] = value
     assert qp.violation(d) == missed
-
-
-def test_violation_is_zero_on_the_edge():
-    qp = QP(2, 2)
-    d = np.array([[1.0, -2.0], [0.5, 3.0]])
-    qp.lower[...] = qp.upper[...] = d
-    assert qp.violation(d) == 0.0
-
-
-@pytest.mark.parametrize("inequality", ["bounds", "rows"])
-def test_violation_of_nan_is_not_zero(inequality):
-    if inequality == "bounds":
-        qp, _ = make(3, 2, bounds="all")
-    else:
-        qp, _ = make(3, 2, 1, sides="two")
-    assert not qp.violation(np.full((3, 2), np.nan)) <= 0.0
+    assert not qp.violation(d * np.nan) <= 0.0
+    qp.lower[...], qp.upper[...] = d, d  # on the edge
+    assert qp.violation(d) == (missed if name.startswith("row") else 0.0)
 
 
 @pytest.mark.parametrize("name", ARRAYS)
-def test_finite_sees_nan_everywhere(name):
-    qp, _ = make(3, 2, 1, bounds="part", sides="one")
-    assert qp.finite()
-    getattr(qp, name)[1].flat[-1] = np.nan
-    assert not qp.finite()
+def test_finite_sees_nan_everywhere_and_allows_infinite_limits(name):
+    for value, allowed in ((np.nan, False), (np.inf, "er" in name)):
+        qp, _ = make(3, 2, 1)
+        assert qp.finite()
+        getattr(qp, name)[1].flat[-1] = value
+        assert qp.finite() is allowed
 
 
-@pytest.mark.parametrize("name", ARRAYS)
-def test_finite_allows_infinity_in_bounds_only(name):
-    qp, _ = make(3, 2, 1)
-    getattr(qp, name)[0].flat[0] = np.inf
-    assert qp.finite() is (name in ("lower", "upper", "row_lower", "row_upper"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+def test_sizes_out_of_range():
+    for arguments, message in [
         ((0, 1), "stages is 0; a QP needs an integer stages >= 1"),
-        ((-3, 1), "stages is -3; a QP needs an integer stages >= 1"),
-        ((1, 0), "n is 0; a QP needs an integer n >= 1"),
+        ((1, -3), "n is -3; a QP needs an integer n >= 1"),
         ((1, 1, -1), "rows is -1; a QP needs an integer rows >= 0"),
-    ],
-)
-def test_sizes_out_of_range(arguments, message):
-    with pytest.raises(ShapeError, match=message) as caught:
-        QP(*arguments)
-    assert isinstance(caught.value, InvalidInputError)
+        ((2.5, 1), r"stages is 2\.5"), ((1, "3"), "n is '?3"), ((1, 1, 0.5), r"rows is 0\.5"),
+    ]:
+        with pytest.raises(ShapeError, match=message) as caught:
+            QP(*arguments)
+        assert isinstance(caught.value, InvalidInputError)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [((2.5, 1), r"stages is 2\.5"), ((1, "3"), "n is '?3"), ((1, 1, 0.5), r"rows is 0\.5")],
-)
-def test_sizes_that_are_not_integers(arguments, message):
-    with pytest.raises(ShapeError, match=message):
-        QP(*arguments)
-
-
-def pushed():
-    """Each unknown wants to be 5 and may be 1; nothing else is said of it."""
-    qp = QP(3, 2)
-    qp.band[:, :, 0], qp.gradient[...] = 1.0, -5.0
-    qp.lower[...], qp.upper[...] = -1.0, 1.0
-    return qp
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_bounds_that_are_filled_in_are_met(name):
-    qp = pushed()
-    solution = create(name, SolverOptions(absolute_tolerance=1e-9)).solve(qp)
-    if not backend(name).inequalities:
-        assert solution.status is SolveStatus.UNCONSTRAINED
-        assert solution.residuals.primal == pytest.approx(4.0)
-        return
-    assert solution.status.usable
-    np.testing.assert_allclose(solution.d, 1.0, atol=1e-4)
-
-
-def test_a_copy_shares_nothing():
+@pytest.mark.parametrize("bounded", [True, False])
+def test_a_copy_shares_nothing(bounded):
     qp, _ = make(3, 2, 1, bounds="all", sides="two")
-    for bounded in (True, False):
-        qp.bounded = bounded
-        twin = qp.copy()
-        for name in QP.__slots__:
-            np.testing.assert_array_equal(getattr(twin, name), getattr(qp, name))
-            assert type(getattr(twin, name)) is type(getattr(qp, name))
-        for name in ARRAYS:
-            assert not np.shares_memory(getattr(twin, name), getattr(qp, name))
+    qp.bounded = bounded
+    twin = qp.copy()
+    for name in QP.__slots__:
+        np.testing.assert_array_equal(getattr(twin, name), getattr(qp, name))
+        assert type(getattr(twin, name)) is type(getattr(qp, name))
+    assert not np.shares_memory(twin.numbers, qp.numbers)
 
 
 @pytest.mark.parametrize("boxed", [False, True])
@@ -277,6 +184,46 @@ def test_the_estimator_promises_that_there_are_no_bounds_where_there_are_none(bo
             system, qpmhe.Luenberger([0.8]), cost, horizon=3, initial_state=[0.5], backend="spy",
             max_qps=1,
         )
-        for _ in range(5):
-            mhe.update([0.4])
+        mhe.run(np.full(5, 0.4))
     assert seen == [boxed] * 5
+
+
+# Of each option: its default, values in range and out of it, and what a message expects.
+ABOVE = "expected a finite number > 0"
+OPTIONS = {
+    "max_iterations": (
+        None, [1, 10**9], [0, -2, 2.0, math.inf, "5", True],
+        r"expected an integer >= 1 or None.*max_qps=0",
+    ),
+    "absolute_tolerance": (
+        1e-7, [1, np.float64(1e-12)], [0.0, -1e-9, math.nan, math.inf, None, "1e-6", True], ABOVE
+    ),
+    "relative_tolerance": (
+        0.0, [0, 0.5], [-1e-9, math.nan, math.inf, None, False], "expected a finite number >= 0"
+    ),
+    "time_limit": (None, [1e-9, 3600], [0, -1.0, math.nan, math.inf, "1 s", True], ABOVE),
+    "warm_start": (True, [False], [1, None, "yes"], "expected True or False"),
+}
+
+
+def test_options_are_validated():
+    options = SolverOptions()
+    assert set(OPTIONS) == {field.name for field in dataclasses.fields(options)}
+    for name, (default, good, bad, expectation) in OPTIONS.items():
+        check_option(options, name, default, good, bad, expectation)
+    with pytest.raises(TypeError, match="max_iter"):
+        SolverOptions(max_iter=3)
+
+
+def check_option(options, name, default, good, bad, expectation):
+    assert getattr(options, name) == default
+    with pytest.raises(dataclasses.FrozenInstanceError, match=name):
+        setattr(options, name, default)
+    for value in good:
+        assert getattr(SolverOptions(**{name: value}), name) == value
+    for value in bad:
+        with pytest.raises(OptionError, match=f"^{name} is {value!r}; {expectation}") as caught:
+            dataclasses.replace(options, **{name: value})
+        assert isinstance(caught.value, InvalidInputError)
+        assert isinstance(caught.value, QpmheError)
+        assert isinstance(caught.value, ValueError)
