@@ -29,13 +29,13 @@ class Model(NamedTuple):
 
     def f(self, x, u=None):
         sin = ca.sin if isinstance(x, ca.SX) else np.sin
-        return _times(self.a, x) + self.bent * sin(_times(self.b, x))
+        return times(self.a, x) + self.bent * sin(times(self.b, x))
 
     def h(self, x, u=None):
-        return _times(self.c, x) + self.curved * _times(self.c, x) ** 2
+        return times(self.c, x) + self.curved * times(self.c, x) ** 2
 
 
-def _times(matrix, x):
+def times(matrix, x):
     return ca.DM(matrix) @ x if isinstance(x, ca.SX) else x @ matrix.T
 
 
