@@ -2,8 +2,10 @@
 
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
+import pytest
+
+ca = pytest.importorskip("casadi")
 
 OPTIONS = {
     "print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-10,

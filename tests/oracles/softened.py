@@ -1,11 +1,10 @@
 """Random nonlinear problems with nonlinear constraints and soft sets."""
 
-import casadi as ca
 import numpy as np
 
 import qpmhe
 
-from .nlp import Model, Row, Window, quadratic
+from .nlp import Model, Row, Window, ca, quadratic
 
 #: Parameters of a nonlinear constraint, or the soft set and its shape.
 HARD = ("x", "xu", "w", "v", "xwv")

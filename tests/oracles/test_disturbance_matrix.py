@@ -5,8 +5,7 @@ import pytest
 
 import qpmhe
 
-ca = pytest.importorskip("casadi")
-from .nlp import Window, times
+from .nlp import Window, ca, times
 from .test_kalman import spd
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")

@@ -5,7 +5,6 @@ import pytest
 
 import qpmhe
 
-pytest.importorskip("casadi")
 from .nlp import Model, Window
 
 

@@ -8,8 +8,7 @@ import pytest
 import qpmhe
 from qpmhe import Status
 
-ca = pytest.importorskip("casadi")
-from .nlp import Model, Window
+from .nlp import Model, Window, ca
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 

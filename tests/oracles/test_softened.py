@@ -5,7 +5,6 @@ import pytest
 
 import qpmhe
 
-pytest.importorskip("casadi")
 from .softened import COSTS, HARD, PENALTIES, SETS, Case
 
 CASES = [(kind, None) for kind in HARD] + [

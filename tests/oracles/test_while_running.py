@@ -7,8 +7,7 @@ import pytest
 
 import qpmhe
 
-ca = pytest.importorskip("casadi")
-from .nlp import Window
+from .nlp import Window, ca
 from .test_kalman import spd
 
 HORIZON, STEPS = 5, 14

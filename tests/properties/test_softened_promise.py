@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
+from oracles.softened import COSTS, HARD, PENALTIES, SETS, Case
 
 import qpmhe
 from qpmhe import Status
 from qpmhe_solvers import RawSolution, Solver
 from qpmhe_solvers.options import SolverOptions
-
-pytest.importorskip("casadi")
-from oracles.softened import COSTS, HARD, PENALTIES, SETS, Case
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 
