@@ -79,7 +79,7 @@ class Window:
     us : sequence, optional
         Inputs and parameters of each sample.
     boxes : dict, optional
-        For the name of a set a box for each sample; for the states one more.
+        For the name of a set that at each sample; for the states one more.
     rows : sequence of Row
         At each sample; those on x alone also at the last state.
     loss : callable
@@ -118,6 +118,9 @@ class Window:
                     keep = seen if letter == "v" else list(range(values[letter].numel()))
                     box = boxes[name][i]
                     self.limits.append((values[letter][keep], box.lower[keep], box.upper[keep]))
+                    if len(box.matrix):
+                        rows_of = ca.DM(box.matrix) @ values[letter]
+                        self.limits.append((rows_of, box.row_lower, box.row_upper))
             for row in rows:
                 if set(row.names) <= set(values) and not (
                     "v" in row.names and (~there & row.outputs).any()

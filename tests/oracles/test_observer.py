@@ -6,7 +6,6 @@ import pytest
 import qpmhe
 from qpmhe import Status
 
-BACKENDS = qpmhe.solvers.available()
 GAIN, START = np.array([[0.3, 0.05], [-0.1, 0.2], [0.02, 0.4]]), np.array([0.5, -0.2, 1.0])
 
 
@@ -61,34 +60,7 @@ def test_no_qps_are_the_observer_to_the_last_bit(name):
     assert all(Status.NO_QPS in s and Status.CANDIDATE in s for s in run.statuses)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("observer", [None, qpmhe.ExtendedKalman(
-    prior=np.eye(3), disturbance=0.1 * np.eye(3), noise=0.2 * np.eye(2)
-)], ids=["luenberger", "kalman"])
-def test_the_candidate_is_the_observer_whatever_the_qps_do(observer, backend):
-    Y, U = record(2, steps=25)
-    pure = estimator(observer, max_qps=0, horizon=1).run(Y, U).states
-    mhe = estimator(observer, backend=backend, max_qps=2)
-    for t in range(25):
-        estimate = mhe.update(Y[t], U[t])
-        assert estimate.candidate.tolist() == pure[max(0, t - 3) : t + 2].tolist()
-        if not estimate.improved:
-            assert estimate.trajectory.tolist() == estimate.candidate.tolist()
-
-
-def test_the_reactor_with_no_qps_is_the_papers_luenberger_observer():
-    system, observer, cost, scenario = qpmhe.models.batch_reactor()
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, observer, cost, horizon=10, initial_state=[3.0, 0.0], max_qps=0
-    )
-    z = np.array([3.0, 0.0])
-    for y in scenario.simulate(5).measurements:
-        reaction, v = 0.16 * z[0] ** 2 - 0.64 * z[1], y[0] - z.sum()
-        z = z + 0.1 * (np.array([-2.0 * reaction, reaction]) + 0.5 * v)
-        np.testing.assert_allclose(mhe.update(y).state, z, rtol=1e-12)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", qpmhe.solvers.available())
 @pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])
 def test_a_growing_window_is_a_full_one_of_its_length(backend, missing):
     # Remark rem:emtpyN: until N samples are there, the horizon is t.
