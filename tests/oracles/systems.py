@@ -4,6 +4,8 @@ import numpy as np
 
 import qpmhe
 
+from .nlp import Window, ca
+
 
 class Case:
     """A model, sets, an observer that mostly keeps within them, and random records.
@@ -49,10 +51,8 @@ class Case:
 
     def symbolic(self):
         """f and h for CasADi."""
-        import casadi
-
         return {
-            name: lambda x, g=g: casadi.vertcat(*g(casadi.vertsplit(x), casadi))
+            name: lambda x, g=g: ca.vertcat(*g(ca.vertsplit(x), ca))
             for name, g in (("f", self.step), ("h", self.output))
         }
 
@@ -68,24 +68,17 @@ class Case:
         gain[disturbances.fixed_components] = 0.0  # or the candidate would be outside
         return (system, qpmhe.Luenberger(gain), self.cost), common
 
-    def judged(self, kind, trajectory, prior, Y):
-        """J, and how far x, w and v are from the boundaries of X, W and V: negative outside.
-
-        Components of no width count only where they are violated.
-        """
+    def window(self, kind, estimate, ys):
+        """The program of an estimate's window, for the judgement of trajectories."""
         P, Q, R = self.cost.prior, self.cost.disturbance, self.cost.noise
-        offset = trajectory[0] - prior
-        J, points = offset @ P @ offset, ([], [], [])
-        for x, following, y in zip(trajectory[:-1], trajectory[1:], Y, strict=True):
-            w, v = following - self.f(x), y - self.h(x)
-            J += w @ Q @ w + v @ R @ v
-            for collected, point in zip(points, (x, w, v), strict=True):
-                collected.append(point)
-        points[0].append(trajectory[-1])
-        return J, [
-            min(_margin(one, point) for point in several)
-            for one, several in zip(self.sets[kind], points, strict=True)
-        ]
+        f, h = self.symbolic().values()
+        count, names = len(ys), ("states", "disturbances", "noises")
+        return Window(
+            lambda x, u: f(x), lambda x, u: h(x), ys, estimate.candidate[0],
+            (P, [Q] * count, [R] * count), boxes={
+                name: [one] * (count + 1) for name, one in zip(names, self.sets[kind], strict=True)
+            },
+        )
 
     def record(self, seed, steps):
         rng = np.random.default_rng(seed)
@@ -94,15 +87,6 @@ class Case:
             Y.append(self.h(x) + rng.uniform(-self.draws[1], self.draws[1]))
             x = self.f(x) + rng.uniform(-self.draws[0], self.draws[0])
         return np.array(Y)
-
-
-def _margin(one, point):
-    rows = one.matrix @ point
-    gaps = np.concatenate(
-        [point - one.lower, one.upper - point, rows - one.row_lower, one.row_upper - rows]
-    )
-    fixed = np.concatenate([np.tile(one.lower == one.upper, 2), np.zeros(2 * rows.size, bool)])
-    return np.where(fixed & (gaps >= -1e-12), np.inf, gaps).min()
 
 
 def around(center, *half):

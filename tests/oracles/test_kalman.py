@@ -1,5 +1,7 @@
 """On linear-Gaussian systems the estimator with a Kalman-type prior is the Kalman filter."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -9,48 +11,65 @@ STEPS = 80  # beyond the length at which the window of the shorter horizons is m
 
 
 class Plant:
-    """A random observable linear system with dense covariances, an input and a record."""
+    """A random observable linear system x+ = A x + B u + G w, y = C x + D u + v, and a record.
 
-    def __init__(self, seed, n, p, radius, m=0, missing=False, steps=STEPS):
+    With ``drifting`` covariances each sample has its own; with fewer ``directions`` than states
+    the disturbance has so many components.
+    """
+
+    def __init__(
+        self, seed, n, p, radius, m=0, missing=False, steps=STEPS, directions=None, drifting=False
+    ):
         rng = np.random.default_rng(seed)
         a = rng.standard_normal((n, n))
         self.A = a * (radius / np.abs(np.linalg.eigvals(a)).max())
         self.B, self.C = rng.standard_normal((n, m)), rng.standard_normal((p, n))
         self.D = rng.standard_normal((p, m))
-        self.P, self.Q, self.R = (_covariance(rng, k) for k in (n, n, p))
+        self.G = np.eye(n) if directions is None else rng.standard_normal((n, directions))
+        self.low = directions is not None
+        self.P, self.Q, self.R = (spd(rng, k) for k in (n, self.G.shape[1], p))
+        self.Qs, self.Rs = [self.Q] * steps, [self.R] * steps
+        if drifting:
+            self.Qs, self.Rs = (
+                [spd(rng, len(one)) for _ in range(steps)] for one in (self.Q, self.R)
+            )
         self.z0 = rng.standard_normal(n)
         self.U = rng.standard_normal((steps, m))
         self.Y = np.empty((steps, p))
-        x = self.z0 + np.linalg.cholesky(self.P) @ rng.standard_normal(n)
+        x = self.z0 + _draw(rng, self.P)
         for t, u in enumerate(self.U):
             self.Y[t] = self.C @ x + self.D @ u + _draw(rng, self.R)
-            x = self.A @ x + self.B @ u + _draw(rng, self.Q)
+            x = self.A @ x + self.B @ u + self.G @ _draw(rng, self.Q)
         if missing:
             self.Y[rng.random(self.Y.shape) < 0.3] = np.nan
             self.Y[[0, 7, 8]] = np.nan
 
-    def estimator(self, horizon, **options):
+    def system(self, how="matrix"):
         A, B, C, D = self.A, self.B, self.C, self.D
-        n, p, m = A.shape[0], C.shape[0], B.shape[1]
-        if m:
-            system = qpmhe.System(
-                lambda x, u: x @ A.T + u @ B.T, lambda x, u: x @ C.T + u @ D.T, n=n, p=p, m=m
-            )
-        else:
-            system = qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=n, p=p)
-        observer = qpmhe.ExtendedKalman(prior=self.P, disturbance=self.Q, noise=self.R)
-        cost = qpmhe.QuadraticCost.from_covariances(
-            prior=qpmhe.ObserverPrior(), disturbance=self.Q, noise=self.R
+        given = {"disturbance_matrix": self.G} if self.low and how == "matrix" else {}
+        sizes = {"n": len(A), "p": len(C), "m": B.shape[1]}
+        if not sizes["m"]:
+            return qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, **sizes, **given)
+        return qpmhe.System(
+            lambda x, u: x @ A.T + u @ B.T, lambda x, u: x @ C.T + u @ D.T, **sizes, **given
         )
+
+    def estimator(self, horizon, how="matrix", observer=qpmhe.ExtendedKalman, **options):
+        """With G itself or, for a ``how`` of "covariance", with the covariance G Q G'."""
+        usual = {"disturbance": self.Q, "noise": self.R}
+        if how == "covariance":
+            usual["disturbance"] = self.G @ self.Q @ self.G.T
         return qpmhe.MovingHorizonEstimator(
-            system, observer, cost, horizon=horizon, initial_state=self.z0, **options
+            self.system(how), observer(prior=self.P, **usual),
+            qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(), **usual),
+            horizon=horizon, initial_state=self.z0, **options,
         )
 
     def inputs(self):
         return self.U if self.U.shape[1] else None
 
 
-def _covariance(rng, size):
+def spd(rng, size):
     factor = rng.standard_normal((size, size))
     return factor @ factor.T + 0.3 * np.eye(size)
 
@@ -63,9 +82,9 @@ def kalman(plant):
     """Predicted (T + 1) and filtered (T) means and covariances, and the normalised innovations."""
     x, P = plant.z0, plant.P
     predicted, filtered, squares = [(x, P)], [], []
-    for y, u in zip(plant.Y, plant.U, strict=True):
+    for y, u, Q, R in zip(plant.Y, plant.U, plant.Qs, plant.Rs, strict=True):
         seen = np.isfinite(y)
-        C, R = plant.C[seen], plant.R[np.ix_(seen, seen)]
+        C, R = plant.C[seen], R[np.ix_(seen, seen)]
         innovation = y[seen] - C @ x - plant.D[seen] @ u
         S = C @ P @ C.T + R
         K = P @ C.T @ np.linalg.inv(S)
@@ -74,7 +93,8 @@ def kalman(plant):
         joseph = np.eye(x.size) - K @ C
         P = joseph @ P @ joseph.T + K @ R @ K.T
         filtered.append((x, P))
-        x, P = plant.A @ x + plant.B @ u, plant.A @ P @ plant.A.T + plant.Q
+        x = plant.A @ x + plant.B @ u
+        P = plant.A @ P @ plant.A.T + plant.G @ Q @ plant.G.T
         predicted.append((x, P))
     return predicted, filtered, np.array(squares)
 
@@ -96,16 +116,20 @@ def distance(found, expected):
     return (np.linalg.norm(found - expected, axis=1) / size).max()
 
 
+def off(run, plant):
+    """How far the states of a run are from the filter's predictions."""
+    return distance(run.states, np.array([x for x, _ in kalman(plant)[0]]))
+
+
 @pytest.mark.parametrize("horizon", [1, 2, 5, 10, 50])
 @pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])
 @pytest.mark.parametrize("radius", [0.8, 1.15], ids=["stable", "unstable"])
 def test_every_horizon_gives_the_kalman_predictor_and_filter(radius, missing, horizon):
     for n, p in ((1, 1), (1, 2), (2, 2), (3, 1), (4, 1), (4, 2)):
         plant = Plant(100 * n + p, n, p, radius, m=n % 3, missing=missing)
-        predicted, filtered, _ = kalman(plant)
         run = plant.estimator(horizon).run(plant.Y, plant.inputs())
-        assert distance(run.states, np.array([x for x, _ in predicted])) < 1e-8
-        assert distance(run.filtered, np.array([x for x, _ in filtered])) < 1e-8
+        assert off(run, plant) < 1e-8
+        assert distance(run.filtered, np.array([x for x, _ in kalman(plant)[1]])) < 1e-8
 
 
 @pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])
@@ -120,7 +144,6 @@ def test_a_growing_window_is_the_rts_smoother(n, radius, missing):
         assert distance(estimate.trajectory, rts(plant, predicted, filtered, t + 1)) < 1e-8
         # The minimum of J is the sum of the normalised squared innovations.
         assert estimate.cost == pytest.approx(squares[: t + 1].sum(), rel=1e-9)
-        # What the trajectory says about w and v, plainly.
         x = estimate.trajectory
         w = x[1:] - x[:-1] @ plant.A.T - plant.U[: t + 1] @ plant.B.T
         v = plant.Y[: t + 1] - x[:-1] @ plant.C.T - plant.U[: t + 1] @ plant.D.T
@@ -129,16 +152,15 @@ def test_a_growing_window_is_the_rts_smoother(n, radius, missing):
 
 
 @pytest.mark.parametrize("horizon", [1, 5])
-def test_a_smoother_on_the_full_window_has_the_kalman_prior(horizon):
-    # A window that starts at s is the RTS smoother of a filter that starts there, from the
-    # predicted mean and covariance at s.
+def test_a_moving_window_is_the_rts_smoother_of_a_filter_that_starts_there(horizon):
     plant = Plant(3, 3, 2, 0.9, m=1, missing=True, steps=25)
     predicted, _, _ = kalman(plant)
     mhe = plant.estimator(horizon)
     for t in range(25):
         trajectory = mhe.update(plant.Y[t], plant.U[t]).trajectory
         start = max(0, t + 1 - horizon)
-        tail = Plant(3, 3, 2, 0.9, m=1, missing=True, steps=25)
+        tail = copy.copy(plant)
+        tail.Qs, tail.Rs = plant.Qs[start : t + 1], plant.Rs[start : t + 1]
         tail.z0, tail.P = predicted[start]
         tail.Y, tail.U = plant.Y[start : t + 1], plant.U[start : t + 1]
         expected = rts(tail, *kalman(tail)[:2], t + 1 - start)
@@ -146,8 +168,69 @@ def test_a_smoother_on_the_full_window_has_the_kalman_prior(horizon):
 
 
 @pytest.mark.parametrize("backend", qpmhe.solvers.available())
-def test_every_backend_gives_the_kalman_predictor(backend):
+def test_one_qp_of_every_backend_gives_the_kalman_predictor(backend):
     plant = Plant(7, 2, 1, 1.05, m=1, missing=True, steps=14)
-    predicted, _, _ = kalman(plant)
-    run = plant.estimator(4, backend=backend, solver_tolerance=1e-9).run(plant.Y, plant.U)
-    assert distance(run.states, np.array([x for x, _ in predicted])) < 1e-6
+    mhe = plant.estimator(4, backend=backend, max_qps=1, solver_tolerance=1e-9)
+    assert off(mhe.run(plant.Y, plant.U), plant) < 1e-6
+
+
+@pytest.mark.parametrize("how", ["matrix", "covariance"])
+@pytest.mark.parametrize("observer", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
+@pytest.mark.parametrize("horizon", [1, 4, 50])
+@pytest.mark.parametrize(
+    ("n", "r", "p"), [(2, 1, 1), (3, 1, 2), (3, 2, 1), (4, 2, 2), (5, 3, 2), (4, 4, 1)]
+)
+def test_disturbances_of_lower_dimension(n, r, p, horizon, observer, how):
+    plant = Plant(100 * n + 10 * r + p, n, p, 1.0, steps=40, directions=r)
+    options = {"max_qps": None, "solver_tolerance": 1e-10}
+    mhe = plant.estimator(horizon, how, observer, **options)
+    means, covariances = (np.array(one) for one in zip(*kalman(plant)[0], strict=True))
+    run = mhe.run(plant.Y, covariances=True)
+    assert np.abs(run.states - means).max() <= 1e-9 * (1.0 + np.abs(means).max())
+    assert np.abs(run.covariances - covariances[1:]).max() <= 1e-9 * np.abs(covariances).max()
+
+
+@pytest.mark.parametrize("horizon", [1, 4])
+@pytest.mark.parametrize("without_disturbance", [False, True])
+def test_singular_covariances_of_the_state_cost_few_digits(without_disturbance, horizon):
+    """Of a model that forgets all but one direction, or decays with no disturbance at all."""
+    for seed in range(4):
+        plant, rng = Plant(seed, 3, 2, 1.0, steps=40, directions=1), np.random.default_rng(seed + 5)
+        if without_disturbance:  # small eigenvalues, but not rounding yet
+            plant.A = 0.95 * plant.A
+            plant.Q = np.zeros((1, 1))
+            plant.Qs = [plant.Q] * 40
+        else:
+            plant.A = np.outer(rng.standard_normal(3), rng.standard_normal(3))
+            plant.A /= np.abs(np.linalg.eigvals(plant.A)).max()
+            assert np.linalg.cond(kalman(plant)[0][-1][1]) > 1e15
+        run = plant.estimator(horizon, max_qps=None, solver_tolerance=1e-10).run(plant.Y)
+        means = np.array([x for x, _ in kalman(plant)[0]])
+        assert np.abs(run.states - means).max() <= 2e-7 * (1.0 + np.abs(means).max())
+
+
+@pytest.mark.parametrize("observer", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
+def test_a_state_that_only_delays_another_has_singular_covariances_throughout(observer):
+    plant = Plant(3, 2, 2, 1.0, steps=30)
+    plant.A, plant.C = np.array([[1.0, 0.0], [1.0, 0.0]]), np.eye(2)
+    plant.P, plant.Q, plant.R = np.diag([0.5, 0.0]), np.diag([0.04, 0.0]), np.eye(2)
+    plant.Qs, plant.Rs = [plant.Q] * 30, [plant.R] * 30
+    assert off(plant.estimator(4, observer=observer, max_qps=None).run(plant.Y), plant) < 1e-9
+
+
+@pytest.mark.parametrize("candidate", ["observer", "reinitialized"])
+@pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])
+@pytest.mark.parametrize("observer", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
+@pytest.mark.parametrize("directions", [None, 2, 1])
+def test_covariances_of_their_own_for_each_sample(directions, observer, missing, candidate):
+    plant = Plant(4, 3, 2, 0.9, missing=missing, steps=50, directions=directions, drifting=True)
+    predicted, filtered, _ = kalman(plant)
+    mhe = plant.estimator(4, observer=observer, candidate=candidate)
+    for t, y in enumerate(plant.Y):
+        estimate = mhe.update(
+            y, noise_weight=np.linalg.inv(plant.Rs[t]),
+            disturbance_weight=np.linalg.inv(plant.Qs[t]),
+        )
+        np.testing.assert_allclose(estimate.filtered, filtered[t][0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(estimate.state, predicted[t + 1][0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(mhe.covariances()[-1], predicted[t + 1][1], rtol=0, atol=1e-9)
