@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .intervals import BRANCHES
-from .polynomials import gap_of
+from .continuity import gap_of
 
 CONDITIONS = ("less", "equal", "and", "or", "not")
 
