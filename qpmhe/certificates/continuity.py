@@ -116,10 +116,9 @@ class _Values:
         return self._found[node]
 
     def _atom(self, *key: Any) -> _Value:
-        if key not in self.atoms:
-            points = tuple(Fraction(_RANDOM.getrandbits(_BITS)) for _ in range(_POINTS))
-            self.atoms[key] = _Value(points, Interval.of(0.0))
-        return self.atoms[key]
+        points = tuple(Fraction(_RANDOM.getrandbits(_BITS)) for _ in range(_POINTS))
+        value: _Value = self.atoms.setdefault(key, _Value(points, Interval.of(0.0)))
+        return value
 
     def _evaluated(self, node: int, level: int) -> _Value:
         operation, arguments, parameter = self._nodes[node]

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from .intervals import BRANCHES
 from .continuity import gap_of
+from .intervals import BRANCHES
 
 CONDITIONS = ("less", "equal", "and", "or", "not")
 

@@ -29,7 +29,6 @@ from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
 from .regions import Region, bounded_region, bounds, inequalities, row_bounds
 
-_CHUNK = 256
 _MOST_CELLS = 40_000
 _SAMPLES, _SEED = 2000, 20210829
 # More than the rounding of a few sums and products.
@@ -39,23 +38,10 @@ _SLACKS = (1e-12, 1e-9, 1e-6, 1e-3)
 
 @dataclass(frozen=True, eq=False)
 class Invariance:
-    r"""Whether f and the disturbances keep the state in a region.
+    """Whether f and the disturbances keep the state in a region: ``holds``, None if not known.
 
-    Attributes
-    ----------
-    holds : bool or None
-        True where it is proved, False where a state that leaves is known, None where neither is.
-    text : str
-        In words: through which side the state leaves, from where, and how far it reaches; or why
-        it is not known.
-    region : Region
-        The region.
-    limit, reach : float
-        c, and the largest :math:`g^\top x^+` that is known; NaN where no state is known to leave.
-    at : (n + m,) array or None
-        From where: state and input.
-    cells : int
-        How many cells were examined.
+    ``text`` says it in words: through which side the state leaves, from where (``at``, state and
+    input), how far it reaches and what the ``limit`` is; or why it is not known.
     """
 
     holds: bool | None
@@ -88,47 +74,38 @@ def certify_invariance(
 ) -> Invariance:
     """Prove that a region is invariant, or say where the state leaves it.
 
-    Parameters
-    ----------
-    system, region, inputs
-        As for `certify`.
-    disturbance : float or (r,) array_like
-        The largest disturbance w: a length, or half-widths by component; G w acts on the state.
-    seconds : float or Deadline
-        How long it may take, about.
-
-    Raises
-    ------
-    SetError, ModelError, ShapeError, OptionError
-        If the region is no bounded set of states, f raises in it, or the disturbance does not fit.
+    Arguments and errors are those of `certify`; the ``disturbance`` is the largest w, a length or
+    half-widths by component (r,), which acts on the state as G w.
     """
     deadline, where = Deadline.of(seconds), bounded_region(system, region, inputs)
     rows, limits = inequalities(where.states)
-    added, cells = _added(system, rows, disturbance), Cells(where)
-    model = SmoothModel(system, where)
+    added, model = _added(system, rows, disturbance), SmoothModel(system, where)
     unknown = "it is not known whether x stays"
     if model.reason:
         return Invariance(None, f"{unknown}: {model.reason}", where)
+    cells = Cells(where, _MOST_CELLS, deadline)
     points = where.sample(_SAMPLES, np.random.default_rng(_SEED))
-    while True:
-        found = _leaving(model, where, rows, limits, added, points, cells.taken)
-        if found is not None:
-            return found
-        if not len(cells.lower):
-            return Invariance(True, "x stays in the region", where, cells=cells.taken)
-        if cells.taken and (deadline.passed or cells.taken > _MOST_CELLS):
-            end = "when its time was over" if deadline.passed else "the most that are allowed"
-            text = f"{unknown}, after {cells.taken} cells, {end}"
-            return Invariance(None, text, where, cells=cells.taken)
-        low, high = cells.take(_CHUNK)
+    leaving = _leaving(model, where, rows, limits, added, points)
+    for low, high in cells if leaving is None else ():
         reach, parts = _reach(model, rows, low, high)
         excess = reach - (limits - added)
         left = np.flatnonzero(~(excess <= 0.0).all(axis=1))
         low, high, excess = low[left], high[left], excess[left]
         points = 0.5 * low + 0.5 * high
         points = points[where.contains(points[:, : where.n])]
-        worst = np.where(np.isnan(excess), np.inf, excess).argmax(axis=1)
-        cells.halve(low, high, parts[left, worst], np.full(len(left), np.inf))
+        leaving = _leaving(model, where, rows, limits, added, points)
+        if leaving is not None:
+            break
+        if len(left):
+            worst = np.where(np.isnan(excess), np.inf, excess).argmax(axis=1)
+            cells.halve(low, high, parts[left, worst])
+    if leaving is not None:
+        return Invariance(False, *leaving, cells.taken)
+    if cells.done:
+        return Invariance(True, "x stays in the region", where, cells=cells.taken)
+    end = "when its time was over" if cells.late else "the most that are allowed"
+    text = f"{unknown}, after {cells.taken} cells, {end}"
+    return Invariance(None, text, where, cells=cells.taken)
 
 
 def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
@@ -136,20 +113,7 @@ def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
 
     While x stays there, and :math:`|x - z|_P \le b`, z stays in the region. With b the larger of
     the observer's initial bound and its limit, that is at all times; the inner region's own
-    invariance can be certified in turn.
-
-    Parameters
-    ----------
-    region : Region
-    metric : (n, n) array
-        P.
-    radius : float
-        b.
-
-    Returns
-    -------
-    Region or None
-        None if it is empty, or has no interior.
+    invariance can be certified in turn. None if it is empty, or has no interior.
     """
     states, n = region.states, region.n
     sides, slants = (radius * supports(metric, rows) for rows in (np.eye(n), states.matrix))
@@ -203,33 +167,36 @@ def _added(system: System, rows: Array, disturbance: ArrayLike) -> Array:
 
 def _reach(model: SmoothModel, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """Upper bounds (B, r) on g^T f over cells, and what each coordinate adds (B, r, N)."""
-    n, (middle, half) = model.n, halved(low, high)
+    n, free, (middle, half) = model.n, model.free, halved(low, high)
     start, end = low.copy(), high.copy()
     start[:, :n] = end[:, :n] = middle[:, :n]
+    parts = np.zeros((len(low), len(rows), low.shape[1]))
     with np.errstate(all="ignore"):
         enclosure = model.enclose(low, high)
-        J = enclosure.centre[:, :n]
-        spread = np.abs(enclosure.slopes[:, :, :n]).sum(axis=1) + enclosure.error[:, :n]
-        slopes = np.abs(np.einsum("ri,bij->brj", rows, J)) + np.einsum(
-            "ri,bij->brj", np.abs(rows), spread + 1e-14 * np.abs(J)
-        )
-        parts = slopes * half[:, None, :n] * _OUTWARD
+        # The sides of free states alone: others do not move, or else the values decide.
+        J, g = enclosure.centre[:, : free.size], rows[:, free]
+        spread = np.abs(enclosure.slopes[:, :, : free.size]).sum(axis=1)
+        spread += enclosure.error[:, : free.size] + 1e-14 * np.abs(J)
+        # r sides, b cells, rows i and columns j.
+        slopes = np.abs(np.einsum("ri,bij->brj", g, J))
+        slopes += np.einsum("ri,bij->brj", np.abs(g), spread)
+        parts[:, :, free] = slopes * half[:, None, free] * _OUTWARD
         at_middle, over_cell = model.values(start, end), model.values(low, high)
         first = row_bounds(rows, at_middle.low[:, :n], at_middle.high[:, :n])
         mean = first[1] + parts.sum(axis=2) * _OUTWARD
         mean += 1e-15 * np.abs(mean)
-        direct = row_bounds(rows, over_cell.low[:, :n], over_cell.high[:, :n])[1]
-        reach = np.fmin(mean, direct)
+        reach = row_bounds(rows, over_cell.low[:, :n], over_cell.high[:, :n])[1]
+        if not model.moved.size:
+            reach = np.fmin(mean, reach)
     # Inputs count by what their width adds to the values at the middle.
-    width = (first[1] - first[0])[:, :, None] * (half[:, None, n:] > 0.0)
-    return reach, np.concatenate((parts, width), axis=2)
+    parts[:, :, n:] = (first[1] - first[0])[:, :, None] * (half[:, None, n:] > 0.0)
+    return reach, parts
 
 
 def _leaving(
-    model: SmoothModel, region: Region, rows: Array, limits: Array, added: Array, points: Array,
-    cells: int,
-) -> Invariance | None:
-    """The state among some of the region's from which f reaches farthest, if it leaves."""
+    model: SmoothModel, region: Region, rows: Array, limits: Array, added: Array, points: Array
+) -> tuple[str, Region, float, float, Array] | None:
+    """From which of some states f leaves farthest, in words, and how far, if it leaves."""
     if not len(points):
         return None
     n, found = region.n, model.values(points, points)
@@ -243,20 +210,11 @@ def _leaving(
         return None
     reach, limit, row = float(most[k, side]), float(limits[side]), rows[side]
     sign, relation = (1.0, "<=") if row[np.flatnonzero(row)[0]] > 0.0 else (-1.0, ">=")
-    names = _words(sign * row)
+    terms = " ".join(f"{each:+.4g} x{j + 1}" for j, each in enumerate(sign * row) if each)
+    names = terms.replace("+1 x", "+x").replace("-1 x", "-x").lstrip("+")
     who = "f and the disturbances reach" if added[side] > 0.0 else "f reaches"
     text = (
         f"{who} {names} = {sign * reach:.4g} through the face {names} {relation} "
-        f"{sign * limit:.4g}, from {place(*np.split(np.round(points[k], 4), [n]))}"
+        f"{sign * limit:.4g}, from {place(np.round(points[k], 4), n)}"
     )
-    return Invariance(False, text, region, limit, reach, points[k], cells)
-
-
-def _words(row: Array) -> str:
-    """A linear form in words."""
-    text = ""
-    for j in np.flatnonzero(row):
-        sign = "-" if row[j] < 0.0 else "+"
-        text += f" {sign} " if text else sign.strip("+")
-        text += ("" if abs(row[j]) == 1.0 else f"{abs(row[j]):.4g} ") + f"x{j + 1}"
-    return text
+    return text, region, limit, reach, points[k]
