@@ -156,14 +156,16 @@ class SmoothModel:
             or self._programs["h"].obstacle(region.lower, region.upper)
         )
         if not self.reason:
-            self._plan = _Plan(graph, slopes, [*(following[i] for i in self.free), *output],
-                               self.free.tolist())
             self._values = Program(graph, following + output)
-            kept = [graph.value(node) == low for node, low in zip(following, region.lower, strict=False)]
+            rows = [*(following[i] for i in self.free), *output]
+            self._plan = _Plan(graph, slopes, rows, self.free.tolist())
+        fixed = np.flatnonzero(~wide[: self.n])
+        if self.reason and fixed.size:
+            ahead = evaluated("f", system.f, self.points, self.n)[:, fixed]
+            kept = (ahead == region.lower[fixed]).all(axis=0)
         else:
-            ahead = evaluated("f", system.f, self.points, self.n)
-            kept = (ahead == self.points[:, : self.n]).all(axis=0)
-        self.moved = np.flatnonzero(~wide[: self.n] & ~np.array(kept))
+            kept = np.array([graph.value(following[i]) == region.lower[i] for i in fixed], np.bool_)
+        self.moved = fixed[~kept]
 
     def jacobians(self, points: Array) -> Array:
         """The joint Jacobians at some points: the expressions', or the functions' own."""
@@ -250,7 +252,6 @@ class SmoothModel:
         if unknown.any():
             self._unknown = lower[unknown][-1], upper[unknown][-1]
             middles = 0.5 * lower[unknown] + 0.5 * upper[unknown]
-            middles = middles[self._region.contains(middles[:, : self.n])]
             for name in self._programs:
                 evaluated(name, getattr(self._system, name), middles, self.n)
         return found

@@ -1,10 +1,11 @@
 r"""The matrix inequalities of detectability and observers, as functions of the Jacobian.
 
 Differences of f and h between two states of a convex set are :math:`A\, \delta x` and
-:math:`C\, \delta x` with one pair (A, C), an average of the joint Jacobians between them. A condition
-that describes a convex set of pairs holds for it once it holds at every single state. `Form` is such
-a condition: a matrix affine in (A, C) that is positive definite. How the inequalities on
-trajectories follow is in docs/explanation: *What is guaranteed* and *A design by a Lyapunov function*.
+:math:`C\, \delta x` with one pair (A, C), an average of the joint Jacobians between them. A
+condition that describes a convex set of pairs holds for it once it holds at every single state.
+`Form` is such a condition: a matrix affine in (A, C) that is positive definite. How inequalities
+for trajectories follow is in the docs, in *What is guaranteed* and *A design by a Lyapunov
+function*.
 """
 
 from __future__ import annotations
