@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,54 +11,56 @@ from numpy.typing import NDArray
 from .._checks import Array
 from ..model.system import System
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel, joint_jacobians
+from .enclosures import MOST_ACTIVE, Enclosure, SmoothModel
 from .evidence import Evidence
 from .inequalities import Form, Matrices, definite, norm_bound
 from .regions import Region
 
-_CHUNK = 256
-_MOST_CELLS = 40_000
+_CHUNK, _MOST_CELLS, _MOST_LIPSCHITZ_CELLS = 256, 40_000, 20_000
 # Operations on one chunk, about: large systems take fewer cells at a time, so that the clock
 # is checked often enough.
 _WORK = 4e7
 # Cells are split by what their width adds to the error; what it adds to the corners counts
-# a little, for cells that reach out of a polytope.
+# a little.
 _CORNER_SHARE = 1e-3
-_MOST_LIPSCHITZ_CELLS, _TOLERANCE = 20_000, 1e-3
-_SAMPLES, _SEED = 400, 20210829
-
-
-@dataclass(frozen=True, eq=False)
-class Cover:
-    """How far the verification of an inequality went."""
-
-    proved: bool
-    cells: int
-    violations: Array  # (V, n + m): states and inputs at which the inequality does not hold
-    jacobians: Array  # (V, n + p, n): the Jacobians there
-    late: bool = False  # whether it ended because the time was over
+_TOLERANCE = 1e-3  # of a Lipschitz constant, beside the largest norm seen
 
 
 class Cells:
-    """The cells of a region that remain, each with the bound of the cell that it is a part of."""
+    """The cells of a region that remain, each with the bound of the cell that it is a part of.
 
-    def __init__(self, region: Region) -> None:
-        self._region = region
-        self.lower, self.upper = region.lower[None], region.upper[None]
+    Iteration is over chunks of those with the largest bounds, which decide the result. It ends
+    when none is left, or after ``most``, or when the time is over, but not before one was taken.
+    """
+
+    def __init__(
+        self, region: Region, most: int, deadline: Deadline, chunk: int = _CHUNK
+    ) -> None:
+        self._region, self._most, self._deadline, self._chunk = region, most, deadline, chunk
+        self._lower, self._upper = region.lower[None], region.upper[None]
         self.inherited = np.array([np.inf])
-        self.taken = 0
+        self.taken, self.late = 0, False
 
-    def take(self, most: int) -> tuple[Array, Array]:
-        """The cells with the largest inherited bounds, which decide the result."""
-        order = np.argsort(self.inherited, kind="stable")
-        rest, chosen = order[:-most], order[-most:]
-        low, high = self.lower[chosen], self.upper[chosen]
-        self.lower, self.upper = self.lower[rest], self.upper[rest]
-        self.inherited = self.inherited[rest]
-        self.taken += len(chosen)
-        return low, high
+    def __iter__(self) -> Iterator[tuple[Array, Array]]:
+        while not self.done:
+            if self.taken:
+                self.late = self._deadline.passed
+                if self.late or self.taken > self._most:
+                    return
+            order = np.argsort(self.inherited, kind="stable")
+            rest, chosen = order[: -self._chunk], order[-self._chunk :]
+            low, high = self._lower[chosen], self._upper[chosen]
+            self._lower, self._upper = self._lower[rest], self._upper[rest]
+            self.inherited = self.inherited[rest]
+            self.taken += len(chosen)
+            yield low, high
 
-    def halve(self, low: Array, high: Array, scores: Array, bounds: Array) -> None:
+    @property
+    def done(self) -> bool:
+        """Whether no cell is left."""
+        return not len(self._lower)
+
+    def halve(self, low: Array, high: Array, scores: Array, bounds: Array | float = np.inf) -> None:
         """Put the halves of cells back, along the coordinates with the largest scores."""
         region, rows = self._region, np.arange(low.shape[0])
         known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
@@ -68,13 +70,11 @@ class Cells:
         first_high, second_low = high.copy(), low.copy()
         first_high[rows, which] = second_low[rows, which] = middle
         lower, upper = np.vstack((low, second_low)), np.vstack((first_high, high))
-        stay = ~region.outside(lower, upper)
-        self.lower = np.vstack((self.lower, lower[stay]))
-        self.upper = np.vstack((self.upper, upper[stay]))
-        self.inherited = np.append(self.inherited, np.tile(bounds, 2)[stay])
+        self._lower, self._upper = np.vstack((self._lower, lower)), np.vstack((self._upper, upper))
+        self.inherited = np.append(self.inherited, np.tile(np.broadcast_to(bounds, len(low)), 2))
 
 
-def _scores(enclosure: Enclosure, left: NDArray[Any]) -> Array:
+def _scores(enclosure: Enclosure, left: NDArray[np.intp]) -> Array:
     """What the width of each coordinate adds to the error and the corners of some cells."""
     sizes = np.abs(enclosure.slopes)
     weight = np.nan_to_num(sizes).max(axis=(0, 2, 3), initial=0.0)
@@ -85,51 +85,47 @@ def _scores(enclosure: Enclosure, left: NDArray[Any]) -> Array:
     return scores
 
 
-class Enclosing(Protocol):
-    """Whatever encloses Jacobians over cells."""
-
-    def enclose(self, lower: Array, upper: Array) -> Enclosure:
-        """As `SmoothModel.enclose`."""
-
-
-def cover(
-    model: Enclosing, region: Region, form: Form, most_cells: int = _MOST_CELLS,
-    seconds: float | Deadline = PART_SECONDS,
-) -> Cover:
-    """Show an inequality on a region by dividing it until each cell is shown."""
-    deadline, cells = Deadline.of(seconds), Cells(region)
-    corners = 2 ** min(region.lower.size, MOST_ACTIVE)
-    order = len(form.P)
-    chunk = int(np.clip(_WORK / (corners * (2 * order + len(form.R)) ** 3), 1, _CHUNK))
-    nowhere = np.empty((0, region.lower.size)), np.empty((0, 0, 0))
-    while len(cells.lower):
-        if cells.taken and deadline.passed:
-            return Cover(False, cells.taken, *nowhere, late=True)
-        low, high = cells.take(chunk)
-        enclosure = model.enclose(low, high)
-        matrices, count = _at_corners(enclosure)
-        with np.errstate(all="ignore"):
-            shown = definite(form.matrices(matrices)).reshape(count, -1).all(axis=1)
-        if shown.all():
-            continue
-        left = np.flatnonzero(~shown)
-        low, high, centres = low[left], high[left], enclosure.jacobian[left]
-        middle = 0.5 * (low + high)
-        broken = _broken(form, centres) & region.contains(middle[:, : region.n])
-        if broken.any():
-            return Cover(False, cells.taken, middle[broken], centres[broken])
-        if cells.taken > most_cells:
-            return Cover(False, cells.taken, *nowhere)
-        cells.halve(low, high, _scores(enclosure, left), np.full(len(left), np.inf))
-    return Cover(True, cells.taken, *nowhere)
-
-
 def _at_corners(enclosure: Enclosure) -> tuple[Matrices, int]:
     """The matrices at all corners of each cell, one after another, and how many cells there are."""
     corners, error = enclosure.corners()
     cells, count = corners.shape[:2]
     middle = corners.reshape(cells * count, *corners.shape[2:])
     return Matrices(middle, np.repeat(error, count, axis=0)), cells
+
+
+class Cover(NamedTuple):
+    """How far the verification of an inequality went."""
+
+    proved: bool
+    cells: int
+    violations: Array  # (V, n + m): states and inputs at which the inequality does not hold
+    jacobians: Array  # the Jacobians there
+    late: bool = False  # whether it ended because the time was over
+
+
+def cover(
+    model: SmoothModel, region: Region, form: Form, most_cells: int = _MOST_CELLS,
+    seconds: float | Deadline = PART_SECONDS,
+) -> Cover:
+    """Show an inequality on a region by dividing it until each cell is shown."""
+    size = 2 ** min(region.lower.size, MOST_ACTIVE) * (2 * len(form.P) + len(form.R)) ** 3
+    chunk = int(np.clip(_WORK / size, 1, _CHUNK))
+    cells = Cells(region, most_cells, Deadline.of(seconds), chunk)
+    nowhere = np.empty((0, region.lower.size)), np.empty((0, 0, 0))
+    for low, high in cells:
+        enclosure = model.enclose(low, high)
+        matrices, count = _at_corners(enclosure)
+        with np.errstate(all="ignore"):
+            shown = definite(form.matrices(matrices)).reshape(count, -1).all(axis=1)
+        left = np.flatnonzero(~shown)
+        low, high, centres = low[left], high[left], enclosure.jacobian[left]
+        middle = 0.5 * (low + high)
+        broken = _broken(form, centres)
+        if broken.any():
+            return Cover(False, cells.taken, middle[broken], centres[broken])
+        if len(left):
+            cells.halve(low, high, _scores(enclosure, left))
+    return Cover(cells.done, cells.taken, *nowhere, late=cells.late)
 
 
 def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:
@@ -141,8 +137,7 @@ def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:
     return broken
 
 
-@dataclass(frozen=True, eq=False)
-class LipschitzConstant:
+class LipschitzConstant(NamedTuple):
     """L_h or L_f, with what it rests on."""
 
     value: float  # in units of the output, or of the state, per unit of the state
@@ -159,17 +154,12 @@ def lipschitz(
     On a convex set it is the supremum of the Jacobian's spectral norm. Cells are divided until the
     bound exceeds the largest norm seen by a thousandth at most, or the time is over.
     """
-    deadline, n = Deadline.of(seconds), system.n
-    rows = slice(0, n) if name == "f" else slice(n, None)
-    points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-    norms = np.linalg.norm(joint_jacobians(system, points)[:, rows], 2, axis=(1, 2))
-    seen, model = float(norms.max()), SmoothModel(system, region)
-    cells, bound = Cells(region), 0.0
-    while len(cells.lower) and not model.reason:
-        if cells.taken and (deadline.passed or cells.taken > _MOST_LIPSCHITZ_CELLS):
-            bound = max(bound, float(cells.inherited.max()))
-            break
-        low, high = cells.take(_CHUNK)
+    deadline, model = Deadline.of(seconds), SmoothModel(system, region)
+    rows = slice(0, model.free.size) if name == "f" else slice(model.free.size, None)
+    jacobians = model.jacobians(model.points)[:, rows]
+    seen, bound = float(np.linalg.norm(jacobians, 2, axis=(1, 2)).max()), 0.0
+    cells = Cells(region, _MOST_LIPSCHITZ_CELLS, deadline)
+    for low, high in cells if not model.reason else ():
         enclosure = model.enclose(low, high)
         matrices, count = _at_corners(enclosure)
         with np.errstate(all="ignore"):
@@ -177,9 +167,11 @@ def lipschitz(
         each = np.where(np.isnan(each), np.inf, each)
         left = np.flatnonzero(each > seen * (1.0 + _TOLERANCE))
         bound = max(bound, float(np.delete(each, left).max(initial=0.0)))
-        cells.halve(low[left], high[left], _scores(enclosure, left), each[left])
-    if model.reason or not np.isfinite(bound):
-        why = model.reason or f"no bound was found with {cells.taken} cells{model.unknown}"
-        note = f"largest of {len(points)} gradients; {why}"
-        return LipschitzConstant(seen, Evidence.SAMPLED, note)
-    return LipschitzConstant(bound, Evidence.PROVED, f"bounded on {cells.taken} cells")
+        if len(left):
+            cells.halve(low[left], high[left], _scores(enclosure, left), each[left])
+    bound = max(bound, float(cells.inherited.max(initial=0.0)))
+    if np.isfinite(bound):
+        return LipschitzConstant(bound, Evidence.PROVED, f"bounded on {cells.taken} cells")
+    why = model.reason or f"no bound was found with {cells.taken} cells{model.unknown}"
+    note = f"largest of {len(jacobians)} gradients; {why}"
+    return LipschitzConstant(seen, Evidence.SAMPLED, note)

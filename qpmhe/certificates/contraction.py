@@ -18,7 +18,7 @@ from .inequalities import Matrices, euclidean_constants, norm_bound
 from .properties import Detectability, ObserverStability, sealed
 from .regions import Region, bounded_region
 from .sdp import NoiseSizes, started
-from .search import Search
+from .search import Search, embedded
 
 # Of an output in its own size, for a state in the region's.
 _UNSEEN = 1e-9
@@ -26,6 +26,11 @@ _FAST, _STEEP = 1e3, 1e6
 _NEAR = 1e-9, 1e-12  # of the region's width: what changes as much over less jumps
 _OTHER_GAIN = "another gain, such as synthesise_gain finds"
 _PAIR_STAYS = "it holds for trajectories that stay in the region, both of a pair, with equal inputs"
+_RUN_STAYS = "it holds while the states of system and observer stay in the region"
+_NOT_AFFINE = (
+    "h is not affine on the region, where the inequality with an output weight does not carry over "
+    "from states to averages of Jacobians; that with output injection does"
+)
 
 
 def certify_detectability(
@@ -36,11 +41,9 @@ def certify_detectability(
     """Find and verify constants of e-IOSS, Definition def:eIOSS.
 
     A constant P with one of the inequalities of `qpmhe.certificates.inequalities` is sought by
-    semidefinite programs at some states of the region, and then verified on all of it: the
-    Jacobians are enclosed cell by cell with outward rounding, and each cell's matrices shown
-    positive definite. The constants follow as in `euclidean_constants`. Proved is what f and
-    h are as written, in real arithmetic with the constants that they have in double precision;
-    how far their computed values are rounded belongs to the disturbance.
+    semidefinite programs at some states of the region, and then verified on all of it, cell by
+    cell. Proved is what f and h are as written, in real arithmetic with the constants that they
+    have in double precision; how far their computed values are rounded belongs to the disturbance.
 
     Parameters
     ----------
@@ -78,17 +81,11 @@ def certify_detectability(
     found = search.answer("eta", eta, (), _undetectable)
     form = found.form
     notes = (*found.notes, *_left_out(search), _PAIR_STAYS)
-    if form.injection is not None:
-        notes = (
-            *notes,
-            "h is not affine on the region, where the inequality with an output weight does not "
-            "carry over from states to averages of Jacobians; that with output injection does",
-        )
     return sealed(
         Detectability(
             form.rate, *euclidean_constants(form.P, form.R, form.rate), form=search.kind,
-            region=search.region, notes=notes,
-            P=search.embedded(form.P, search.free, system.n), V=form.R, cells=found.cells,
+            region=search.region, notes=notes if form.injection is None else (*notes, _NOT_AFFINE),
+            P=embedded(form.P, search.free, system.n), V=form.R, cells=found.cells,
         ),
         system, found.evidence,
     )
@@ -131,12 +128,14 @@ def _steepest(search: Search) -> str:
     point, largest = search.points[int(radii.argmax())], float(radii.max())
     if largest < _FAST:
         return ""
-    room = np.diag(search.region.upper - search.region.lower)[search.free]
-    ends = np.stack([
-        evaluated("f", system.f, *np.split(point + share * room, [system.n], axis=1))
+    width = search.region.upper - search.region.lower
+    ends = [
+        evaluated("f", system.f, np.clip(
+            point + share * np.diag(width)[search.free], search.region.lower, search.region.upper
+        ), system.n)
         for share in (*_NEAR, *(-each for each in _NEAR))
-    ])
-    near, nearer = np.abs(ends[:2] - ends[2:])
+    ]
+    near, nearer = (np.abs(ends[k] - ends[k + 2]) for k in range(2))
     where = np.round(point, 4).tolist()
     if (nearer > np.maximum(0.5 * near, _NEAR[0] * np.abs(ends).max(axis=0))).any():
         raise NotCertifiedError(
@@ -147,9 +146,6 @@ def _steepest(search: Search) -> str:
         f"; f's Jacobian has an eigenvalue of size {largest:.3g} at {where}, where the model may "
         "not be meant to hold"
     )
-
-
-_RUN_STAYS = "it holds while the states of system and observer stay in the region"
 
 
 def constant_gain(observer: Observer, system: System) -> Array:
@@ -177,7 +173,7 @@ def constant_gain(observer: Observer, system: System) -> Array:
 
 
 def gain_if_constant(observer: Observer, system: System) -> Array | None:
-    """The gain of `constant_gain`, or None where the observer has none."""
+    """As `constant_gain`, but None where the observer has none."""
     varies = isinstance(observer, Observer) and observer.constant_gain is None
     return None if varies else constant_gain(observer, system)
 
@@ -189,10 +185,9 @@ def certify_observer(
 ) -> ObserverStability:
     """Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
-    A constant P with the inequality of `qpmhe.certificates.inequalities.Form` is sought
-    and verified as in `certify_detectability`. It serves linear and nonlinear outputs. Among all
-    P, and all rates, it is the one for which disturbances and noises of the given sizes leave the
-    smallest error in the limit, in the size of the region.
+    It serves linear and nonlinear outputs. Among all P, and all rates, it is the one for which
+    disturbances and noises of the given sizes leave the smallest error in the limit, in the size of
+    the region.
 
     Parameters
     ----------
@@ -210,11 +205,8 @@ def certify_observer(
     ------
     CertificateError
         If the observer has no constant gain.
-    SetError, OptionError, ShapeError, ModelError
-        As for `certify_detectability`.
-    NotCertifiedError
-        If there are no such constants, or none were found; the text gives the smallest feasible
-        rate, and what to try. An `OutOfTimeError` says that it is not known which.
+    ShapeError
+        If the gain or the sizes do not fit. Other errors are those of `certify_detectability`.
     """
     gain = constant_gain(observer, checked_system(system))
     search = Search(
@@ -244,16 +236,16 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
     V = 0.5 * (product.middle + product.middle.T)
     V += 2.0 * float(product.radius.sum()) * np.eye(V.shape[0])
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
-    system, free = search.system, search.free
+    system = search.system
     full = np.zeros((system.n, system.p))
-    full[free] = form.gain
+    full[search.free] = form.gain
     return sealed(
         ObserverStability(
             form.rate, *euclidean_constants(form.P, V, form.rate), kappa, gain=full,
             region=search.region,
             notes=(*found.notes, *search.notes, *_left_out(search), _RUN_STAYS),
-            P=search.embedded(form.P, free, system.n), V=V,
-            Q=search.embedded(form.Q, search.acting, system.r) if form.Q.size else None,
+            P=embedded(form.P, search.free, system.n), V=V,
+            Q=embedded(form.Q, search.acting, system.r) if form.Q.size else None,
             R=form.R if form.R.size else None, cells=found.cells,
         ),
         system, found.evidence,
@@ -313,24 +305,11 @@ def synthesise_gain(
     inputs: Box | None = None, sizes: NoiseSizes = (1.0, 1.0),
     seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Synthesis:
-    r"""Find a constant gain L whose observer contracts on a region, and verify it.
+    """Find a constant gain L whose observer contracts on a region, and verify it.
 
     The gain and P are sought together, with Y = P L, for the smallest limit of the error in states
-    of the region's size. The gain is rounded, and then verified like any other.
-
-    Parameters
-    ----------
-    system, region, inputs, rho, sizes, seconds
-        As for `certify_observer`.
-
-    Raises
-    ------
-    OptionError
-        If rho or the sizes are out of range.
-    SetError, ModelError
-        As for `certify_detectability`.
-    NotCertifiedError
-        If there is no such gain, or none was found.
+    of the region's size. The gain is rounded, and then verified like any other. Parameters and
+    errors are those of `certify_observer`.
     """
     search = Search(
         system, bounded_region(system, region, inputs), "synthesis", sizes,

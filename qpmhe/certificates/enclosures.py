@@ -30,64 +30,39 @@ _MOST_KINKS = 3
 _TRACEABLE = "Write it with NumPy's functions of x and u, numpy.where in place of branches"
 
 
-def evaluated(name: str, function: Any, x: Array, u: Array) -> Array:
-    """A function's values; the state is named where it raises."""
-    for k in (slice(None), *range(len(x))):
-        try:
-            with np.errstate(all="ignore"):
-                values = np.array(
-                    function.batch(np.atleast_2d(x[k]), np.atleast_2d(u[k])), np.float64
-                )
-        except Exception as error:  # a user's function may raise anything
-            if k == slice(None):
-                first = error
-                continue
-            raise ModelError(
-                f"{name} raises {type(error).__name__} at {place(x[k], u[k])}, within the region: "
-                f"{error}. {_REMEDY}"
-            ) from error
-        if k == slice(None):
-            return values
-    raise ModelError(
-        f"{name} raises {type(first).__name__} at several states of the region at once, though "
-        f"not at any of them alone: {first}. Write it for one state at a time."
-    ) from first
+def evaluated(name: str, function: Any, points: Array, n: int) -> Array:
+    """A function's values; a `ModelError` names the state where it raises or is not finite."""
 
+    def at(where: Array) -> Array:
+        with np.errstate(all="ignore"):
+            return np.array(function.batch(where[:, :n], where[:, n:]), np.float64)
 
-def place(x: Array, u: Array) -> str:
-    """A state and its input in words."""
-    return f"x = {x.tolist()}" + (f", u = {u.tolist()}" if u.size else "")
-
-
-def check_values(system: System, points: Array) -> None:
-    """Raise a ModelError where f or h raises or is not finite."""
-    x, u = points[:, : system.n], points[:, system.n :]
-    for name in ("f", "h"):
-        values = evaluated(name, getattr(system, name), x, u)
-        broken = ~np.isfinite(values).all(axis=1)
-        if broken.any():
-            k = int(np.argmax(broken))
-            raise ModelError(
-                f"{name} is not finite at {place(x[k], u[k])}, within the region: it returned "
-                f"{values[k].tolist()}. {_REMEDY}"
-            )
-
-
-def joint_jacobians(system: System, points: Array) -> Array:
-    """The joint Jacobians at some states."""
-    check_values(system, points)  # a step in the imaginary direction may not see NaN
-    x, u = points[:, : system.n], points[:, system.n :]
-    joint = np.concatenate([
-        evaluated(f"the Jacobian of {name}", getattr(system, f"{name}_jacobian"), x, u)
-        for name in ("f", "h")
-    ], axis=1)
-    broken = ~np.isfinite(joint).all(axis=(1, 2))
+    try:
+        values = at(points)
+    except Exception:  # a user's function may raise anything
+        each = []
+        for point in points:
+            try:
+                each.append(at(point[None])[0])
+            except Exception as error:
+                raise ModelError(
+                    f"{name} raises {type(error).__name__} at {place(point, n)}, within the "
+                    f"region: {error}. {_REMEDY}"
+                ) from error
+        values = np.array(each)
+    broken = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if broken.any():
+        k = int(np.argmax(broken))
         raise ModelError(
-            f"the Jacobians of f and h are not finite at {points[broken][0].tolist()}, within the "
-            "region; expected functions with derivatives there. Take a smaller region."
+            f"{name} is not finite at {place(points[k], n)}, within the region: it returned "
+            f"{values[k].tolist()}. {_REMEDY}"
         )
-    return joint
+    return values
+
+
+def place(point: Array, n: int) -> str:
+    """A state and its input in words."""
+    return f"x = {point[:n].tolist()}" + (f", u = {point[n:].tolist()}" if point[n:].size else "")
 
 
 # Beyond, corners would be many: what the other coordinates do is covered by the error.
@@ -151,30 +126,59 @@ class SmoothModel:
     have in double precision. Functions in NumPy are traced, under watch (`qpmhe.model.tracing`).
     At samples of the region, the functions' values must lie where the expressions' values do.
 
-    ``reason`` says why f and h have no enclosure; empty if they have. ``affine_output``: the
-    Jacobian of h is constant on the region.
+    States and inputs that the region fixes, such as known parameters, are numbers in the graph:
+    Jacobians are of the other states, those in ``free``. ``moved`` are the states that the region
+    fixes but f is not shown to keep. ``reason`` says why f and h have no enclosure; empty if they
+    have. ``affine_output``: the Jacobian of h is constant on the region.
     """
 
     def __init__(self, system: System, region: Region) -> None:
-        self._system, self._region = system, region
-        self.n, self.p = system.n, system.p
-        self._graph = Graph(system.n + system.m)
+        self._system, self._region, self.n = system, region, system.n
+        graph = self._graph = Graph(system.n + system.m)
+        wide = region.lower < region.upper
+        self.free = np.flatnonzero(wide[: self.n])
+        for k in np.flatnonzero(~wide):
+            graph.variables[k] = graph.constant(region.lower[k])
+        self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self._programs: dict[str, Program] = {}
         self._unknown: tuple[Array, Array] | None = None
         self.reason, output = self._read("h")
         following: list[int] = []
         if not self.reason:
             self.reason, following = self._read("f")
-        self._rows, slopes = following + output, Slopes(self._graph)
+        slopes, self._plan = Slopes(graph), None
         self.affine_output = not (
             self.reason
             or any(
-                slopes.of(slope) or self._graph.comparisons([slope])
+                slopes.of(slope) or graph.comparisons([slope])
                 for root in output for slope in slopes.of(root).values()
             )
             or self._programs["h"].obstacle(region.lower, region.upper)
         )
-        self._plan = None if self.reason else _Plan(self._graph, slopes, self._rows, self.n)
+        if not self.reason:
+            self._values = Program(graph, following + output)
+            rows = [*(following[i] for i in self.free), *output]
+            self._plan = _Plan(graph, slopes, rows, self.free.tolist())
+        fixed = np.flatnonzero(~wide[: self.n])
+        if self.reason and fixed.size:
+            ahead = evaluated("f", system.f, self.points, self.n)[:, fixed]
+            kept = (ahead == region.lower[fixed]).all(axis=0)
+        else:
+            kept = np.array([graph.value(following[i]) == region.lower[i] for i in fixed], np.bool_)
+        self.moved = fixed[~kept]
+
+    def jacobians(self, points: Array) -> Array:
+        """The joint Jacobians at some points: the expressions', or the functions' own."""
+        parts = []
+        for name in ("f", "h"):
+            evaluated(name, getattr(self._system, name), points, self.n)  # steps may not see NaN
+            jacobian = getattr(self._system, f"{name}_jacobian")
+            parts.append(evaluated(f"the Jacobian of {name}", jacobian, points, self.n))
+        joint = np.concatenate((parts[0][:, self.free], parts[1]), axis=1)[..., self.free]
+        if self.reason:
+            return joint
+        true = self.enclose(points, points).centre
+        return np.where(np.isfinite(true), true, joint)
 
     def _read(self, name: str) -> tuple[str, list[int]]:
         """Why a function has no enclosure, or the nodes of its values."""
@@ -211,14 +215,19 @@ class SmoothModel:
 
     def _differs(self, name: str) -> str:
         """Where a function differs from its expression by more than rounding; blank if nowhere."""
-        points = self._region.sample(_SAMPLES, np.random.default_rng(_SEED))
-        function, n = getattr(self._system, name), self.n
+        points, function, n = self.points, getattr(self._system, name), self.n
+
+        def values_at(point: Array) -> Any:
+            try:
+                return np.asarray(function(point[:n].copy(), point[n:].copy()), np.float64)
+            except Exception:  # whatever a user's function does: others report it
+                return np.full(function.shape, np.nan)
+
         # In a thread of its own: a function may know those of others by name.
-        with ThreadPoolExecutor(1) as pool:
-            values = pool.submit(_at_each, function, points[:, :n], points[:, n:]).result()
-        found = self._programs[name](points, points)
-        middle, room = found.middle.T, _ROUNDING * found.radius.T
-        with np.errstate(invalid="ignore"):
+        with np.errstate(all="ignore"), ThreadPoolExecutor(1) as pool:
+            values = np.array(pool.submit(lambda: [values_at(point) for point in points]).result())
+            found = self._programs[name](points, points)
+            middle, room = found.middle.T, _ROUNDING * found.radius.T
             same = (np.abs(values - middle) <= room) | ~(np.isfinite(values) & np.isfinite(middle))
         # Not known of the expression may be what the function has a value for.
         same &= np.isfinite(values) >= np.isfinite(middle)
@@ -226,14 +235,13 @@ class SmoothModel:
             return ""
         k = int(np.argmin(same.all(axis=1)))
         return (
-            f"{name} is {values[k].tolist()} at {place(points[k, :n], points[k, n:])}, but its "
-            f"expression is {middle[k].tolist()}: it depends on more than its arguments"
+            f"{name} is {values[k].tolist()} at {place(points[k], n)}, but its expression is "
+            f"{middle[k].tolist()}: it depends on more than its arguments"
         )
 
     def values(self, lower: Array, upper: Array) -> Interval:
         """Enclosures (B, n + p) of f and h over cells (B, N); NaN where there are none."""
-        assert self._plan is not None
-        found = self._plan.values(lower, upper)
+        found = self._values(lower, upper)
         return Interval(found.low.T, found.high.T)
 
     def enclose(self, lower: Array, upper: Array) -> Enclosure:
@@ -244,7 +252,8 @@ class SmoothModel:
         if unknown.any():
             self._unknown = lower[unknown][-1], upper[unknown][-1]
             middles = 0.5 * lower[unknown] + 0.5 * upper[unknown]
-            check_values(self._system, middles[self._region.contains(middles[:, : self.n])])
+            for name in self._programs:
+                evaluated(name, getattr(self._system, name), middles, self.n)
         return found
 
     def _enclosed(self, lower: Array, upper: Array) -> Enclosure:
@@ -267,19 +276,21 @@ class SmoothModel:
 
 
 class _Plan:
-    """The programs for the Jacobian of some nodes by the first n variables, over cells."""
+    """The programs for the Jacobian of some nodes by some variables, over cells."""
 
-    def __init__(self, graph: Graph, slopes: Slopes, roots: list[int], n: int) -> None:
-        self._q, self._n = len(roots), n
-        first = [
+    def __init__(self, graph: Graph, slopes: Slopes, roots: list[int], by: list[int]) -> None:
+        self._q, self._n = len(roots), len(by)
+        column = {variable: k for k, variable in enumerate(by)}
+        each = [
             (row, i, node) for row, root in enumerate(roots)
-            for i, node in slopes.of(root).items() if i < n
+            for i, node in slopes.of(root).items() if i in column
         ]
+        first = [(row, column[i], node) for row, i, node in each]
         # Each second derivative in all places that it has.
         second = [
-            (row, this, other, node) for row, i, slope in first
+            (row, column[this], other, node) for row, i, slope in each
             for j, node in slopes.of(slope).items() if i <= j
-            for this, other in sorted({(i, j), (j, i)}) if this < n
+            for this, other in sorted({(i, j), (j, i)}) if this in column
         ]
         self._first, self._second = (
             np.array([one[:-1] for one in table], np.intp).reshape(-1, count).T
@@ -291,7 +302,6 @@ class _Plan:
         self._depends = np.array([
             [one in each for one in decisions] for each in above
         ], np.bool_).reshape(len(nodes), len(decisions))
-        self.values = Program(graph, roots)
         self._point = Program(graph, roots + nodes + decisions)
         self._cell = Program(graph, roots + nodes + [one[-1] for one in second] + decisions)
 
@@ -327,9 +337,6 @@ class _Plan:
         slopes, spread = np.zeros((2, cells, N, q, n))
         slopes[:, other, row, this] = bends.middle.T * half[:, other]
         spread[:, other, row, this] = bends.radius.T * half[:, other]
-        # Fixed coordinates bend nothing, whatever is known of it.
-        fixed = half == 0.0
-        slopes[fixed], spread[fixed] = 0.0, 0.0
         # Where a condition may change, what depends on it may jump.
         at, entry = np.nonzero(open_ends @ self._depends.T)
         spread[at, columns[entry], rows[entry], columns[entry]] = np.nan
@@ -363,15 +370,3 @@ def halved(lower: Array, upper: Array) -> tuple[Array, Array]:
     centre = np.where(lower == upper, lower, 0.5 * lower + 0.5 * upper)
     half = np.nextafter(np.maximum(upper - centre, centre - lower), np.inf)
     return centre, np.where(lower == upper, 0.0, half)
-
-
-def _at_each(function: Any, x: Array, u: Array) -> Array:
-    """A function's values, state by state; NaN where it raises."""
-    values = np.full((len(x), *function.shape), np.nan)
-    with np.errstate(all="ignore"):
-        for k in range(len(x)):
-            try:
-                values[k] = np.asarray(function(x[k].copy(), u[k].copy()), np.float64)
-            except Exception:  # whatever a user's function does: others report it
-                continue
-    return values

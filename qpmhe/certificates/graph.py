@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from .continuity import gap_of
 from .intervals import BRANCHES
-from .polynomials import gap_of
 
 CONDITIONS = ("less", "equal", "and", "or", "not")
 

@@ -1,24 +1,16 @@
 r"""The matrix inequalities of detectability and observers, as functions of the Jacobian.
 
-For two states x_1, x_2 of a convex set, differences of f and of h are integrals of the
-Jacobians along the segment between them, so that
-
-.. math::
-    \begin{pmatrix} f(x_1) - f(x_2) \\ h(x_1) - h(x_2) \end{pmatrix}
-    = \begin{pmatrix} A \\ C \end{pmatrix} (x_1 - x_2), \qquad
-    \begin{pmatrix} A \\ C \end{pmatrix}
-    = \int_0^1 J(x_2 + s (x_1 - x_2))\, ds
-
-with one pair (A, C) in the closed convex hull of the joint Jacobians J over the set. A
-condition of the pair that describes a convex set of pairs holds on this hull once it holds
-at the Jacobian of every single state. `Form` is such a condition: a matrix affine in (A, C) that
-is positive definite.
+Differences of f and h between two states of a convex set are :math:`A\, \delta x` and
+:math:`C\, \delta x` with one pair (A, C), an average of the joint Jacobians between them. A
+condition that describes a convex set of pairs holds for it once it holds at every single state.
+`Form` is such a condition: a matrix affine in (A, C) that is positive definite. How inequalities
+for trajectories follow is in the docs, in *What is guaranteed* and *A design by a Lyapunov
+function*.
 """
 
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,14 +41,12 @@ def _empty() -> Array:
 def _assemble(rows: list[list[Matrices]]) -> Matrices:
     """Blocks as one matrix."""
     cells = np.broadcast_shapes(*(each.middle.shape[:-2] for row in rows for each in row))
-    middle, radius = (
+    return Matrices(*(
         np.block([
-            [np.broadcast_to(part(each), cells + each.middle.shape[-2:]) for each in row]
+            [np.broadcast_to(getattr(each, part), cells + each.middle.shape[-2:]) for each in row]
             for row in rows
-        ])
-        for part in (operator.attrgetter("middle"), operator.attrgetter("radius"))
-    )
-    return Matrices(middle, radius)
+        ]) for part in ("middle", "radius")
+    ))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,60 +59,38 @@ class Form:
         |x_1^+ - x_2^+|_P^2 \le \rho^2 |x_1 - x_2|_P^2 + |w_1 - w_2|_Q^2 + |h(x_1) - h(x_2)|_R^2,
 
     and for the error e = x - z of an observer with the constant gain L,
-
-    .. math:: |e^+|_P^2 \le \rho^2 |e|_P^2 + |w|_Q^2 + |v|_R^2 .
-
-    Either follows from two inequalities, of which the second has no state in it:
+    :math:`|e^+|_P^2 \le \rho^2 |e|_P^2 + |w|_Q^2 + |v|_R^2`. Either follows from
 
     .. math::
         \begin{pmatrix} X & P A_L \\ \cdot & \rho^2 P + C^\top R C \end{pmatrix} \succ 0, \qquad
         \begin{pmatrix} P - X & P B \\ \cdot & D \end{pmatrix} \succ 0,
 
     for detectability with :math:`A_L = A`, B = G and D = Q, for an observer with
-    :math:`A_L = A - L C`, B = (G, -L), D = diag(Q, R) and without :math:`C^\top R C`. Their sum
-    is :math:`|a|_P^2 \le \rho^2 |e|_P^2 + |d|_D^2 + |C e|_R^2` for :math:`a = A_L e + B d`. With
-    X = P there is no room for the second; then, by the triangle inequality,
+    :math:`A_L = A - L C`, B = (G, -L), D = diag(Q, R) and without :math:`C^\top R C`. Where X is
+    P, by the triangle inequality alone,
+    :math:`|x_1^+ - x_2^+|_P \le \rho |x_1 - x_2|_P + |w_1 - w_2|_P + |h(x_1) - h(x_2)|_R`.
 
-    .. math:: |x_1^+ - x_2^+|_P \le \rho |x_1 - x_2|_P + |w_1 - w_2|_P + |h(x_1) - h(x_2)|_R .
-
-    Where C varies, :math:`-C^\top R C` is concave in C: the first inequality at every single state
-    says nothing of averages of their Jacobians. As :math:`\delta h = C \delta x`, neither of the
-    terms with :math:`\delta h - C \delta x` changes anything in
+    Where C varies, :math:`-C^\top R C` is concave in C. As :math:`\delta h = C \delta x`, the
+    terms with :math:`\delta h - C \delta x` change nothing in
 
     .. math::
         |A \delta x - K (\delta h - C \delta x)|_S^2 \le \rho^2 |\delta x|_P^2
         + |\delta h|_R^2 - 2 (\delta h - C \delta x)^\top (M \delta x + N \delta h),
 
-    but asked of all :math:`\delta x, \delta h`, with Y = P K and :math:`S = P X^{-1} P`, it is
+    which for all :math:`\delta x, \delta h`, with Y = P K and :math:`S = P X^{-1} P`, is affine:
 
     .. math::
         \begin{pmatrix} X & P A + Y C & -Y \\
         \cdot & \rho^2 P + C^\top M + M^\top C & C^\top N - M^\top \\
-        \cdot & \cdot & R - N - N^\top \end{pmatrix} \succ 0,
-
-    which is affine in (A, C) jointly. It takes one K, M and N for the whole set.
-
-    Parameters
-    ----------
-    P : (n, n) array
-    rate : float
-        rho.
-    R : (p, p) array
-        The weight of the output's difference, or of an observer's noise; empty if there is none.
-    gain : (n, p) array, optional
-        L, of an observer.
-    injection : (Y, M, N), optional
-        For outputs that are not affine.
-    X, B, Q : (n, n), (n, r) or (n, r + p), and (r, r) array
-        Empty where X is P.
+        \cdot & \cdot & R - N - N^\top \end{pmatrix} \succ 0 .
     """
 
     P: Array
     rate: float
-    R: Array = field(default_factory=_empty)
-    gain: Array | None = None
-    injection: tuple[Array, Array, Array] | None = None
-    X: Array = field(default_factory=_empty)
+    R: Array = field(default_factory=_empty)  # of the output or an observer's noise
+    gain: Array | None = None  # of an observer
+    injection: tuple[Array, Array, Array] | None = None  # Y, M and N
+    X: Array = field(default_factory=_empty)  # X, B and Q are empty where X is P
     B: Array = field(default_factory=_empty)
     Q: Array = field(default_factory=_empty)
 
@@ -221,12 +189,8 @@ def definite(matrices: Matrices) -> NDArray[np.bool_]:
     The matrices are scaled to diagonals near one. A member less the middle A, plus the sums of the
     radius' rows on the diagonal, is diagonally dominant; so A less these sums must be definite.
     Cholesky's factorisation, where it ends, is of a matrix that differs from it by at most
-    :math:`\gamma_{n+1} \operatorname{tr} A`, up to a factor near one.
-
-    References
-    ----------
-    Rump, Verification of positive definiteness, BIT 46 (2006). Higham, Accuracy and Stability
-    of Numerical Algorithms, 2nd edition, theorem 10.3.
+    :math:`\gamma_{n+1} \operatorname{tr} A`, up to a factor near one (Rump, BIT 46, 2006; Higham,
+    Accuracy and Stability of Numerical Algorithms, 2nd edition, theorem 10.3).
     """
     middle = 0.5 * (matrices.middle + np.swapaxes(matrices.middle, -1, -2))
     radius = np.broadcast_to(matrices.radius, middle.shape)
@@ -278,14 +242,9 @@ def norm_bound(matrices: Matrices) -> Array:
 
 
 def euclidean_constants(P: Array, V: Array, rate: float) -> tuple[float, float, float]:
-    r"""Constants of the sums in def:RGES and def:eIOSS.
+    r"""c_p, c_w and c_v of the sums in def:RGES and def:eIOSS, rounded up.
 
-    From :math:`|e^+|_P \le \rho |e|_P + |w|_P + |v|_V`, by induction, and as the sums of the
-    definitions discount by one power of the rate more,
-
-    .. math::
-        c_p = \sqrt{\bar\lambda(P) / \underline\lambda(P)}, \quad c_w = c_p / \rho, \quad
-        c_v = \sqrt{\bar\lambda(V) / \underline\lambda(P)} / \rho .
+    They follow from :math:`|e^+|_P \le \rho |e|_P + |w|_P + |v|_V` by induction.
     """
     low, high = eigenvalue_bounds(P)
     size = 2.0 * float(np.linalg.norm(V))

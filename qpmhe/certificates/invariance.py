@@ -1,13 +1,12 @@
 r"""Whether a region is invariant: f(x, u) + G w in it for all its states x, inputs u and w.
 
-The state leaves through a side :math:`g^\top x \le c` exactly where the largest value of
-:math:`g^\top f(x, u)`, and what the disturbances add to it, are above c. On a cell with middle m
-it is, with the Jacobian J enclosed over the cell and the inputs over theirs, at most
+On a cell with middle m, with the Jacobian J enclosed over the cell and the inputs over theirs,
 
 .. math::
-    g^\top f(m, u) + \sum_j |g^\top J|_j\, h_j, \qquad h_j \text{ the half-widths},
+    f_i(x, u) \in f_i(m, u) + \sum_j [-1, 1]\, |J_{ij}|\, h_j, \qquad h_j \text{ the half-widths},
 
-and cells are divided until it is below c, or above it at a state.
+and cells are divided until that, and what disturbances add, is within the sides, or a state is
+found from which it is not.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel, halved, place
 from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
-from .regions import Region, bounded_region, bounds, inequalities, row_bounds
+from .intervals import Interval
+from .regions import Region, bounded_region
 
-_CHUNK = 256
 _MOST_CELLS = 40_000
 _SAMPLES, _SEED = 2000, 20210829
 # More than the rounding of a few sums and products.
@@ -39,23 +38,10 @@ _SLACKS = (1e-12, 1e-9, 1e-6, 1e-3)
 
 @dataclass(frozen=True, eq=False)
 class Invariance:
-    r"""Whether f and the disturbances keep the state in a region.
+    """Whether f and the disturbances keep the state in a region: ``holds``, None if not known.
 
-    Attributes
-    ----------
-    holds : bool or None
-        True where it is proved, False where a state that leaves is known, None where neither is.
-    text : str
-        In words: through which side the state leaves, from where, and how far it reaches; or why
-        it is not known.
-    region : Region
-        The region.
-    limit, reach : float
-        c, and the largest :math:`g^\top x^+` that is known; NaN where no state is known to leave.
-    at : (n + m,) array or None
-        From where: state and input.
-    cells : int
-        How many cells were examined.
+    ``text`` says it in words: through which side the state leaves, from where (``at``, state and
+    input), how far it reaches and what the ``limit`` is; or why it is not known.
     """
 
     holds: bool | None
@@ -88,47 +74,38 @@ def certify_invariance(
 ) -> Invariance:
     """Prove that a region is invariant, or say where the state leaves it.
 
-    Parameters
-    ----------
-    system, region, inputs
-        As for `certify`.
-    disturbance : float or (r,) array_like
-        The largest disturbance w: a length, or half-widths by component; G w acts on the state.
-    seconds : float or Deadline
-        How long it may take, about.
-
-    Raises
-    ------
-    SetError, ModelError, ShapeError, OptionError
-        If the region is no bounded set of states, f raises in it, or the disturbance does not fit.
+    Arguments and errors are those of `certify`; the ``disturbance`` is the largest w, a length or
+    half-widths by component (r,), which acts on the state as G w.
     """
     deadline, where = Deadline.of(seconds), bounded_region(system, region, inputs)
-    rows, limits = inequalities(where.states)
-    added, cells = _added(system, rows, disturbance), Cells(where)
-    model = SmoothModel(system, where)
+    added, model = _added(system, disturbance), SmoothModel(system, where)
     unknown = "it is not known whether x stays"
     if model.reason:
         return Invariance(None, f"{unknown}: {model.reason}", where)
+    cells = Cells(where, _MOST_CELLS, deadline)
     points = where.sample(_SAMPLES, np.random.default_rng(_SEED))
-    while True:
-        found = _leaving(model, where, rows, limits, added, points, cells.taken)
-        if found is not None:
-            return found
-        if not len(cells.lower):
-            return Invariance(True, "x stays in the region", where, cells=cells.taken)
-        if cells.taken and (deadline.passed or cells.taken > _MOST_CELLS):
-            end = "when its time was over" if deadline.passed else "the most that are allowed"
-            text = f"{unknown}, after {cells.taken} cells, {end}"
-            return Invariance(None, text, where, cells=cells.taken)
-        low, high = cells.take(_CHUNK)
-        reach, parts = _reach(model, rows, low, high)
-        excess = reach - (limits - added)
+    leaving = _leaving(model, where, added, points)
+    for low, high in cells if leaving is None else ():
+        reached, parts = _reached(model, low, high)
+        excess = np.maximum(
+            reached.high - (where.upper[: where.n] - added),
+            where.lower[: where.n] + added - reached.low,
+        )
         left = np.flatnonzero(~(excess <= 0.0).all(axis=1))
         low, high, excess = low[left], high[left], excess[left]
-        points = 0.5 * low + 0.5 * high
-        points = points[where.contains(points[:, : where.n])]
-        worst = np.where(np.isnan(excess), np.inf, excess).argmax(axis=1)
-        cells.halve(low, high, parts[left, worst], np.full(len(left), np.inf))
+        leaving = _leaving(model, where, added, 0.5 * low + 0.5 * high)
+        if leaving is not None:
+            break
+        if len(left):
+            worst = np.where(np.isnan(excess), np.inf, excess).argmax(axis=1)
+            cells.halve(low, high, parts[left, worst])
+    if leaving is not None:
+        return Invariance(False, *leaving, cells.taken)
+    if cells.done:
+        return Invariance(True, "x stays in the region", where, cells=cells.taken)
+    end = "when its time was over" if cells.late else "the most that are allowed"
+    text = f"{unknown}, after {cells.taken} cells, {end}"
+    return Invariance(None, text, where, cells=cells.taken)
 
 
 def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
@@ -136,40 +113,13 @@ def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
 
     While x stays there, and :math:`|x - z|_P \le b`, z stays in the region. With b the larger of
     the observer's initial bound and its limit, that is at all times; the inner region's own
-    invariance can be certified in turn.
-
-    Parameters
-    ----------
-    region : Region
-    metric : (n, n) array
-        P.
-    radius : float
-        b.
-
-    Returns
-    -------
-    Region or None
-        None if it is empty, or has no interior.
+    invariance can be certified in turn. None if it is empty, or has no interior.
     """
-    states, n = region.states, region.n
-    sides, slants = (radius * supports(metric, rows) for rows in (np.eye(n), states.matrix))
-    inner = ConvexSet(
-        _inward(states.lower, sides), -_inward(-states.upper, sides), states.matrix,
-        _inward(states.row_lower, slants), -_inward(-states.row_upper, slants),
-    )
-    if not (inner.lower < inner.upper).all() or not (inner.row_lower < inner.row_upper).all():
-        return None
-    lower, upper = region.lower.copy(), region.upper.copy()
-    lower[:n], upper[:n] = bounds(inner)
-    if not (lower[:n] < upper[:n]).all() or not np.isfinite(upper[:n] - lower[:n]).all():
-        return None
-    return Region(inner, lower, upper)
-
-
-def _inward(sides: Array, reach: Array) -> Array:
-    """Lower sides moved up by some lengths, rounded up; infinite ones stay."""
-    moved: Array = np.where(np.isinf(sides), sides, np.nextafter(sides + reach, np.inf))
-    return moved
+    n, lower, upper = region.n, region.lower.copy(), region.upper.copy()
+    reach = radius * supports(metric, np.eye(n))
+    lower[:n] = np.nextafter(lower[:n] + reach, np.inf)
+    upper[:n] = np.nextafter(upper[:n] - reach, -np.inf)
+    return Region(lower, upper, n) if (lower[:n] < upper[:n]).all() else None
 
 
 def supports(metric: Array, rows: Array) -> Array:
@@ -186,8 +136,8 @@ def supports(metric: Array, rows: Array) -> Array:
     return np.full(len(rows), np.inf)
 
 
-def _added(system: System, rows: Array, disturbance: ArrayLike) -> Array:
-    """What disturbances add to each g^T x at most."""
+def _added(system: System, disturbance: ArrayLike) -> Array:
+    """What disturbances add to each state at most."""
     size = numbers("disturbance", disturbance)
     if size.shape not in ((), (system.r,)):
         raise ShapeError(
@@ -196,67 +146,55 @@ def _added(system: System, rows: Array, disturbance: ArrayLike) -> Array:
     if (size < 0.0).any():
         raise OptionError(f"disturbance is {size.tolist()}; expected >= 0.")
     G = np.eye(system.n) if system.disturbance_matrix is None else system.disturbance_matrix
-    moves = rows @ G
-    added: Array = np.linalg.norm(moves, axis=1) * size if size.ndim == 0 else np.abs(moves) @ size
+    added: Array = np.linalg.norm(G, axis=1) * size if size.ndim == 0 else np.abs(G) @ size
     return added * _OUTWARD
 
 
-def _reach(model: SmoothModel, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Upper bounds (B, r) on g^T f over cells, and what each coordinate adds (B, r, N)."""
-    n, (middle, half) = model.n, halved(low, high)
+def _reached(model: SmoothModel, low: Array, high: Array) -> tuple[Interval, Array]:
+    """Where f is over cells (B, n), and what each coordinate's width adds (B, n, N)."""
+    n, free, (middle, half) = model.n, model.free, halved(low, high)
     start, end = low.copy(), high.copy()
     start[:, :n] = end[:, :n] = middle[:, :n]
+    parts = np.zeros((len(low), n, low.shape[1]))
     with np.errstate(all="ignore"):
-        enclosure = model.enclose(low, high)
-        J = enclosure.centre[:, :n]
-        spread = np.abs(enclosure.slopes[:, :, :n]).sum(axis=1) + enclosure.error[:, :n]
-        slopes = np.abs(np.einsum("ri,bij->brj", rows, J)) + np.einsum(
-            "ri,bij->brj", np.abs(rows), spread + 1e-14 * np.abs(J)
-        )
-        parts = slopes * half[:, None, :n] * _OUTWARD
+        found = model.enclose(low, high)
+        size = (np.abs(found.centre) + np.abs(found.slopes).sum(axis=1) + found.error)
+        size = size[:, : free.size] * (1.0 + 1e-14) * half[:, None, free] * _OUTWARD
+        parts[:, free[:, None], free] = size
+        parts[:, model.moved] = np.nan  # of these, the values over the cell decide
         at_middle, over_cell = model.values(start, end), model.values(low, high)
-        first = row_bounds(rows, at_middle.low[:, :n], at_middle.high[:, :n])
-        mean = first[1] + parts.sum(axis=2) * _OUTWARD
-        mean += 1e-15 * np.abs(mean)
-        direct = row_bounds(rows, over_cell.low[:, :n], over_cell.high[:, :n])[1]
-        reach = np.fmin(mean, direct)
+        reach = parts.sum(axis=2) * _OUTWARD
+        mean = Interval(at_middle.low[:, :n], at_middle.high[:, :n]) + Interval(-reach, reach)
+        reached = Interval(
+            np.fmax(mean.low, over_cell.low[:, :n]), np.fmin(mean.high, over_cell.high[:, :n])
+        )
     # Inputs count by what their width adds to the values at the middle.
-    width = (first[1] - first[0])[:, :, None] * (half[:, None, n:] > 0.0)
-    return reach, np.concatenate((parts, width), axis=2)
+    width = (at_middle.high - at_middle.low)[:, :n, None]
+    parts[:, :, n:] = width * (half[:, None, n:] > 0.0)
+    return reached, parts
 
 
 def _leaving(
-    model: SmoothModel, region: Region, rows: Array, limits: Array, added: Array, points: Array,
-    cells: int,
-) -> Invariance | None:
-    """The state among some of the region's from which f reaches farthest, if it leaves."""
+    model: SmoothModel, region: Region, added: Array, points: Array
+) -> tuple[str, Region, float, float, Array] | None:
+    """From which of some states f leaves farthest, in words, and how far, if it leaves."""
     if not len(points):
         return None
     n, found = region.n, model.values(points, points)
-    # What disturbances add at most was rounded up.
-    most = row_bounds(rows, found.low[:, :n], found.high[:, :n])[0] + added / _OUTWARD**2
+    less = added / _OUTWARD**2  # it was rounded up
+    limits = np.stack((region.upper[:n], -region.lower[:n]))[:, None]
+    reach = np.stack((found.low[:, :n], -found.high[:, :n])) + less
     widths = (region.upper - region.lower)[:n]
-    beyond = (most - limits) / (np.abs(rows) @ np.where(widths > 0.0, widths, 1.0))
+    beyond = (reach - limits) / np.where(widths > 0.0, widths, 1.0)
     beyond = np.where(np.isnan(beyond), -np.inf, beyond)
-    k, side = np.unravel_index(int(beyond.argmax()), beyond.shape)
-    if not beyond[k, side] > 0.0:
+    side, k, i = np.unravel_index(int(beyond.argmax()), beyond.shape)
+    if not beyond[side, k, i] > 0.0:
         return None
-    reach, limit, row = float(most[k, side]), float(limits[side]), rows[side]
-    sign, relation = (1.0, "<=") if row[np.flatnonzero(row)[0]] > 0.0 else (-1.0, ">=")
-    names = _words(sign * row)
-    who = "f and the disturbances reach" if added[side] > 0.0 else "f reaches"
+    sign, relation = (-1.0, ">=") if side else (1.0, "<=")
+    reached, limit = float(reach[side, k, i]), float(limits[side, 0, i])
+    who = "f and the disturbances reach" if added[i] > 0.0 else "f reaches"
     text = (
-        f"{who} {names} = {sign * reach:.4g} through the face {names} {relation} "
-        f"{sign * limit:.4g}, from {place(*np.split(np.round(points[k], 4), [n]))}"
+        f"{who} x{i + 1} = {sign * reached:.4g} through the face x{i + 1} {relation} "
+        f"{sign * limit:.4g}, from {place(np.round(points[k], 4), n)}"
     )
-    return Invariance(False, text, region, limit, reach, points[k], cells)
-
-
-def _words(row: Array) -> str:
-    """A linear form in words."""
-    text = ""
-    for j in np.flatnonzero(row):
-        sign = "-" if row[j] < 0.0 else "+"
-        text += f" {sign} " if text else sign.strip("+")
-        text += ("" if abs(row[j]) == 1.0 else f"{abs(row[j]):.4g} ") + f"x{j + 1}"
-    return text
+    return text, region, limit, reached, points[k]

@@ -88,13 +88,8 @@ class Detectability(_Certified):
         cls, *, eta: float, c_p: float, c_w: float, c_v: float,
         region: ConvexSet | Region | None = None,
     ) -> Detectability:
-        """Constants that the user states without proof; without a region, everywhere.
-
-        An `OptionError` names one that is not positive, or not below 1 for eta.
-        """
-        checked_rate("eta", eta)
-        for name, value in (("c_p", c_p), ("c_w", c_w), ("c_v", c_v)):
-            positive(name, value)
+        """Constants that the user states without proof; without a region, everywhere."""
+        _checked("eta", eta=eta, c_p=c_p, c_w=c_w, c_v=c_v)
         return cls(eta, c_p, c_w, c_v, region=stated_region(region))
 
     @property
@@ -149,16 +144,20 @@ class ObserverStability(_Certified):
         cls, *, rho: float, C_p: float, C_w: float, C_v: float, kappa: float,
         region: ConvexSet | Region | None = None,
     ) -> ObserverStability:
-        """Constants that the user states without proof; see `Detectability.assumed`."""
-        checked_rate("rho", rho)
-        for name, value in (("C_p", C_p), ("C_w", C_w), ("C_v", C_v), ("kappa", kappa)):
-            positive(name, value)
+        """Constants that the user states without proof; without a region, everywhere."""
+        _checked("rho", rho=rho, C_p=C_p, C_w=C_w, C_v=C_v, kappa=kappa)
         return cls(rho, C_p, C_w, C_v, kappa, region=stated_region(region))
 
     @property
     def sums(self) -> DecayingSums:
         """rho, C_p, C_w and C_v."""
         return DecayingSums(self.rho, self.C_p, self.C_w, self.C_v)
+
+
+def _checked(rate: str, **constants: float) -> None:
+    """Raise an `OptionError` for one that is not positive, or a rate that is not below 1."""
+    for name, value in constants.items():
+        (checked_rate if name == rate else positive)(name, value)
 
 
 Result = TypeVar("Result", "Detectability", "ObserverStability")

@@ -79,28 +79,15 @@ class Program:
         \min \textstyle\sum_j d_j^2 D_j \quad \text{s.t. both inequalities of the form}, \quad
         D \text{ diagonal}, \quad \operatorname{tr} P^{-1} \le n,
 
-    in states of the region's size, for disturbances and noises d of the given sizes. A length is
-    shared by its components. In the limit, :math:`|e|_P^2` is at most the sum divided by
+    in states of the region's size, for disturbances and noises d of the given ``sizes``; a length
+    is shared by its components. In the limit, :math:`|e|_P^2` is at most the sum divided by
     :math:`1 - \rho^2`. A rate hardly above the smallest leaves no room between X and P: then X is
-    P, and so it is where the triangle inequality is to be used. There, and for the weights of a
-    cost, P is no less than I instead, and the latter are scaled to a sum of 1. For
-    ``synthesis`` the gain is sought as well, with Y = P L.
+    P, as it is from the first with ``triangle``. There, and for the weights of a cost, P is no less
+    than I instead, and the latter are scaled to a sum of 1.
 
-    Parameters
-    ----------
-    kind : str
-    jacobians : (K, n + p, n) array
-    scales : Scales
-    sizes : NoiseSizes
-        Of w, and of v or the output.
-    matrix : (n, r) array
-        G, by which disturbances act.
-    gain : (n, p) array, optional
-        The observer's.
-    growth : callable, optional
-        The limit's square for a supply of 1, by the rate; then weights are rounded to be printed.
-    triangle : bool
-        Whether X is P from the first, for detectability.
+    The Jacobians are (K, n + p, n). For ``synthesis`` the gain is sought as well, with Y = P L.
+    ``matrix`` is G. ``growth`` is the limit's square for a supply of 1, by the rate; with it,
+    weights are rounded to be printed.
     """
 
     def __init__(

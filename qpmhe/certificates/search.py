@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,14 @@ from ..model.residuals import Angles
 from ..model.system import System
 from .branch_and_bound import Cover, cover
 from .deadline import LEAST_SECONDS, PART_SECONDS, Deadline
-from .enclosures import Enclosure, SmoothModel, evaluated, joint_jacobians
+from .enclosures import SmoothModel, evaluated
 from .evidence import CertificateError, Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
 from .regions import Region
 from .sdp import Answer, Kind, NoiseSizes, Program, Scales, expected_seconds
 from .theorem import checked_rate
 
-_SAMPLES, _PAIRS, _SEED = 400, 2000, 20210829
+_PAIRS, _SEED = 2000, 20210829
 _ROUNDS = 8
 _MARGINS = (1e-6, 1e-4, 1e-3, 1e-2)
 # Of what a rate that is not given leaves to 1: few cells suffice where there is room.
@@ -32,13 +32,11 @@ _DESIGN_MARGIN = 1e-4  # it saves the verification most of its cells, and costs 
 _LONG, _RATES, _WIDE_ROOM = 0.3, (0.9, 0.95, 0.98), (0.2, 0.4, 0.6)
 _FEW_POINTS, _MOST_POINTS, _MORE_POINTS = 4, 24, 6  # Jacobians at first, and of a failure
 _FEW_CELLS, _MOST_CELLS = 100, 40_000
-_TOLERANCE = 1e-3  # of the smallest rate
-_LARGEST_RATE = 0.9999
+_TOLERANCE, _LARGEST_RATE = 1e-3, 0.9999  # of the smallest rate; of any
 # In how many steps the best rate is sought, in decades of 1 - rate; how often, and how much of
 # what a failed rate leaves to 1 the next ones leave out.
 _STEPS, _FURTHER = 12, (0.0, 0.03, 0.1, 0.3)
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
-_ROUNDING = 1e-12  # of a state that f keeps
 # How much of the time the choice of a rate may take, and one verification; how many programs
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
@@ -66,10 +64,9 @@ class Search:
     disturbance and noise; for detectability, of disturbance and output. With ``growth``, as of
     `Program`, detectability has the sum of squares, and disturbances act through their matrix.
 
-    A state that the region fixes, such as a known parameter, has no error. It is left out where
-    f keeps it at its value, whatever the others do, and the gain does not move it. Jacobians,
-    scales, gain and forms are of the states in ``free`` only, and of the disturbances in ``acting``
-    that move none of the fixed states.
+    A state that the region fixes, such as a known parameter, has no error. Jacobians, scales, gain
+    and forms are of the states in ``free`` only, and of the disturbances in ``acting`` that move
+    none of the fixed states.
     """
 
     def __init__(
@@ -77,29 +74,23 @@ class Search:
         gain: Array | None = None, seconds: float | Deadline = PART_SECONDS,
         growth: Callable[[float], float] | None = None,
     ) -> None:
-        self._deadline = Deadline.of(seconds)
-        self.system, self.region, self.gain, self._sizes = system, region, gain, sizes
-        self._growth, self._triangle = growth, kind is None and growth is None
         if kind is None and (system.output_residual or system.state_residual) is not None:
             raise CertificateError(
                 "the system has angles, whose differences may wrap: only an observer is "
                 "certified, within a region where they do not. Leave the residuals out for "
                 "detectability, with outputs and states that do not wrap within the region."
             )
-        n, self.p, G = system.n, system.p, system.disturbance_matrix
-        self._matrix = np.eye(n) if G is None or self._triangle else G
-        self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-        self.jacobians = joint_jacobians(system, self.points)
+        self._deadline = Deadline.of(seconds)
+        self.system, self.region, self.gain, self._sizes = system, region, gain, sizes
+        self._growth, self._triangle = growth, kind is None and growth is None
+        self.p, G = system.p, system.disturbance_matrix
+        self._matrix = np.eye(system.n) if G is None or self._triangle else G
         self.model = SmoothModel(system, region)
-        given = "given" in (system.f_jacobian.method, system.h_jacobian.method)
-        if given and not self.model.reason:  # what is given may be wrong
-            true = self.model.enclose(self.points, self.points).centre
-            self.jacobians = np.where(np.isfinite(true), true, self.jacobians)
-        fixed = (region.lower == region.upper)[:n]
-        self.free, self.acting = np.flatnonzero(~fixed), np.arange(system.r)
-        self.n = self.free.size
-        if fixed.any():
-            self._leave_out(fixed)
+        self.points, self.free = self.model.points, self.model.free
+        self.n, self.acting = self.free.size, np.arange(system.r)
+        self.jacobians = self.model.jacobians(self.points)
+        if self.n < system.n:
+            self._leave_out()
         if kind is None:
             same = self.model.affine_output or (
                 bool(self.model.reason) and not np.ptp(self.jacobians[:, self.n :], axis=0).any()
@@ -146,66 +137,34 @@ class Search:
             for j, each in zip(angles.components, np.floor(room * 1e4) / 1e4, strict=True)
         )
 
-    def _leave_out(self, fixed: NDArray[np.bool_]) -> None:
-        """Leave the states out that the region fixes; an error if it cannot be done."""
-        n, free = self.system.n, self.free
-        states, width = self.points[:, :n], "a region with some width there"
-        ahead = evaluated("f", self.system.f, states, self.points[:, n:])
-        kept = (np.abs(ahead - states) <= _ROUNDING * np.abs(states)).all(axis=0)
-        kept &= ~self.jacobians[:, :n, free].any(axis=(0, 2))
-        still = np.ones(n, np.bool_) if self.gain is None else ~self.gain.any(axis=1)
-        for who, which, helps in (
-            ("f", fixed & ~kept, (width,)),
-            ("the observer's gain", fixed & ~still, (width, "a gain with a row of zeros there")),
-        ):
-            if which.any():
-                names = ", ".join(f"x[{j}]" for j in np.flatnonzero(which))
-                raise NotCertifiedError(
-                    f"the region has no width in {names}, but {who} moves it", helps
-                )
+    def _leave_out(self) -> None:
+        """Leave the states out that the region fixes; an error if f or the gain moves them."""
+        n, free, width = self.system.n, self.free, "a region with some width there"
         if not free.size:
             raise NotCertifiedError(
                 "the region is a single state, which has nothing to estimate",
                 ("a region with some width",),
             )
-        self.jacobians = self.jacobians[:, np.append(~fixed, np.ones(self.p, np.bool_))][..., free]
+        fixed = np.setdiff1d(np.arange(n), free)
+        pulled = fixed[self.gain[fixed].any(axis=1)] if self.gain is not None else fixed[:0]
+        for who, moved, helps in (
+            ("f", self.model.moved, (width,)),
+            ("the observer's gain", pulled, (width, "a gain with a row of zeros there")),
+        ):
+            if moved.size:
+                names = ", ".join(f"x[{j}]" for j in moved)
+                raise NotCertifiedError(
+                    f"the region has no width in {names}, but {who} moves it", helps
+                )
         self.gain = None if self.gain is None else self.gain[free]
         G, (w, v) = self._matrix, self._sizes
         acting = np.flatnonzero(~G[fixed].any(axis=0) & G[free].any(axis=0))
         if not self._triangle:
             self.acting = acting
-        if np.shape(w) == (G.shape[1],):
-            self._sizes = np.asarray(w)[acting], v
+        self._sizes = (np.asarray(w)[acting] if np.shape(w) == (G.shape[1],) else w), v
         self._matrix = G[np.ix_(free, acting)]
         if not acting.size:
             self._matrix, self._sizes = np.eye(self.n), (0.0, v)
-
-    def enclose(self, lower: Array, upper: Array) -> Enclosure:
-        """As `SmoothModel.enclose`, of the free states.
-
-        Nothing is known where f is not shown to keep the others.
-        """
-        found, n = self.model.enclose(lower, upper), self.system.n
-        if self.n == n:
-            return found
-        rest = np.setdiff1d(np.arange(n), self.free)
-        size = np.abs(found.centre) + np.abs(found.slopes).sum(axis=1) + found.error
-        moves = size[:, rest][..., self.free].any(axis=(1, 2))
-        rows, columns = np.append(self.free, n + np.arange(self.p))[:, None], self.free
-        return replace(
-            found, centre=found.centre[:, rows, columns],
-            slopes=found.slopes[:, :, rows, columns], jacobian=found.jacobian[:, rows, columns],
-            error=np.where(moves[:, None, None], np.nan, found.error[:, rows, columns]), sides=(),
-        )
-
-    def embedded(self, matrix: Array, places: NDArray[np.intp], size: int) -> Array:
-        """A weight of what is not left out, as one of everything; what is left out weighs most."""
-        if places.size == size:
-            return matrix
-        full = np.eye(size) * float(np.linalg.eigvalsh(matrix)[-1])
-        if places.size:
-            full[np.ix_(places, places)] = matrix
-        return full
 
     @property
     def program(self) -> Program:
@@ -228,7 +187,7 @@ class Search:
         if rate is not None:
             checked_rate(name, rate)
         try:
-            return self._find_best() if rate is None else self._find(rate, given=True)
+            return self._best() if rate is None else self._find(rate, given=True)
         except OutOfTimeError:
             for one in sorted(self._answers, key=lambda each: each.objective):
                 found = None if one.form is None else self._verified(one.form, _FEW_CELLS)
@@ -240,7 +199,7 @@ class Search:
                 smallest = self._smallest_rate()
             except OutOfTimeError:
                 raise error from None
-            if not math.isfinite(smallest):
+            if math.isinf(smallest):
                 raise why(self, error.finding) from error
             helps = (*error.suggestions, f"a larger {name}", *advice, "a smaller region")
             raise NotCertifiedError(
@@ -249,46 +208,37 @@ class Search:
             ) from error
 
     def _smallest_rate(self) -> float:
-        """The smallest feasible rate at the chosen states, infinite if none below 1 is.
-
-        Where the time is over before, the smallest one that was tried and is.
-        """
-        low, high, deadline = 0.0, 1.0, self._deadline.part(_CHOICE)
+        """The smallest rate found feasible at the chosen states, infinite if none below 1 is."""
+        low, high, deadline = 0.0, math.inf, self._deadline.part(_CHOICE)
         middle = _LARGEST_RATE
-        try:
-            while high - low > _TOLERANCE * (1.0 - low):
+        while high - low > _TOLERANCE * (1.0 - low):
+            try:
                 margin = _MARGINS[0] * min(1.0, middle * middle)
-                if self._solved(middle, margin, deadline).form is not None:
-                    high = middle
-                elif high == 1.0:
-                    return math.inf
-                else:
-                    low = middle
-                middle = 0.5 * (low + high)
-        except OutOfTimeError:
-            if high == 1.0:
-                raise
+                feasible = self._solved(middle, margin, deadline).form is not None
+            except OutOfTimeError:
+                if math.isinf(high):
+                    raise
+                break
+            if not feasible and math.isinf(high):
+                break
+            low, high = (low, middle) if feasible else (middle, high)
+            middle = 0.5 * (low + high)
         return high
 
     def _solved(self, rate: float, margin: float, deadline: Deadline) -> Answer:
         """What the program returns; an error if there is no time for it, or not enough."""
         expected, left = self.program.expected_seconds, deadline.left
-        answer = Answer("user_limit")
-        if not deadline.passed and expected <= _MISJUDGED * left:
+        answer, begun = Answer("user_limit"), left > 0.0 and expected <= _MISJUDGED * left
+        if begun:
             answer = self.program.solve(rate, margin, left)
-        if answer.status == "user_limit" and (deadline.passed or expected > _MISJUDGED * left):
+        if answer.status == "user_limit" and (deadline.passed or not begun):
             given = self._deadline.seconds
-            time = (
-                f"the time for this search ({given:.3g} s) was too short" if given > LEAST_SECONDS
-                else "no time was left for this search"
-            )
-            why = (
-                f"a semidefinite program for {self.system.n} states takes about {expected:.2g} s, "
-                f"and {left:.2g} s were left" if expected > left > 0.0
-                else "it was over while matrices were sought and verified"
-            )
+            time = f"the time for this search ({given:.3g} s) was too short"
+            if given <= LEAST_SECONDS:
+                time = "no time was left for this search"
             raise OutOfTimeError(
-                f"{time}: {why}",
+                f"{time}: a semidefinite program for {self.system.n} states takes about "
+                f"{expected:.2g} s, and {left:.2g} s were left",
                 ("more seconds", "a given rate, which spares the search for one",
                  "a smaller model"),
             )
@@ -321,13 +271,9 @@ class Search:
             if not measures:
                 raise
         best = min(measures, key=measures.__getitem__)
-        if math.isinf(measures[best]) and math.isinf(self._smallest_rate()):
-            raise NotCertifiedError(
-                "no rate below 1 was found for which the semidefinite program is feasible"
-            )
         return best if math.isfinite(measures[best]) else _LARGEST_RATE
 
-    def _find_best(self) -> Found:
+    def _best(self) -> Found:
         """An inequality with the best rate found."""
         least, refused = 0.0, NotCertifiedError("no rate was tried")
         for further, one in zip(_FURTHER, _RATES if self._long else _FURTHER, strict=False):
@@ -339,6 +285,8 @@ class Search:
             except NotCertifiedError as error:
                 # What failed has left more states in the program, and moves the best rate.
                 refused, least = error, rate
+                if rate == _LARGEST_RATE:
+                    break
         raise refused
 
     def _margins(self, rate: float, given: bool) -> list[float]:
@@ -355,25 +303,25 @@ class Search:
     def _find(self, rate: float, *, given: bool) -> Found:
         """An inequality with this rate, verified as far as can be."""
         margins, best, status = self._margins(rate, given), None, "no round was left"
+        # Where a few cells do, as for affine models, no room is needed.
+        cells = _MOST_CELLS if given else _FEW_CELLS
         for turn in range(_ROUNDS):
             try:
                 answer = self._solved(rate, margins[0], self._deadline)
-                if self.kind == "synthesis" and answer.form is not None:
-                    # A better P for the gain, which was rounded.
-                    assert answer.form.gain is not None
-                    answer = self.program.of_gain(answer.form.gain).solve(
-                        rate, margins[0], self._deadline.left
-                    )
             except OutOfTimeError:
                 if best is None:
                     raise
                 break
+            if self.kind == "synthesis" and answer.form is not None:
+                # A better P for the gain, which was rounded.
+                assert answer.form.gain is not None
+                answer = self.program.of_gain(answer.form.gain).solve(
+                    rate, margins[0], self._deadline.left
+                )
             if answer.form is None:
                 status = answer.status
                 break
-            # Where a few cells do, as for affine models, no room is needed.
-            few = not given and margins[0] == self._margins(rate, given)[0]
-            outcome = self._verified(answer.form, _FEW_CELLS if few else _MOST_CELLS)
+            outcome = self._verified(answer.form, cells)
             if isinstance(outcome, Found):
                 if outcome.evidence is Evidence.PROVED or self.model.reason:
                     return outcome
@@ -382,7 +330,7 @@ class Search:
                 continue
             if not margins[1:]:
                 break
-            margins = margins[1:]
+            margins, cells = margins[1:], _MOST_CELLS
         if best is not None:
             return best
         raise NotCertifiedError(
@@ -401,7 +349,8 @@ class Search:
             return Cover(False, 0, self.points[~shown], self.jacobians[~shown])
         why = f"f and h cannot be run with intervals ({self.model.reason})"
         if not self.model.reason:
-            found = cover(self, self.region, form, most_cells, self._deadline.part(_VERIFICATION))
+            deadline = self._deadline.part(_VERIFICATION)
+            found = cover(self.model, self.region, form, most_cells, deadline)
             if found.proved:
                 return Found(form, Evidence.PROVED, found.cells, ())
             if found.violations.shape[0]:
@@ -419,11 +368,9 @@ class Search:
         """Raise where the inequality does not hold between two of the samples."""
         n, rng = self.system.n, np.random.default_rng(_SEED)
         start, end = self.points[rng.integers(len(self.points), size=(2, _PAIRS))]
-        fixed = np.setdiff1d(np.arange(start.shape[1]), self.free)
-        end[:, fixed] = start[:, fixed]
+        end[:, n:] = start[:, n:]
         df, dh = (
-            evaluated(name, function, end[:, :n], end[:, n:])
-            - evaluated(name, function, start[:, :n], start[:, n:])
+            evaluated(name, function, end, n) - evaluated(name, function, start, n)
             for name, function in (("f", self.system.f), ("h", self.system.h))
         )
         broken = form.excess((end - start)[:, self.free], df[:, self.free], dh) > 0.0
@@ -443,6 +390,14 @@ class Search:
         self.jacobians = np.concatenate((self.jacobians, outcome.jacobians[chosen]))
         self._program = None
         return bool(len(chosen))
+
+
+def embedded(matrix: Array, places: NDArray[np.intp], size: int) -> Array:
+    """A weight of what is not left out, as one of everything; what is left out weighs most."""
+    full = np.eye(size) * float(np.linalg.eigvalsh(matrix)[-1])
+    if places.size:
+        full[np.ix_(places, places)] = matrix
+    return full
 
 
 def _far_apart(jacobians: Array, count: int) -> NDArray[np.intp]:
