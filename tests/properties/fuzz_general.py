@@ -157,6 +157,9 @@ def case(draw, engine="python"):
         "noise": np.diag(draw.uniform(0.01, 1, p)),
     }
     system = qpmhe.System(f, h, n=n, p=p, m=1 + k, **options)
+    if not states and draw.random() < 0.25:  # as `augment_parameters` does
+        held = draw.permutation(n)[: draw.integers(1, n + 1)]
+        system.held = {int(j): float(draw.uniform(0.05, 1.0)) for j in held}
     observer = qpmhe.Luenberger(draw.uniform(0, 0.9) * a @ np.linalg.pinv(c))
     if draw.random() < 0.5:
         observer = qpmhe.ExtendedKalman(**covariances, innovation=some_rule(draw, p))
@@ -288,7 +291,11 @@ def judged(one, trajectory, start):
     inverse, _, null = one.inverse
     offset = wrapped(trajectory[0] - start, one.state_angles)
     count, worst, off = len(samples), 0.0, 0.0
-    cost = one.discount**count * offset @ one.prior @ offset
+    cost = offset @ one.prior @ offset
+    if one.mhe.hold is not None:  # `fuzz_independent` finds its weight a second time
+        away = trajectory[0][one.mhe.hold.components] - one.mhe.hold.target
+        cost += away @ one.mhe.hold.weight @ away
+    cost *= one.discount**count
     deviations = {
         "states": np.sqrt(one.metric),
         "disturbances": np.sqrt(np.linalg.inv(one.usual.disturbance).diagonal()),

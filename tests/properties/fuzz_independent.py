@@ -23,7 +23,7 @@ import qpmhe
 from qpmhe import Status
 from qpmhe.codegen import compiler
 
-from .independent import SMOOTH, Model, Price, Region, Watcher, one_of, spd
+from .independent import SMOOTH, Held, Model, Price, Region, Watcher, one_of, spd
 
 SETS = ("states", "disturbances", "noises")
 # What is missed by so much counts as satisfied, as the documentation has it.
@@ -154,6 +154,15 @@ class Case:
         }
         self.scribble = rng.random() < 0.3
         self.snapshots = rng.random() < 0.15
+        self.hold = None
+        if quadratic and model.kind in SMOOTH and rng.random() < 0.5:
+            self.hold = Held(rng, model, self.price, self.watcher, self.fixed)
+        # As `augment_parameters` does; without QPs nothing is held.
+        self.system.held = {} if self.hold is None else dict(
+            zip(self.hold.places, self.hold.within.tolist(), strict=True)
+        )
+        if self.options["max_qps"] == 0:
+            self.hold = None
         observer, cost = self.watcher.made(self.system), self.price.made()
         self.arguments = (self.system, observer, cost)
         return self._estimator()
@@ -172,7 +181,7 @@ class Case:
             f"fixed={self.fixed} observer={self.watcher.kind} cost={self.price.names} "
             f"single={self.price.single} discount={self.price.discount} "
             f"observer prior={self.price.prior_of_observer} {self.options} {self.data} "
-            f"scribble={self.scribble} snapshots={self.snapshots}"
+            f"scribble={self.scribble} snapshots={self.snapshots} held={self.system.held}"
         )
 
     def sample(self, x):
@@ -216,7 +225,9 @@ class Case:
             estimate = mhe.update(buffer_y, *((buffer_u,) if model.m else ()), **given)
             buffer_y[:], buffer_u[:] = 1e3, -1e3
             K = min(t + 1, N)
-            self._check(estimate, t, K, samples, z, P, history, counts)
+            self._check(estimate, t, K, samples, z, P, history)
+            if self.hold is not None:
+                self._check_hold(mhe, estimate, K, t)
             if not np.array_equal(mhe.state, history[-1]):
                 raise WrongStepError("the estimator's state is not the estimate's")
             arrays = [
@@ -285,7 +296,7 @@ class Case:
             ("projecting", self.watcher.region is not None),
             ("sample", "complete" if observed.all() else "partial" if observed.any() else "none"),
             ("own noise weight", own is not None), ("irregular step", dt is not None),
-            ("scribbled over", self.scribble),
+            ("scribbled over", self.scribble), ("held", self.hold is not None),
         ):
             counts[key, value] += 1
         for flag in Status:
@@ -296,7 +307,19 @@ class Case:
             counts["candidate outside, rung", rung] += 1
             counts["nearest points"] += estimate.nearest_points
 
-    def _check(self, estimate, t, K, samples, z, P, history, counts):
+    def _check_hold(self, mhe, estimate, K, t):
+        """What the estimator says of its hold; then the trusted values follow."""
+        hold = self.hold
+        if t % 4 == 0:
+            for name in ("target", "weight"):
+                told, own = getattr(mhe.hold, name), getattr(hold, name)
+                if not np.allclose(told, own, rtol=1e-5, atol=1e-5 * np.abs(own).max()):
+                    raise WrongStepError(f"the hold's {name} is {told}, truly {own}")
+            hold.target = mhe.hold.target.copy()
+        if estimate.improved:
+            hold.learn(estimate.trajectory[int(K == self.options["horizon"])])
+
+    def _check(self, estimate, t, K, samples, z, P, history):
         status, price = estimate.status, self.price
         window = samples[-K:]
         n = self.model.n
@@ -308,11 +331,14 @@ class Case:
             raise WrongStepError(f"the model does not fail, says {status}")
         raw = self._observed(estimate, t, K, window, z, P, history)
         prior, covariance = raw[0], P[t + 1 - K]
-        J, first, w, v = price.of(estimate.trajectory, prior, covariance, window)
+        if self.hold is not None:
+            self.hold.see(estimate.candidate, window)
+        J, first, w, v = price.of(estimate.trajectory, prior, covariance, window, self.hold)
         candidate_J, candidate_first, cw, cv = price.of(
-            estimate.candidate, prior, covariance, window
+            estimate.candidate, prior, covariance, window, self.hold
         )
-        loose = 1e-5 if price.prior_of_observer and not self.watcher.exact else 1e-8
+        differences = price.prior_of_observer and not self.watcher.exact
+        loose = 1e-5 if differences or self.hold is not None else 1e-8
         for name, told, own, term in (
             ("cost", estimate.cost, J, first),
             ("candidate_cost", estimate.candidate_cost, candidate_J, candidate_first),

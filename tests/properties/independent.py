@@ -531,27 +531,81 @@ class Price:
         values, vectors = np.linalg.eigh(0.5 * (P + P.T))
         return vectors @ np.diag(np.clip(1.0 / values, self.low, self.high)) @ vectors.T
 
-    def of(self, trajectory, prior, P, samples):
+    def noise_weight(self, y, own):
+        """Weight of the noises that are there, and which are."""
+        there = np.isfinite(y)
+        weight = self.weights[2] if own is None else own
+        if there.any() and not there.all():
+            weight = np.linalg.inv(np.linalg.inv(weight)[there][:, there])
+        return weight, there
+
+    def of(self, trajectory, prior, P, samples, hold=None):
         """J, its prior term, and the residuals w and v."""
         K, model = len(samples), self.model
         first = self._loss(0, np.asarray(trajectory[0]) - prior, self.prior_weight(P))
+        if hold is not None:
+            first += hold.term(trajectory[0])
         first *= self.discount**K
         J, ws, vs = first, [], []
         for i, (y, u, dt, own) in enumerate(samples):
             x = trajectory[i]
             w = np.asarray(trajectory[i + 1]) - np.array(model.f(x, u, dt))
             v = y - np.array(model.h(x, u))
-            there = np.isfinite(y)
+            weight, there = self.noise_weight(y, own)
             stage = self._loss(1, w, self.weights[1])
             if there.any():
-                weight = self.weights[2] if own is None else own
-                if not there.all():
-                    weight = np.linalg.inv(np.linalg.inv(weight)[there][:, there])
                 stage += self._loss(2, v[there], weight)
             J += self.discount ** (K - 1 - i) * stage
             ws.append(w)
             vs.append(v)
         return J, first, np.array(ws), np.array(vs)
+
+
+class Held:
+    """States that are held at trusted values where a window does not see them, by dense inverses."""
+
+    def __init__(self, rng, model, price, watcher, fixed):
+        n = model.n
+        self.places = rng.permutation(n)[: rng.integers(1, n + 1)].tolist()
+        self.within = rng.uniform(0.05, 1.0, len(self.places))
+        self.model, self.price, self.target = model, price, watcher.start[self.places]
+        self.prior = np.linalg.inv(price.prior_weight(watcher.P0))
+        free = [j for j in range(n) if j not in fixed]
+        self.spread = np.zeros((n, n))
+        self.spread[np.ix_(free, free)] = np.linalg.inv(price.weights[1][np.ix_(free, free)])
+
+    def see(self, candidate, samples):
+        """Find H, and the matrix by which the trusted values follow, of a window."""
+        n, K = self.model.n, len(samples)
+        covariance = np.kron(np.eye(K + 1), self.spread)  # of the first state and each w
+        covariance[:n, :n] = self.prior
+        slopes, information = np.eye(n, n * (K + 1)), np.zeros_like(covariance)
+        for i, (y, u, dt, own) in enumerate(samples):
+            A, C = self.model.slopes(candidate[i], u, dt)
+            weight, there = self.price.noise_weight(y, own)
+            if there.any():
+                information += (C[there] @ slopes).T @ weight @ (C[there] @ slopes)
+            slopes = A @ slopes
+            slopes[:, n * (i + 1) : n * (i + 2)] += np.eye(n)
+        left = covariance @ np.linalg.inv(np.eye(len(covariance)) + information @ covariance)
+        part, left = (one[np.ix_(self.places, self.places)] for one in (self.prior, left))
+        units = np.sqrt(part.diagonal())
+        values, vectors = np.linalg.eigh(part / np.outer(units, units))
+        root = units[:, None] * ((vectors * np.sqrt(values)) @ vectors.T)
+        inverse, stiff, eye = np.linalg.inv(root), np.diag(1.0 / self.within), np.eye(len(root))
+        values, vectors = np.linalg.eigh(inverse @ left @ inverse.T)
+        low = np.minimum(values, 0.5)
+        shares = (vectors * (low / (1.0 - low))) @ vectors.T
+        self.weight = inverse.T @ stiff @ shares @ shares @ stiff @ inverse
+        self.follow = root @ np.linalg.inv(eye + stiff @ shares @ stiff) @ (eye - shares) @ inverse
+
+    def term(self, first):
+        offset = np.asarray(first)[self.places] - self.target
+        return float(offset @ self.weight @ offset)
+
+    def learn(self, estimate):
+        """Follow an estimate of the next window's first state."""
+        self.target = self.target + self.follow @ (estimate[self.places] - self.target)
 
 
 class Region:
