@@ -44,7 +44,8 @@ def reproduce(
         task = bar.add_task("")
         found = studies.reproduce(
             out, seed=seed, seeds=seeds, steps=steps, method=method, backend_name=backend,
-            ipopt=ipopt, width=read_width(width), progress=lambda done, total: bar.update(task, completed=done, total=total),
+            ipopt=ipopt, width=read_width(width),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     console.print(_paper_table(found))
     console.print(_backend_table(found))

@@ -215,17 +215,18 @@ def _resized(figure: Figure, width: float | None) -> Iterator[None]:
     size: tuple[float, float] = tuple(figure.get_size_inches())
     texts: list[Any] = figure.findobj(Text)
     fonts = [(text, text.get_fontsize(), text.get_wrap()) for text in texts]
-    boxes = [one._legend_handle_box for one in figure.findobj(Legend)]
+    legends: list[Any] = figure.findobj(Legend)
+    boxes = [one._legend_handle_box for one in legends]
     columns = [[(one, list(one.get_children())) for one in box.get_children()] for box in boxes]
     try:
         # Lower than in proportion would squeeze panels between letters that shrink less.
         figure.set_size_inches(width, size[1] * min(1.0, max(width / size[0], 0.7)))
         for text in texts:
             text.set_fontsize(_LETTERS)
-        for text in (figure._suptitle, figure._supxlabel):
-            if text is not None:
+        for name in ("_suptitle", "_supxlabel"):
+            if (text := getattr(figure, name)) is not None:
                 text.set_wrap(True)
-        for legend, box in zip(figure.findobj(Legend), boxes, strict=True):
+        for legend, box in zip(legends, boxes, strict=True):
             _narrow(legend, box, 0.98 * figure.bbox.width)
         yield
     finally:

@@ -36,7 +36,7 @@ def environment() -> dict[str, Any]:
 
 
 def environment_words(found: dict[str, Any], names: Iterable[str] = ()) -> str:
-    """An environment in a line: the versions of qpmhe, NumPy and these backends, and the machine."""
+    """An environment in a line: versions of qpmhe, NumPy and these backends, and the machine."""
     wanted = ["qpmhe", "numpy", *(
         entry.distribution for entry in backends() if entry.name in set(names)
     )]

@@ -225,10 +225,10 @@ class Study:
         return tuple(made)
 
     def to_latex(self, store: Store | str | Path) -> str:
-        """The results of this study as LaTeX tables, one a model and horizon.
+        r"""The results of this study as LaTeX tables, one a model and horizon.
 
         Numbers are means ± standard errors of the means over the seeds,
-        :math:`s / \\sqrt n`, rounded to two digits of the error. Comments above each table say so,
+        :math:`s / \sqrt n`, rounded to two digits of the error. Comments above each table say so,
         and name machine and versions. The tables need the package booktabs.
 
         Parameters
@@ -241,7 +241,7 @@ class Study:
         StoreError, InvalidInputError
             If it cannot be read, or has none of this study.
         """
-        from .latex import tables
+        from .export import tables
 
         return tables(store, {cell.key for cell in self.cells()})
 

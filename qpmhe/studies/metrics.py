@@ -105,9 +105,10 @@ def cost_ratio(costs: Array, reference: Array | None) -> float:
 def outcomes(run: Run) -> dict[str, Any]:
     """How the steps ended, what they cost, and how many QPs and iterations they used.
 
-    ``cost`` is the mean of the true cost J where it is finite. Shares of steps: ``improved``; ``kept``, where the candidate is the estimate and nothing
-    failed; ``fallback``, where it is because something failed or no iterate lowered the cost;
-    ``cap_hits``, where a QP ended at its cap or unconfirmed. Further ``reasons``, the number of
+    ``cost`` is the mean of the true cost J where it is finite. Shares of steps: ``improved``;
+    ``kept``, where the candidate is the estimate and nothing failed; ``fallback``, where it is
+    because something failed or no iterate lowered the cost; ``cap_hits``, where a QP ended at its
+    cap or unconfirmed. Further ``reasons``, the number of
     steps of each flag of `qpmhe.Status`, and the means ``qps_mean`` and
     ``solver_iterations_mean`` per step, NaN where the solver does not report them.
     """

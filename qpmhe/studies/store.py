@@ -14,8 +14,7 @@ from urllib.parse import quote
 import numpy as np
 
 from .._checks import checked_path, need
-from ..errors import InvalidInputError, OptionError, QpmheError
-from .environment import environment_words
+from ..errors import QpmheError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -35,9 +34,9 @@ COLUMNS = {
     "rmse_settled": "REAL", "rmse_states": "TEXT", "rmse_settled_states": "TEXT",
     "nees": "REAL", "cost": "REAL", "cost_ratio": "REAL", "improved": "REAL", "kept": "REAL",
     "fallback": "REAL", "reasons": "TEXT", "cap_hits": "REAL", "qps_mean": "REAL",
-    "solver_iterations_mean": "REAL", "time_median": "REAL", "time_p95": "REAL", "time_p99": "REAL", "time_max": "REAL",
-    "times": "BLOB", "shared": "INTEGER", "environment": "INTEGER", "finished": "TEXT",
-    "parts": "TEXT",
+    "solver_iterations_mean": "REAL", "time_median": "REAL", "time_p95": "REAL",
+    "time_p99": "REAL", "time_max": "REAL", "times": "BLOB", "shared": "INTEGER",
+    "environment": "INTEGER", "finished": "TEXT", "parts": "TEXT",
 }
 _JSON = ("rmse_states", "rmse_settled_states", "reasons")
 _ARRAYS = ("times", "states", "estimates")
@@ -236,48 +235,6 @@ class Writer:
                     "INSERT OR REPLACE INTO trajectories VALUES (?, ?)",
                     (row["key"], json.dumps(content)),
                 )
-
-
-def export(store: Store | str | Path, path: str | Path) -> Path:
-    """Write a store into the file ``path``, and return it.
-
-    ``.csv`` and ``.parquet`` files hold all cells, with versions and machine in ``environment``;
-    in CSV, lists and ``reasons`` are JSON texts; in Parquet, only ``reasons`` is. A ``.tex`` file
-    holds the tables of `Study.to_latex`, of all cells. An existing file is replaced. Raises
-    `OptionError` if the name ends differently, `StoreError` if the store cannot be read,
-    `InvalidInputError` if the file cannot be written or a package is missing.
-    """
-    target = checked_path("the file", path)
-    if target.suffix not in (".csv", ".parquet", ".tex"):
-        raise OptionError(f"the file is {str(path)!r}; expected a name in .csv, .parquet or .tex.")
-    held = store if isinstance(store, Store) else Store(store)
-    frame, places = held.frame(), held.meta()["environments"]
-    frame["environment"] = [
-        environment_words(places[k], [backend])
-        for k, backend in zip(frame["environment"], frame["backend"], strict=True)
-    ]
-    lists = ("rmse_states", "rmse_settled_states", "times") if target.suffix == ".csv" else ()
-    for name in ("reasons", *lists):
-        frame[name] = frame[name].map(_text)
-    try:
-        if target.suffix == ".tex":
-            from .latex import tables
-
-            target.write_text(tables(held), encoding="utf-8")
-        elif target.suffix == ".csv":
-            frame.to_csv(target, index=False)
-        else:
-            need("pyarrow", "a Parquet file")
-            frame.to_parquet(target, engine="pyarrow", index=False)
-    except OSError as error:
-        raise InvalidInputError(f"cannot write {target}: {error.strerror or error}.") from error
-    return target
-
-
-def _text(value: Any) -> str | None:
-    if value is None or isinstance(value, float):  # pandas may put NaN for None
-        return None
-    return json.dumps(value if isinstance(value, (list, dict)) else value.tolist())
 
 
 def _environment(connection: sqlite3.Connection, settings: dict[str, Any]) -> int:

@@ -24,8 +24,8 @@ PROBLEM = ("model", "noise_level", "horizon", "steps")
 #: Columns that are averaged over seeds.
 METRICS = (
     "rmse", "rmse_settled", "nees", "cost", "cost_ratio", "improved", "kept", "fallback",
-    "failed_steps", "cap_hits", "qps_mean", "solver_iterations_mean", "time_median", "time_p95", "time_p99",
-    "time_max", "late", "rmse_excess",
+    "failed_steps", "cap_hits", "qps_mean", "solver_iterations_mean", "time_median", "time_p95",
+    "time_p99", "time_max", "late", "rmse_excess",
 )
 _SHARES = ("improved", "kept", "fallback", "failed_steps", "cap_hits", "late")
 _POSITIVE = tuple(name for name in METRICS if name != "rmse_excess")

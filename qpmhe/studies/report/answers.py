@@ -122,7 +122,8 @@ class Case:
             return None
         observer = rows.iloc[0]
         ratio = observer[self.by] / other[self.by] if other[self.by] > 0.0 else np.inf
-        text = f"{self._value(observer)}, {number(ratio)} times that of {configuration_words(other)}"
+        words = configuration_words(other)
+        text = f"{self._value(observer)}, {number(ratio)} times that of {words}"
         if np.isfinite(observer["time_median"]):
             share = observer["time_median"] / other["time_median"]
             text += (

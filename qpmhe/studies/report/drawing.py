@@ -45,9 +45,10 @@ _OBSERVER = Style(COLORS["observer"], "star", "*", "★", "dash", "--")
 
 
 def styles(backends: Iterable[str]) -> dict[str, Style]:
-    """A style for each backend in alphabetical order, and the observer's."""
+    """A style for each name in this order, and the observer's."""
     found = {}
-    for place, name in enumerate(sorted({str(one) for one in backends} - {"observer"})):
+    names = dict.fromkeys(str(one) for one in backends)
+    for place, name in enumerate(one for one in names if one != "observer"):
         symbol, marker, glyph = _SHAPES[place % len(_SHAPES)]
         dash, line = _DASHES[place % len(_DASHES)]
         color = _COLORS[place % len(_COLORS)]
@@ -388,13 +389,13 @@ def _legends(figure: Any, drawing: Drawing, drawn: Mapping[str, Style]) -> None:
             beside.append(Line2D([], [], color=style.color, linestyle=style.line, label=mark.label))
     if beside:
         narrow = figure.get_figwidth() < _NARROW
-        figure.legend(
-            handles=beside, loc=f"outside {'lower' if narrow else 'right'} center", fontsize=8,
+        (figure.axes[0] if narrow else figure).legend(
+            handles=beside, loc="best" if narrow else "outside right center", fontsize=8,
             title_fontsize=8, title="Pareto front" if "front" in kinds else None,
         )
     if kinds & {"points", "line"}:
         present = {mark.backend for mark in marks} - {""}
-        names = sorted(present - {"observer"}) + sorted(present & {"observer"})
+        names = [name for name in drawn if name in present]
         figure.legend(
             handles=[
                 Line2D([], [], color=drawn[name].color, marker=drawn[name].marker, markersize=5.5,

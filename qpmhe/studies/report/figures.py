@@ -139,7 +139,8 @@ def sweeps(summary: DataFrame) -> dict[str, tuple[Drawing, dict[str, Style]]]:
             groups = rows.groupby(others, sort=True) if others else [((), rows)]
             for values, group in groups:
                 fixed = "".join(
-                    f", {AXES[one][1]} = {value:g}" for one, value in zip(others, values, strict=True)
+                    f", {AXES[one][1]} = {value:g}"
+                    for one, value in zip(others, values, strict=True)
                 )
                 title = f"{model}, {backend}{fixed}"
                 if summary["steps"].nunique() > 1:

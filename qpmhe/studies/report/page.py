@@ -44,7 +44,7 @@ _LIBRARIES = ("pandas", "plotly", "itables", "jinja2")
 #: States that the page draws, and a file.
 MOST_STATES, _MOST_STATIC = 12, 6
 # Inches that a column of panels needs.
-_COLUMN = 1.6
+_COLUMN = 2.2
 # Bytes of trajectories that the page may hold.
 _TRAJECTORY_BYTES = 1_000_000
 _METRICS = {
@@ -167,7 +167,7 @@ def write_report(
     if not isinstance(held, tuple):
         for part in found:
             part.runs = choose_runs(held, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
-    drawn, profile = styles(summary["backend"]), figures.profiles(frame)
+    drawn, profile = styles(sorted(summary["backend"])), figures.profiles(frame)
     page, unfinished = folder / "index.html", folder / "index.html.part"
     try:
         # A former report stays whole where the new one cannot be written.
@@ -309,10 +309,9 @@ def files(
     def size(width: float, height: float) -> tuple[float, float]:
         return (width, height) if inches is None else (inches, min(height, 0.8 * inches + 0.4))
 
-    for title, (one, looks) in figures.sweeps(
-        pd.concat([part.case.summary for part in parts])
-    ).items():
-        found[file_name(title)] = static(one, looks, size(5.4, 3.8), title.rpartition(" ")[0])
+    summary = pd.concat([part.case.summary for part in parts])
+    for title, (drawing, looks) in figures.sweeps(summary).items():
+        found[file_name(title)] = static(drawing, looks, size(5.4, 3.8), title.rpartition(" ")[0])
     for part in parts:
         case, rows = part.case, part.case.summary
         starts = sorted(rows["start"].unique(), key=usual_first)
@@ -320,8 +319,8 @@ def files(
         of_start = f"; start {start}" if len(starts) > 1 else ""
 
         def columns(words: list[str], **more: str) -> list[tuple[str, dict[str, str]]]:
-            if inches is not None:  # those for which there is room
-                words = words[-max(1, int(inches / _COLUMN)):]
+            room = len(words) if inches is None else max(1, int(inches / _COLUMN))
+            words = words[-room:] if room > 1 or "2" not in words else ["2"]
             return [(qps_heading(one), {"qps": one, **more}) for one in words]
 
         one = figures.accuracy(rows, case.by, RANKED_BY[case.by], rows["pareto"])

@@ -1,7 +1,8 @@
-"""The results of a study as LaTeX tables."""
+"""The results of a study for other programs: CSV, Parquet and LaTeX."""
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Set
@@ -10,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InvalidInputError
+from .._checks import checked_path, need
+from ..errors import InvalidInputError, OptionError
 from .environment import environment_words
 from .report.answers import cases
 from .report.words import cap_words, qps_words
@@ -27,6 +29,46 @@ _SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     **{mark: f"\\{mark}" for mark in "&%$#_{}"},
 }
+
+
+def export(store: Store | str | Path, path: str | Path) -> Path:
+    """Write a store into the file ``path``, and return it.
+
+    ``.csv`` and ``.parquet`` files hold all cells, with versions and machine in ``environment``;
+    in CSV, lists and ``reasons`` are JSON texts; in Parquet, only ``reasons`` is. A ``.tex`` file
+    holds the tables of `Study.to_latex`, of all cells. An existing file is replaced. Raises
+    `OptionError` if the name ends differently, `StoreError` if the store cannot be read,
+    `InvalidInputError` if the file cannot be written or a package is missing.
+    """
+    target = checked_path("the file", path)
+    if target.suffix not in (".csv", ".parquet", ".tex"):
+        raise OptionError(f"the file is {str(path)!r}; expected a name in .csv, .parquet or .tex.")
+    held = store if isinstance(store, Store) else Store(store)
+    frame, places = held.frame(), held.meta()["environments"]
+    frame["environment"] = [
+        environment_words(places[k], [backend])
+        for k, backend in zip(frame["environment"], frame["backend"], strict=True)
+    ]
+    lists = ("rmse_states", "rmse_settled_states", "times") if target.suffix == ".csv" else ()
+    for name in ("reasons", *lists):
+        frame[name] = frame[name].map(_text)
+    try:
+        if target.suffix == ".tex":
+            target.write_text(tables(held), encoding="utf-8")
+        elif target.suffix == ".csv":
+            frame.to_csv(target, index=False)
+        else:
+            need("pyarrow", "a Parquet file")
+            frame.to_parquet(target, engine="pyarrow", index=False)
+    except OSError as error:
+        raise InvalidInputError(f"cannot write {target}: {error.strerror or error}.") from error
+    return target
+
+
+def _text(value: Any) -> str | None:
+    if value is None or isinstance(value, float):  # pandas may put NaN for None
+        return None
+    return json.dumps(value if isinstance(value, (list, dict)) else value.tolist())
 
 
 def tables(store: Store | str | Path, keys: Set[str] | None = None) -> str:
@@ -49,22 +91,21 @@ def escaped(text: str) -> str:
 
 
 def with_error(mean: float, error: float) -> str:
-    """A mean and its standard error, rounded to two digits of the error."""
+    """A mean and its standard error with two digits of the error, at most four of the mean."""
     if not math.isfinite(mean):
         return "--"
-    if not (math.isfinite(error) and error > 0.0):
-        return f"${mean:.3g}$" if 1e-3 <= abs(mean) < 1e4 or mean == 0.0 else _power(mean, 0.0)
-    exponent = math.floor(math.log10(max(abs(mean), error)))
+    size = max(abs(mean), error if math.isfinite(error) else 0.0)
+    exponent = math.floor(math.log10(size)) if size else 0
     if not -3 <= exponent < 5:
-        return _power(mean, error)
-    places = max(0, 1 - math.floor(math.log10(error)))
-    return rf"${mean:.{places}f} \pm {error:.{places}f}$"
-
-
-def _power(mean: float, error: float) -> str:
-    exponent = math.floor(math.log10(max(abs(mean), error)))
-    inner = with_error(mean / 10.0**exponent, error / 10.0**exponent).strip("$")
-    return rf"$({inner}) \cdot 10^{{{exponent}}}$" if error else rf"${inner} \cdot 10^{{{exponent}}}$"
+        inner = with_error(mean / 10.0**exponent, error / 10.0**exponent).strip("$")
+        return rf"$({inner}) \cdot 10^{{{exponent}}}$"
+    places = 2 - exponent
+    if math.isfinite(error) and error > 0.0:
+        places = min(3 - exponent, 1 - math.floor(math.log10(error)))
+    rounded = f"{error:.{max(0, places)}f}"
+    # Where the seeds agree to all digits, or there is one only, the mean stands alone.
+    known = math.isfinite(error) and float(rounded) > 0.0
+    return f"${mean:.{max(0, places)}f}" + (rf" \pm {rounded}$" if known else "$")
 
 
 def _table(title: str, rows: Any, machines: list[str]) -> str:
