@@ -35,8 +35,8 @@ def test_states_with_bands(case):
     for j, panel in enumerate(axes):
         drawn = lines(panel)
         np.testing.assert_array_equal(drawn["estimate"][:, 1], run.states[:, j])
-        np.testing.assert_array_equal(drawn["real"][:, 1], states[:, j])
-        np.testing.assert_allclose(drawn["real"][:, 0], 0.1 * np.arange(31))
+        np.testing.assert_array_equal(drawn["truth"][:, 1], states[:, j])
+        np.testing.assert_allclose(drawn["truth"][:, 0], 0.1 * np.arange(31))
         low, high = panel.collections[0].get_paths()[0].get_extents().get_points()[:, 1]
         half = 3.0 * np.sqrt(run.covariances[:, j, j])
         assert low == pytest.approx((run.states[1:, j] - half).min())
@@ -70,7 +70,7 @@ def test_estimates_of_angles_are_drawn_on_the_turn_of_the_truth():
     for residual, most in ((None, np.inf), (system.state_residual, 1.0)):
         panel = plots.states(run, truth=record.states, residual=residual)[2]
         drawn = lines(panel)
-        error = np.abs(drawn["estimate"][:, 1] - drawn["real"][:, 1]).max()
+        error = np.abs(drawn["estimate"][:, 1] - drawn["truth"][:, 1]).max()
         assert error < most
         assert error == far or residual is not None
         low, high = panel.collections[0].get_paths()[0].get_extents().get_points()[:, 1]
@@ -228,7 +228,7 @@ def test_trajectories_take_what_is_an_array():
     (panel,) = plots.trajectories(
         [0, 1, 2], [3, 4, 5], {"estimate": [3.0, 4.0, np.nan]}, ["x"], "time"
     )
-    assert lines(panel)["real"].tolist() == [[0, 3], [1, 4], [2, 5]]
+    assert lines(panel)["truth"].tolist() == [[0, 3], [1, 4], [2, 5]]
 
 
 @pytest.mark.parametrize(

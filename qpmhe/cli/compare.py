@@ -13,13 +13,17 @@ from rich.console import Console
 from .._checks import count, make_folder
 from ..errors import OptionError
 from ..studies import Store, Study, StudyError, run
-from ..studies.grid import WORDS, Measure
+from ..studies.grid import READING, WORDS, Measure
 from ..studies.report import check_libraries
+from . import options
 from .report import show_report
+from .values import read_numbers
 
 _JOBS = typer.Option(min=1, help="Cells to run in parallel, default all cores; to measure "
                                  "times, give 1.")
 _SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
+_FAILING = typer.Option(metavar="DIR", help="Folder for QPs on which a backend failed, for qpmhe "
+                                             "solve-qp; keeps those of cells that run.")
 _RETRY = typer.Option("--retry-failed", help="Run the cells again that failed before.")
 
 
@@ -28,6 +32,11 @@ def compare(
         list[str] | None,
         typer.Option(help="Model of the zoo, package.module:function or file.py:function; may be "
                      "repeated. The paper's reactor if left out."),
+    ] = None,
+    record: Annotated[
+        list[str] | None,
+        typer.Option(help="Measured record, CSV (also .gz) or Parquet with a time column, to "
+                          "compare on; may be repeated. Seeds and noise levels do not apply."),
     ] = None,
     backend: Annotated[
         list[str] | None,
@@ -43,6 +52,10 @@ def compare(
     horizons: Annotated[
         str, typer.Option(help="Horizons N, between commas; default is the model's own.")
     ] = "default",
+    noise_levels: Annotated[
+        str, typer.Option(help="Factors on the standard deviations of the simulated disturbance "
+                               "and noise, between commas.")
+    ] = "1",
     start: Annotated[
         list[str] | None, typer.Option(help="candidate or best; may be repeated.")
     ] = None,
@@ -72,19 +85,40 @@ def compare(
     jobs: Annotated[int | None, _JOBS] = None,
     scheduler: Annotated[str | None, _SCHEDULER] = None,
     retry_failed: Annotated[bool, _RETRY] = False,
+    keep_failing: Annotated[Path | None, _FAILING] = None,
+    time: options.Time = None,
+    outputs: options.Outputs = None,
+    inputs: options.Inputs = None,
+    truth: options.Truth = None,
+    dt: options.Step = None,
+    time_scale: options.TimeScale = 1.0,
+    skip_repeated: options.SkipRepeated = False,
+    separator: options.Separator = None,
+    decimal: options.Decimal = "auto",
+    encoding: options.Encoding = "utf-8",
+    skip_lines: options.SkipLines = 0,
+    time_format: options.TimeFormat = None,
+    missing: options.Missing = None,
 ) -> None:
     """Compare QP backends, caps and numbers of QPs: accuracy and time, a table and a report."""
+    given = locals()
+    reading = {key: given[key] for key in READING if given[key] is not None} if record else {}
     if model is None and steps is None:
         steps = 100  # all backends at all caps are to be done within ten minutes
     what = Study(
-        models=model or ("batch_reactor",), backends=backend or None,
+        models=model or ("batch_reactor",), records=record or (), reading=reading,
+        backends=backend or None,
         qps=_numbers("qps", qps),
         solver_iterations=_numbers("solver_iterations", solver_iterations),
         horizons=_numbers("horizons", horizons),
+        noise_levels=read_numbers("--noise-levels", noise_levels).tolist(),
         starts=start or ("candidate",), seeds=seeds, steps=steps, measure=measure,
         deadline=deadline, covariances=covariances, cell_timeout=cell_timeout,
     )
-    _run(what, store, out, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed)
+    _run(
+        what, store, out, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed,
+        keep_failing=keep_failing,
+    )
 
 
 def study(
@@ -98,13 +132,14 @@ def study(
     jobs: Annotated[int | None, _JOBS] = None,
     scheduler: Annotated[str | None, _SCHEDULER] = None,
     retry_failed: Annotated[bool, _RETRY] = False,
+    keep_failing: Annotated[Path | None, _FAILING] = None,
 ) -> None:
     """Run the study of a file; if it is stopped, the same command resumes it."""
     target = file.with_suffix(".sqlite") if store is None else store
     _run(
         Study.from_toml(file), target,
         target.with_name(f"{target.stem}-report") if out is None else out,
-        jobs=jobs, scheduler=scheduler, retry_failed=retry_failed,
+        jobs=jobs, scheduler=scheduler, retry_failed=retry_failed, keep_failing=keep_failing,
     )
 
 

@@ -99,28 +99,13 @@ def estimate(
         int | None,
         typer.Option(min=0, help="Largest number of missing samples in a row; default 500."),
     ] = None,
-    skip_repeated: Annotated[
-        bool, typer.Option("--skip-repeated", help="Skip lines with the same time as the line "
-                                                   "before.")
-    ] = False,
-    separator: Annotated[
-        str | None, typer.Option(help="Separator of a CSV file: a character, or comma, "
-                                      "semicolon, tab, bar, space.")
-    ] = None,
-    decimal: Annotated[Literal["auto", ".", ","], typer.Option(help="Decimal mark.")] = "auto",
-    encoding: Annotated[str, typer.Option(help="Text encoding of a CSV file.")] = "utf-8",
-    skip_lines: Annotated[
-        int, typer.Option(min=0, help="Lines of a CSV file above its header.")
-    ] = 0,
-    time_format: Annotated[
-        str | None,
-        typer.Option(help="Format of the dates, such as '%d/%m/%Y %H:%M:%S'; ISO dates and "
-                          "DD.MM.YYYY need none."),
-    ] = None,
-    missing: Annotated[
-        list[str] | None,
-        typer.Option(metavar="WORD", help="Word for a missing value; may be repeated."),
-    ] = None,
+    skip_repeated: options.SkipRepeated = False,
+    separator: options.Separator = None,
+    decimal: options.Decimal = "auto",
+    encoding: options.Encoding = "utf-8",
+    skip_lines: options.SkipLines = 0,
+    time_format: options.TimeFormat = None,
+    missing: options.Missing = None,
     diagnose: Annotated[
         str | None,
         typer.Option(metavar="FILE.html", help="Look for faults of sensors, model and weights, "

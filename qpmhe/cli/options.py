@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -29,5 +29,32 @@ Engine = Annotated[
     str | None,
     typer.Option(help="python, compiled or auto, which takes the compiled step where qpmhe "
                       "compile has made it."),
+]
+Truth = Annotated[
+    str | None, typer.Option(help="Columns of true states: x1=COLUMN,x2=COLUMN.")
+]
+SkipRepeated = Annotated[
+    bool, typer.Option("--skip-repeated", help="Skip lines with the same time as the line before.")
+]
+Separator = Annotated[
+    str | None, typer.Option(help="Separator of a CSV file: a character, or comma, semicolon, "
+                                  "tab, bar, space.")
+]
+Decimal = Annotated[Literal["auto", ".", ","], typer.Option(help="Decimal mark.")]
+Encoding = Annotated[str, typer.Option(help="Text encoding of a CSV file.")]
+SkipLines = Annotated[int, typer.Option(min=0, help="Lines of a CSV file above its header.")]
+TimeFormat = Annotated[
+    str | None,
+    typer.Option(help="Format of the dates, such as '%d/%m/%Y %H:%M:%S'; ISO dates and "
+                      "DD.MM.YYYY need none."),
+]
+Missing = Annotated[
+    list[str] | None,
+    typer.Option(metavar="WORD", help="Word for a missing value; may be repeated."),
+]
+Width = Annotated[
+    str | None,
+    typer.Option(help="Write the figures as PDF, too, all this wide: single (84 mm), double "
+                      "(174 mm) or a number of inches."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]

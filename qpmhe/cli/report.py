@@ -11,13 +11,17 @@ import numpy as np
 import typer
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
 from .. import studies
+from ..studies.environment import environment_words
 from ..studies.report.answers import Case, cases, chosen
 from ..studies.report.words import cap_words, number, percent, qps_words, seconds
 from ..studies.summary import TOLERANCE
+from . import options
+from .values import read_width
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -42,6 +46,7 @@ _COLUMNS = (
     _Column("rmse_half", "± 95 %", number),
     _Column("rmse_settled", "RMSE\nsettled", number, True),
     _Column("nees", "NEES", number),
+    _Column("cost", "J", number, True),
     _Column("cost_ratio", "J /\nconv.", number, True),
     _Column("time_median", "median", seconds, True),
     _Column("time_p95", "95 %", seconds, True),
@@ -59,31 +64,40 @@ _ALWAYS = ("rmse", "time_median", "late", "nees")
 # The others, in the order in which they are given the room that is left.
 _THEN = (
     "cost_ratio", "improved", "rmse_half", "rmse_settled", "time_p99", "failed_steps", "cap_hits",
-    "fallback", "time_p95", "kept", "time_max",
+    "fallback", "time_p95", "kept", "time_max", "cost",
 )
 
 
 def report(
     store: Annotated[Path, typer.Argument(help="File of the results.")],
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("results/report"),
+    width: options.Width = None,
 ) -> None:
     """Summarise a store on screen, and write its report: an HTML page and figures."""
-    show_report(Console(), store, out)
+    show_report(Console(), store, out, read_width(width))
 
 
 def export(
     store: Annotated[Path, typer.Argument(help="File of the results.")],
-    file: Annotated[Path, typer.Argument(help="File to write, .csv or .parquet.")],
+    file: Annotated[Path, typer.Argument(help="File to write, .csv, .parquet or .tex.")],
 ) -> None:
-    """Write the rows of a store into a CSV or Parquet file."""
+    """Write the rows of a store into a CSV or Parquet file, or their summary as LaTeX tables."""
     Console().print(f"wrote {studies.export(store, file)}", highlight=False)
 
 
-def show_report(console: Console, store: Path, out: Path) -> None:
+def show_report(
+    console: Console, store: Path, out: Path, width: str | float | None = None
+) -> None:
     """Write a store's report, and print its answers and tables."""
-    page = studies.write_report(store, out)
-    show(console, studies.summarise(studies.Store(store).frame()))
-    console.print(f"wrote {page}, and its figures as PNG and SVG beside it", highlight=False)
+    page = studies.write_report(store, out, width=width)
+    held = studies.Store(store)
+    summary = studies.summarise(held.frame())
+    show(console, summary)
+    for found in held.meta()["environments"]:
+        words = environment_words(found, summary["backend"])
+        console.print(f"[dim]{escape(words)}[/]", highlight=False)
+    kinds = "PNG and SVG" if width is None else "PDF, PNG and SVG"
+    console.print(f"wrote {page}, and its figures as {kinds} beside it", highlight=False)
 
 
 def show(console: Console, summary: DataFrame) -> None:
@@ -102,7 +116,7 @@ def show(console: Console, summary: DataFrame) -> None:
             rmse_half=(case.summary["rmse_high"] - case.summary["rmse_low"]) / 2
         )
         filled = {one.name for one in _COLUMNS if rows[one.name].notna().any()}
-        chosen_ones = filled & set(_ALWAYS)
+        chosen_ones = filled & {*_ALWAYS, *([] if case.by == "rmse" else ["cost"])}
         for name in _THEN:
             more = chosen_ones | {name}
             if name in filled and _width(console, _table(case, rows, more)) <= console.width:

@@ -8,11 +8,15 @@ from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from .. import studies
+from ..studies.environment import environment, environment_words
 from ..studies.paper import SETTLED, Reproduction
+from . import options
+from .values import read_width
 
 
 def reproduce(
@@ -29,6 +33,7 @@ def reproduce(
     ipopt: Annotated[
         bool, typer.Option("--ipopt", help="Run CasADi with Ipopt, the paper's tool, as well.")
     ] = False,
+    width: options.Width = None,
 ) -> None:
     """Reproduce the paper's example: tables on screen, figure and CSV files on disk."""
     console = Console()
@@ -39,10 +44,13 @@ def reproduce(
         task = bar.add_task("")
         found = studies.reproduce(
             out, seed=seed, seeds=seeds, steps=steps, method=method, backend_name=backend,
-            ipopt=ipopt, progress=lambda done, total: bar.update(task, completed=done, total=total),
+            ipopt=ipopt, width=read_width(width),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     console.print(_paper_table(found))
     console.print(_backend_table(found))
+    names = {row.label for row in found.backends}
+    console.print(f"[dim]{escape(environment_words(environment(), names))}[/]", highlight=False)
     for path in found.files:
         console.print(f"wrote {path}", highlight=False)
 

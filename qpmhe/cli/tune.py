@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -18,10 +18,6 @@ from ..errors import OptionError, QpmheError
 from ..models.loading import ModelSource, find
 from . import options
 from .values import arguments_of, read_state, with_arguments
-
-if TYPE_CHECKING:
-    from ..records.record_model import RecordModel
-    from ..tuning import TuningRecord
 
 
 def tune(
@@ -54,9 +50,7 @@ def tune(
         typer.Option(help="What to minimise after the likelihood; auto is the error where "
                           "--truth is given."),
     ] = "auto",
-    truth: Annotated[
-        str | None, typer.Option(help="Columns of true states: x1=COLUMN,x2=COLUMN.")
-    ] = None,
+    truth: options.Truth = None,
     time: options.Time = None,
     outputs: options.Outputs = None,
     inputs: options.Inputs = None,
@@ -79,7 +73,9 @@ def tune(
 ) -> None:
     """Choose the weights of an estimator from records; if it is stopped, the same call resumes."""
     from ..plots import save
+    from ..records.arrays import read_record
     from ..records.record_model import load_record_model
+    from ..tuning import TuningRecord
     from ..tuning import tune as run
     from ..tuning.weights import covariances_of
 
@@ -98,8 +94,15 @@ def tune(
         **{name: value for name, value in given.items() if value is not None},
     )
     mhe = loaded.estimator
+    read = [
+        read_record(
+            path, loaded, time=time, outputs=outputs, inputs=inputs, truth=truth, dt=dt,
+            time_scale=time_scale,
+        ) for path in record
+    ]
     records = [
-        _record(path, loaded, time, outputs, inputs, truth, dt, time_scale) for path in record
+        TuningRecord(each.measurements, each.inputs, each.states, each.lengths, name=path)
+        for path, each in zip(record, read, strict=True)
     ]
     try:
         with _named_as_options():
@@ -131,25 +134,6 @@ def tune(
         f"{sum(tuning.seconds.values()):.1f} s; wrote {escape(str(out))}. Use it: qpmhe estimate "
         f"{escape(model)} RECORD --weights {escape(str(out))}", highlight=False, soft_wrap=True,
     )
-
-
-def _record(
-    path: str, loaded: RecordModel, time: str | None, outputs: str | None, inputs: str | None,
-    truth: str | None, dt: float | None, scale: float,
-) -> TuningRecord:
-    """A file, with true states where it has columns of these."""
-    from ..records.arrays import read_arrays
-    from ..records.measurements import ColumnNames
-    from ..tuning import TuningRecord
-
-    system, step = loaded.estimator.system, loaded.dt if dt is None else dt
-    columns = ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs)
-    y, u, lengths = read_arrays(path, columns, system, step, scale)
-    states = None
-    if truth is not None:
-        columns = ColumnNames(loaded.states, (), time, truth, option="truth")
-        states = read_arrays(path, columns, system, step, scale)[0]
-    return TuningRecord(y, u, states, lengths, name=path)
 
 
 def _maker(source: ModelSource) -> Any:

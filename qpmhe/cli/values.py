@@ -39,6 +39,14 @@ def read_numbers(option: str, text: str) -> NDArray[np.float64]:
         raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None
 
 
+def read_width(text: str | None) -> str | float | None:
+    """The width of figures: a name, or inches."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
+
+
 def arguments_of(parameters: dict[str, float]) -> str:
     """Parameters as arguments of a model's function."""
     return ", ".join(f"{name}={float(value)!r}" for name, value in parameters.items())

@@ -9,7 +9,7 @@ import numpy as np
 
 from .._checks import Array
 from ..errors import ShapeError
-from .style import LIGHT, STYLES, panels
+from .style import COLORS, LIGHT, STYLES, panels
 
 
 def error_and_bounds(
@@ -26,7 +26,7 @@ def error_and_bounds(
     error : (T + 1,) array or None
         Length of the error; None for bounds alone.
     bounds : mapping of label to (T + 1,) array
-        At most six; a `ShapeError` is raised if lengths differ.
+        At most five; a `ShapeError` is raised if lengths differ.
     diameter : float, optional
         Diameter of the certified set, above which a bound says nothing.
     time_label, error_label : str
@@ -56,8 +56,11 @@ def error_and_bounds(
                 fontsize=8, ha="right", va="top",
             )
         if error is not None:
-            drawn.plot(times, shown[error_label], color="0.35", linewidth=1.1, label=error_label)
-        for style, label in zip(STYLES, bounds, strict=False):
+            drawn.plot(
+                times, shown[error_label], color=COLORS["estimate"], linewidth=1.1,
+                label=error_label,
+            )
+        for style, label in zip(STYLES[1:], bounds, strict=False):
             drawn.plot(times, shown[label], linewidth=1.4, label=label, **style)
         if ends:
             drawn.set_ylim(0.5 * min(ends), 3.0 * max(*ends, diameter or 0.0))

@@ -7,10 +7,8 @@ from html import escape
 from io import BytesIO
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from .steps import costs
-from .style import LIGHT
+from .style import LIGHT, run_times
 from .trajectories import trajectories
 
 if TYPE_CHECKING:
@@ -38,7 +36,7 @@ def run_page(run: Run) -> str:
         figure = Figure(figsize=(5.6, 0.5 + 1.1 * (count + 1)), layout="constrained")
         panels = list(figure.subplots(count + 1, 1, sharex=True))
         trajectories(
-            np.arange(len(run) + 1.0), None, {"estimate": run.states[:, :count]},
+            run_times(run, None, None)[0], None, {"estimate": run.states[:, :count]},
             [f"x{i + 1}" for i in range(count)], "", panels[:-1],
         )
         costs(run, axes=panels[-1])

@@ -9,7 +9,7 @@ import numpy as np
 from .._checks import positive
 from ..estimation.estimate import Status
 from .checks import check_run
-from .style import STYLES, panels
+from .style import COLORS, OBSERVER, STYLES, panels, run_times
 
 if TYPE_CHECKING:
     from ..estimation.run import Run
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 # Below this many times the largest, a cost is drawn as this: a logarithm ends somewhere.
 _FLOOR = 1e-12
 _EVENTS = (
-    ("improved", Status.IMPROVED, "#0072B2", "|"),
-    ("kept", Status.CANDIDATE, "#D55E00", "x"),
-    ("missing data", Status.MISSING, "0.45", "."),
+    ("improved", Status.IMPROVED, COLORS["estimate"], "|"),
+    ("kept", Status.CANDIDATE, COLORS["observer"], "x"),
+    ("missing data", Status.MISSING, COLORS["measurement"], "."),
     ("solver stopped or failed", Status.SOLVER_STOPPED, "#CC79A7", "v"),
     ("model failed", Status.MODEL_FAILED, "#009E73", "D"),
 )
 
 
 def costs(
-    run: Run, *, dt: float = 1.0, time_label: str = "time t (samples)", axes: Any = None
+    run: Run, *, dt: float | None = None, time_label: str | None = None, axes: Any = None
 ) -> Any:
     """True cost J of estimates and candidates, on a logarithmic axis; kept steps are marked.
 
@@ -41,29 +41,30 @@ def costs(
         Where to draw; a figure is made if left out.
     """
     check_run(run)
-    dt = positive("dt", dt)
+    times, when = run_times(run, dt, time_label)
     (panel,) = panels(1, axes, 2.6)
-    times = dt * np.arange(1, len(run) + 1)
+    times = times[1:]
     finite = run.candidate_costs[np.isfinite(run.candidate_costs)]
     floor = _FLOOR * max(finite.max(initial=0.0), 1e-300)
     for values, label, style in (
-        (run.candidate_costs, "candidate", STYLES[1]), (run.costs, "estimate", STYLES[0]),
+        (run.candidate_costs, "candidate", OBSERVER), (run.costs, "estimate", STYLES[0]),
     ):
         panel.semilogy(times, np.maximum(values, floor), linewidth=1.3, label=label, **style)
     kept = (run.flags & Status.CANDIDATE.value) != 0
     if kept.any():
         panel.semilogy(
-            times[kept], np.maximum(run.costs[kept], floor), "x", color="0.3", markersize=4.0,
+            times[kept], np.maximum(run.costs[kept], floor), "x", color=COLORS["observer"],
+            markersize=4.0,
             label="candidate kept",
         )
-    panel.set(xlabel=time_label, ylabel="true cost J")
+    panel.set(xlabel=when, ylabel="true cost J")
     panel.margins(x=0.01)
     panel.legend(frameon=False)
     return panel
 
 
 def outcomes(
-    run: Run, *, dt: float = 1.0, time_label: str = "time t (samples)", axes: Any = None
+    run: Run, *, dt: float | None = None, time_label: str | None = None, axes: Any = None
 ) -> Any:
     """Marks of what happened at each step, a row for each kind of event: improved, kept, and why.
 
@@ -73,9 +74,9 @@ def outcomes(
         As for `costs`, errors too.
     """
     check_run(run)
-    dt = positive("dt", dt)
+    times, when = run_times(run, dt, time_label)
     (panel,) = panels(1, axes, 1.6)
-    times = dt * np.arange(1, len(run) + 1)
+    times = times[1:]
     failed = Status.SOLVER_FAILED.value
     rows: list[str] = []
     for label, flag, color, marker in _EVENTS:
@@ -88,7 +89,7 @@ def outcomes(
             rows.append(f"{label} ({there.mean():.0%})")
     panel.set_yticks(range(len(rows)), rows)
     panel.set_ylim(max(len(rows), 1) - 0.5, -0.5)
-    panel.set_xlabel(time_label)
+    panel.set_xlabel(when)
     panel.margins(x=0.01)
     return panel
 

@@ -3,30 +3,49 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..errors import InvalidInputError, ShapeError
+from qpmhe_solvers.values import finite, shown
+
+from .._checks import positive
+from ..errors import InvalidInputError, OptionError, ShapeError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette; dashes distinguish the rest.
+    from ..estimation.run import Run
+
+#: One colour for one thing, in all figures; from Okabe and Ito's palette, as those of the rest.
+COLORS = {
+    "truth": "#A6A6A6", "measurement": "#56B4E9", "observer": "#222222", "estimate": "#D55E00",
+}
+#: How estimates are drawn, the first one first; dashes distinguish them, too.
 STYLES: tuple[dict[str, Any], ...] = (
-    {"color": "#D55E00", "linestyle": "-"},
+    {"color": COLORS["estimate"], "linestyle": "-"},
     {"color": "#0072B2", "linestyle": "--"},
     {"color": "#009E73", "linestyle": "-."},
     {"color": "#CC79A7", "linestyle": ":"},
     {"color": "#E69F00", "linestyle": "-"},
-    {"color": "#56B4E9", "linestyle": "--"},
+    {"color": "#882255", "linestyle": "--"},
 )
-#: How the truth is drawn.
-REAL: dict[str, Any] = {"color": "0.25", "linewidth": 2.2, "alpha": 0.5, "label": "real"}
+#: How the truth, measurements and the observer, whose last steps are the candidate, are drawn.
+REAL: dict[str, Any] = {"color": COLORS["truth"], "linewidth": 2.2, "label": "truth"}
+MEASURED: dict[str, Any] = {
+    "color": COLORS["measurement"], "linestyle": "none", "marker": ".", "markersize": 3.0,
+    "label": "measurement",
+}
+OBSERVER: dict[str, Any] = {"color": COLORS["observer"], "linestyle": "--"}
 #: How a band is filled that is proved to hold the truth.
 PROVED = "#E3ECF4"
+# Inches of one column and of two, and the points of letters in them.
+_WIDTHS, _LETTERS = {"single": 84.0 / 25.4, "double": 174.0 / 25.4}, 7.0
 #: Parameters of matplotlib.
 LIGHT: Any = {
     "axes.axisbelow": True,
@@ -37,6 +56,7 @@ LIGHT: Any = {
     "axes.spines.right": False,
     "axes.spines.top": False,
     "font.size": 9.0,
+    "pdf.fonttype": 42,
     "grid.color": "0.92",
     "grid.linewidth": 0.6,
     "legend.frameon": False,
@@ -46,6 +66,40 @@ LIGHT: Any = {
     "ytick.color": "0.4",
     "ytick.labelcolor": "0.2",
 }
+
+
+def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
+    """How lines are drawn: the observer and the estimate as ever, the others as they come."""
+    names = [str(label).lower() for label in labels]
+    found: dict[int, dict[str, Any]] = {
+        k: OBSERVER for k, name in enumerate(names)
+        if name.startswith(("observer", "candidate", "i = 0"))
+    }
+    first = next((k for k, name in enumerate(names) if name.startswith(("estimate", "mhe"))), None)
+    rest = list(STYLES)
+    if first is not None:
+        found[first] = rest.pop(0)
+    return [found[k] if k in found else rest.pop(0) for k in range(len(names))]
+
+
+def run_times(
+    run: Run, dt: float | None, time_label: str | None
+) -> tuple[NDArray[np.float64], str]:
+    """Times of the states of a run, and the label of their axis: seconds where steps are known."""
+    source, count = run.source, len(run)
+    if dt is None and source is not None:
+        dt = source.system.dt
+        if source.steps is not None:
+            times = np.concatenate(([0.0], np.cumsum(source.steps)))
+            return times, time_label or time_words(1.0)
+    return (1.0 if dt is None else positive("dt", dt)) * np.arange(count + 1.0), (
+        time_label or time_words(dt)
+    )
+
+
+def time_words(dt: float | None) -> str:
+    """The label of an axis of times."""
+    return f"time t ({'samples' if dt is None else 's'})"
 
 
 def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
@@ -83,21 +137,28 @@ def _notebooks_pyplot() -> Any:
     return pyplot
 
 
-def save(figure: Figure, stem: str | PathLike[str]) -> list[Path]:
-    """Write a figure as PNG and SVG, and return the paths of the files.
+def save(
+    figure: Figure, stem: str | PathLike[str], *, width: str | float | None = None
+) -> list[Path]:
+    """Write a figure as PNG and SVG, for a paper also as PDF, and return the paths of the files.
 
     Parameters
     ----------
     figure : matplotlib.figure.Figure
         The figure; of axes, ``axes.figure``.
     stem : str or Path
-        Path without suffix; its folder is made. ``.png`` or ``.svg`` at its end is taken off,
-        any other dot belongs to the name: of ``run_0.5`` comes ``run_0.5.png``.
+        Path without suffix; its folder is made. ``.png``, ``.svg`` or ``.pdf`` at its end is taken
+        off, any other dot belongs to the name: of ``run_0.5`` comes ``run_0.5.png``.
+    width : {"single", "double"} or float, optional
+        The width in a paper: a column of 84 mm, two columns of 174 mm, or inches. The files are as
+        wide as that, with letters of 7 points, embedded in the PDF.
 
     Raises
     ------
     InvalidInputError
         If the figure is none, or the path names no file.
+    OptionError
+        If the width is neither.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -113,15 +174,79 @@ def save(figure: Figure, stem: str | PathLike[str]) -> list[Path]:
         raise InvalidInputError(
             f"stem is {stem!r}; expected a path without suffix, such as 'results/states'."
         ) from error
-    name = path.stem if path.suffix.lower() in (".png", ".svg") else path.name
+    name = path.stem if path.suffix.lower() in (".png", ".svg", ".pdf") else path.name
     if name in ("", ".."):
         raise InvalidInputError(
             f"stem is {str(stem)!r}, a folder; expected the file's name without suffix as well, "
             "such as 'results/states'."
         )
+    inches = inches_of(width)
     path.parent.mkdir(parents=True, exist_ok=True)
-    paths = [path.with_name(name + suffix) for suffix in (".png", ".svg")]
-    with rc_context(LIGHT):
+    kinds = (".png", ".svg") if inches is None else (".pdf", ".png", ".svg")
+    paths = [path.with_name(name + suffix) for suffix in kinds]
+    with rc_context(LIGHT), _resized(figure, inches):
         for one in paths:
-            figure.savefig(one, dpi=200)
+            figure.savefig(one, dpi=200 if inches is None else 300)
     return paths
+
+
+def inches_of(width: str | float | None) -> float | None:
+    """A width of `save` in inches."""
+    if width is None or (isinstance(width, str) and width in _WIDTHS):
+        return None if width is None else _WIDTHS[width]
+    found = finite(width)
+    if found is None or not 1.0 <= found <= 20.0:
+        raise OptionError(
+            f"width is {shown(width)}; expected 'single' (84 mm), 'double' (174 mm) or inches "
+            "from 1 to 20."
+        )
+    return found
+
+
+@contextmanager
+def _resized(figure: Figure, width: float | None) -> Iterator[None]:
+    """Draw a figure in this width meanwhile, with the letters of a paper."""
+    from matplotlib.legend import Legend
+    from matplotlib.text import Text
+
+    if width is None:
+        yield
+        return
+    size: tuple[float, float] = tuple(figure.get_size_inches())
+    texts: list[Any] = figure.findobj(Text)
+    fonts = [(text, text.get_fontsize(), text.get_wrap()) for text in texts]
+    legends: list[Any] = figure.findobj(Legend)
+    boxes = [one._legend_handle_box for one in legends]
+    columns = [[(one, list(one.get_children())) for one in box.get_children()] for box in boxes]
+    try:
+        # Lower than in proportion would squeeze panels between letters that shrink less.
+        figure.set_size_inches(width, size[1] * min(1.0, max(width / size[0], 0.7)))
+        for text in texts:
+            text.set_fontsize(_LETTERS)
+        for name in ("_suptitle", "_supxlabel"):
+            if (text := getattr(figure, name)) is not None:
+                text.set_wrap(True)
+        for legend, box in zip(legends, boxes, strict=True):
+            _narrow(legend, box, 0.98 * figure.bbox.width)
+        yield
+    finally:
+        figure.set_size_inches(size)
+        for text, font, wraps in fonts:
+            text.set(fontsize=font, wrap=wraps)
+        for box, former in zip(boxes, columns, strict=True):
+            box._children = [column for column, _ in former]
+            for column, items in former:
+                column._children = items
+
+
+def _narrow(legend: Any, box: Any, most: float) -> None:
+    """Give a legend so few columns that it is no wider; Matplotlib fixes them when it is made."""
+    columns = list(box.get_children())
+    items = [item for column in columns for item in column.get_children()]
+    for number in range(len(columns), 0, -1):
+        parts = np.array_split(np.arange(len(items)), number)
+        box._children = columns[:number]
+        for column, part in zip(columns, parts, strict=False):
+            column._children = [items[k] for k in part]
+        if legend.get_window_extent().width <= most:
+            return

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from .._checks import Array, positive
 from ..errors import InvalidInputError
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
-from .style import PROVED, REAL, STYLES, panels
+from .style import PROVED, REAL, STYLES, line_styles, panels, run_times, time_words
 
 if TYPE_CHECKING:
     from ..estimation.estimate import Estimate
@@ -32,7 +32,8 @@ def trajectories(
     truth : (T + 1, n) array or None
         The real states, where they are known.
     estimates : mapping of label to (T + 1, n) array
-        At most six estimates, drawn in this order.
+        At most six estimates, drawn in this order; "observer" and "candidate" have a colour of
+        their own, which is the same in all figures.
     labels : sequence of str
         Axis labels of the states, with units.
     time_label : str
@@ -60,7 +61,7 @@ def trajectories(
     for j, panel in enumerate(drawn):
         if real is not None:
             panel.plot(when, real[:, j], **REAL)
-        for style, (label, values) in zip(STYLES, curves.items(), strict=False):
+        for style, (label, values) in zip(line_styles(curves), curves.items(), strict=True):
             panel.plot(when, values[:, j], linewidth=1.3, label=label, **style)
         panel.set_ylabel(names[j])
         panel.margins(x=0.01)
@@ -70,8 +71,8 @@ def trajectories(
 
 
 def states(
-    run: Run, *, dt: float = 1.0, labels: Sequence[str] | None = None,
-    time_label: str = "time t (samples)", truth: Array | None = None, sigmas: float = 2.0,
+    run: Run, *, dt: float | None = None, labels: Sequence[str] | None = None,
+    time_label: str | None = None, truth: Array | None = None, sigmas: float = 2.0,
     band: tuple[ArrayLike, ArrayLike] | None = None, axes: Any = None,
     residual: Residual | None = None,
 ) -> list[Any]:
@@ -81,9 +82,11 @@ def states(
     ----------
     run : Run
         Of `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
-    dt : float
-        Time between samples, in the unit of ``time_label``.
-    labels, time_label, truth, axes, residual
+    dt : float, optional
+        Time between samples, in the unit of ``time_label``; the system's if left out.
+    time_label : str, optional
+        Label of the time axis; seconds where the time between samples is known, else samples.
+    labels, truth, axes, residual
         As for `trajectories`.
     sigmas : float
         Half the width of a band, in standard deviations.
@@ -102,11 +105,10 @@ def states(
     """
     check_run(run)
     count, n = run.states.shape
-    times = positive("dt", dt) * np.arange(count, dtype=np.float64)
+    times, when = run_times(run, dt, time_label)
     sigmas = positive("sigmas", sigmas)
     drawn = trajectories(
-        times, truth, {"estimate": run.states}, _names(labels, n), time_label, axes,
-        residual=residual,
+        times, truth, {"estimate": run.states}, _names(labels, n), when, axes, residual=residual,
     )
     if run.covariances is not None and len(run):
         half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
@@ -142,8 +144,8 @@ def _pair(band: Any) -> tuple[ArrayLike, ArrayLike]:
 
 
 def window(
-    estimate: Estimate, *, dt: float = 1.0, labels: Sequence[str] | None = None,
-    time_label: str = "time t (samples)", axes: Any = None,
+    estimate: Estimate, *, dt: float | None = None, labels: Sequence[str] | None = None,
+    time_label: str | None = None, axes: Any = None,
 ) -> list[Any]:
     """The window of one estimate: the observer's candidate, and what became of it.
 
@@ -152,7 +154,7 @@ def window(
     estimate : Estimate
         Of `MovingHorizonEstimator.update`.
     dt, labels, time_label, axes
-        As for `states`.
+        As for `states`; an estimate does not know the time between samples.
 
     Raises
     ------
@@ -161,13 +163,14 @@ def window(
     """
     check_estimate(estimate)
     count, n = estimate.trajectory.shape
-    step, last = positive("dt", dt), estimate.time + 1
+    step, last = 1.0 if dt is None else positive("dt", dt), estimate.time + 1
     times = step * np.arange(last + 1 - count, last + 1, dtype=np.float64)
     lines = {
         f"estimate, J = {estimate.cost:.3g}": estimate.trajectory,
         f"candidate, J = {estimate.candidate_cost:.3g}": estimate.candidate,
     }
-    drawn = trajectories(times, None, lines, _names(labels, n), time_label, axes)
+    when = time_label or time_words(dt)
+    drawn = trajectories(times, None, lines, _names(labels, n), when, axes)
     for panel in drawn:
         for line in panel.lines[-2:]:
             line.set(marker="o", markersize=3.0)

@@ -2,19 +2,51 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from .._checks import Array
 from ..model.system import System
 from .measurements import ColumnNames, Measurement, RecordReader, seconds_between
+from .record_model import RecordModel
 from .steps import Steps
 
 
-def read_arrays(
-    path: str, columns: ColumnNames, system: System, usual: float | None, scale: float
-) -> tuple[Array, Array | None, Array | None]:
-    """Outputs, inputs and, where they differ, lengths of the steps; NaN in y fills the gaps."""
-    reader, steps = RecordReader(path, columns), Steps(system, usual=usual, scale=scale)
+class RecordArrays(NamedTuple):
+    """Outputs (T, p), NaN in gaps; inputs (T, m) or None; and what else a record has.
+
+    ``lengths`` (T,) are those of the steps where they differ, ``usual`` is the usual one, and
+    ``states`` (T, n) are the true states, where columns for them are named.
+    """
+
+    measurements: Array
+    inputs: Array | None
+    lengths: Array | None
+    usual: float | None
+    states: Array | None = None
+
+
+def read_record(
+    path: str, model: RecordModel, *, time: str | None = None, outputs: str | None = None,
+    inputs: str | None = None, truth: str | None = None, dt: float | None = None,
+    time_scale: float = 1.0, **table: Any,
+) -> RecordArrays:
+    """Read a record of a model; the options are those of ``qpmhe estimate``, and ``truth``."""
+    system, usual = model.estimator.system, model.dt if dt is None else dt
+    columns = ColumnNames(model.outputs, model.inputs, time, outputs, inputs)
+    found = _read(path, columns, system, usual, time_scale, table)
+    if truth is None:
+        return found
+    columns = ColumnNames(model.states, (), time, truth, option="truth")
+    return found._replace(states=_read(path, columns, system, usual, time_scale, table)[0])
+
+
+def _read(
+    path: str, columns: ColumnNames, system: System, usual: float | None, scale: float,
+    table: dict[str, Any],
+) -> RecordArrays:
+    reader, steps = RecordReader(path, columns, **table), Steps(system, usual=usual, scale=scale)
     ys: list[Array] = []
     us: list[Array] = []
     lengths: list[float | None] = []
@@ -40,6 +72,6 @@ def read_arrays(
         raise reader.error("it has a header and no samples; expected a line for each.", None)
     dt = None
     if any(each is not None for each in lengths):
-        usual = steps.usual or np.nan
-        dt = np.array([usual if each is None else each for each in [*lengths, None]])
-    return np.array(ys), np.array(us) if us[0].size else None, dt
+        typical = steps.usual or np.nan
+        dt = np.array([typical if each is None else each for each in [*lengths, None]])
+    return RecordArrays(np.array(ys), np.array(us) if us[0].size else None, dt, steps.usual)

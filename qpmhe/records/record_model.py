@@ -33,13 +33,15 @@ class RecordModel:
     scenario: Scenario | None = None
 
 
-def load_record_model(text: str, engine_at_work: str | None = None, **options: Any) -> RecordModel:
+def load_record_model(
+    model: str | ModelSource, engine_at_work: str | None = None, **options: Any
+) -> RecordModel:
     """Make the estimator of a model from its name; `options` replace the model's own.
 
     Among them are ``observer`` and ``cost``.
     ``engine="auto"`` takes the engine `engine_at_work` of an earlier run, if there is one.
     """
-    source = find(text)
+    source = model if isinstance(model, ModelSource) else find(model)
     name = source.name
     parts, given = model_parts(name, build(source))
     scenario = given.pop("scenario", None)

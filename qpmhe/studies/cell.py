@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import faulthandler
+import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, replace
-from functools import lru_cache
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from qpmhe_solvers import Backend, BackendError, backend, register
+from qpmhe_solvers import Backend, BackendError, Recording, backend, register
 
 from .._checks import Array
+from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
-from ..models import Example, Record
-from ..models.loading import ModelSource, load
+from ..models import Record
 from . import metrics
 from .environment import environment
+from .experiment import Source, experiment
 
 Result = dict[str, Any]
 
@@ -30,6 +32,8 @@ Result = dict[str, Any]
 ENGINE = "python"
 #: Backend of a cell that solves no QP.
 OBSERVER = "observer"
+# Failing QPs that are kept of one cell, at most.
+_KEPT = 20
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,8 @@ class Cell:
     """What distinguishes one run from all others of a study.
 
     ``backend`` is `OBSERVER` where no QP is solved; ``qps`` is None to converge, and
-    ``solver_iterations``, the cap inside each QP, None for the solver's default.
+    ``solver_iterations``, the cap inside each QP, None for the solver's default. ``noise_level``
+    multiplies the standard deviations of what is simulated.
     """
 
     model: str
@@ -48,15 +53,17 @@ class Cell:
     start: str
     seed: int
     steps: int
+    noise_level: float = 1.0
 
     @property
     def key(self) -> str:
         """A text that identifies the cell."""
         qps = "converged" if self.qps is None else self.qps
         cap = "none" if self.solver_iterations is None else self.solver_iterations
+        level = "" if self.noise_level == 1.0 else f"/noise={self.noise_level:g}"
         return (
             f"{self.model}/{self.backend}/i={qps}/cap={cap}/N={self.horizon}/{self.start}"
-            f"/T={self.steps}/seed={self.seed}"
+            f"/T={self.steps}{level}/seed={self.seed}"
         )
 
     @property
@@ -72,16 +79,18 @@ class Task:
     It gives up between two steps after ``timeout`` seconds. ``keep`` returns the trajectory,
     ``shared`` says that other cells run on the machine at the same time, ``registered`` is the
     backend for workers that do not know it, and ``isolated`` runs the solver in another process.
+    QPs on which the backend failed go to a folder in ``failing``.
     """
 
     cell: Cell
-    source: ModelSource
+    source: Source
     parts: frozenset[str]
     timeout: float
     keep: bool = False
     shared: bool = False
     registered: Backend | None = None
     isolated: bool = False
+    failing: Path | None = None
 
     @property
     def hard_limit(self) -> float:
@@ -131,18 +140,17 @@ def _fields(task: Task) -> Result:
 
 
 def _measured(task: Task, limit: float) -> Result:
-    cell, example = task.cell, load(task.source)
+    cell, found = task.cell, experiment(task.source)
     if task.registered is not None:
         _register(task.registered)
-    record = _record(task.source, cell.seed, cell.steps)
+    record = found.record(cell.seed, cell.steps, cell.noise_level)
     if "time" in task.parts:
         _warm_up(task, limit)
-    run = _run(_estimator(example, task), record, limit, "covariance" in task.parts)
-    scenario, residual = example.scenario, example.system.state_residual
-    settled = int(np.ceil(scenario.settling_time / scenario.dt - 1e-9))
+    run = _run(task, record, limit, covariances="covariance" in task.parts)
+    residual = found.system.state_residual
     row: Result = {
         **_fields(task), "outcome": "done", "reason": "", "environment": environment(),
-        **metrics.accuracy(run.states, record.states, settled, residual),
+        **metrics.accuracy(run.states, record.states, found.settled, residual),
         **metrics.outcomes(run),
     }
     if "time" in task.parts:
@@ -158,14 +166,29 @@ def _measured(task: Task, limit: float) -> Result:
         row["cost_ratio"] = metrics.cost_ratio(run.costs, reference)
     if task.keep:
         row["trajectory"] = {
-            "times": scenario.dt * np.arange(cell.steps + 1, dtype=np.float64),
+            "times": found.times(cell.steps),
             "states": record.states,
             "estimates": run.states if residual is None
             else residual.aligned(run.states, record.states),
-            "labels": list(scenario.labels), "title": scenario.title,
-            "time_unit": scenario.time_unit,
+            "labels": list(found.labels), "title": found.title, "time_unit": found.time_unit,
         }
+    if task.failing is not None and {"SOLVER_FAILED", "SOLVER_STOPPED"} & row["reasons"].keys():
+        try:
+            _keep_failing(task, task.failing, record, limit)
+        except (InvalidInputError, OutOfTimeError) as error:
+            row["reason"] = f"not all failing QPs were kept: {error}"
     return row
+
+
+def _keep_failing(task: Task, folder: Path, record: Record, limit: float) -> None:
+    """Run once more, as writing files takes time, and keep the QPs on which the backend failed."""
+    place = folder / re.sub(r"[^\w.=-]+", "-", task.cell.key)
+    with Recording(
+        place, task.cell.backend, limit=_KEPT, isolated=task.isolated
+    ) as recording:
+        _run(replace(task, isolated=False), record, limit, backend_name=recording.backend)
+    with suppress(OSError):
+        place.rmdir()  # where there was none
 
 
 def _register(entry: Backend) -> None:
@@ -175,31 +198,28 @@ def _register(entry: Backend) -> None:
         register(entry)
 
 
-def _estimator(example: Example, task: Task) -> MovingHorizonEstimator:
-    system, observer, cost, scenario = example
-    cell = task.cell
-    return MovingHorizonEstimator(
-        system, observer, cost,
-        horizon=cell.horizon, initial_state=scenario.initial_estimate,
-        backend="banded" if cell.backend == OBSERVER else cell.backend,
-        max_qps=cell.qps, max_solver_iterations=cell.solver_iterations,
-        warm_start=cell.start == "best",
-        isolated=task.isolated, engine=ENGINE,
-    )
-
-
 def _run(
-    mhe: MovingHorizonEstimator, record: Record, limit: float, covariances: bool = False
+    task: Task, record: Record, limit: float, *, covariances: bool = False, backend_name: str = ""
 ) -> Run:
+    cell, found = task.cell, experiment(task.source)
+    options = found.options | {
+        "horizon": cell.horizon, "max_qps": cell.qps, "warm_start": cell.start == "best",
+        "backend": backend_name or ("banded" if cell.backend == OBSERVER else cell.backend),
+        "max_solver_iterations": cell.solver_iterations, "isolated": task.isolated,
+        "engine": ENGINE,
+    }
+    mhe = MovingHorizonEstimator(*found.parts, **options)
     start, estimates, collected = mhe.state.copy(), [], []
-    inputs = [None] * len(record.measurements) if record.inputs is None else record.inputs
-    for y, u in zip(record.measurements, inputs, strict=True):
-        estimate: Estimate = mhe.update(y, u)
+    total = len(record.measurements)
+    inputs = [None] * total if record.inputs is None else record.inputs
+    lengths = [None] * total if found.lengths is None else found.lengths
+    for y, u, dt in zip(record.measurements, inputs, lengths, strict=False):
+        estimate: Estimate = mhe.update(y, u, dt=dt)
         estimates.append(estimate)
         if covariances:
             collected.append(_newest_covariance(mhe))
         if perf_counter() > limit:
-            raise OutOfTimeError(f"{len(estimates)} of {len(record.measurements)} steps were done.")
+            raise OutOfTimeError(f"{len(estimates)} of {total} steps were done.")
     return Run.of(start, estimates, np.array(collected) if covariances else None)
 
 
@@ -211,21 +231,16 @@ def _newest_covariance(mhe: MovingHorizonEstimator) -> Array:
     return value
 
 
-@lru_cache(maxsize=8)
-def _record(source: ModelSource, seed: int, steps: int) -> Record:
-    return load(source).scenario.simulate(seed, steps)
-
-
 _WARM: set[tuple[object, ...]] = set()
 
 
 def _warm_up(task: Task, limit: float) -> None:
     """Imports and first calls happen before the first measured run, as they belong to no step."""
-    cell, source = task.cell, task.source
-    key = (source, task.isolated, *cell.configuration)
+    cell = task.cell
+    key = (task.source, task.isolated, *cell.configuration)
     if key not in _WARM:
         steps = min(cell.steps, cell.horizon + 2)
-        _run(_estimator(load(source), task), _record(source, cell.seed, steps), limit)
+        _run(task, experiment(task.source).record(cell.seed, steps, cell.noise_level), limit)
         _WARM.add(key)
 
 
@@ -235,7 +250,7 @@ _REFERENCES: dict[tuple[object, ...], Array | None] = {}
 def _reference(task: Task, record: Record, limit: float) -> Array | None:
     """J of the converged solutions, which all cells on the same record share."""
     cell, source = task.cell, task.source
-    key = (source, cell.horizon, cell.start, cell.seed, cell.steps)
+    key = (source, cell.horizon, cell.start, cell.seed, cell.steps, cell.noise_level)
     if key not in _REFERENCES:
         if len(_REFERENCES) >= 8:
             del _REFERENCES[next(iter(_REFERENCES))]
@@ -244,5 +259,5 @@ def _reference(task: Task, record: Record, limit: float) -> Array | None:
             isolated=False,
         )
         _REFERENCES[key] = None  # where it runs out of time, it does so once
-        _REFERENCES[key] = _run(_estimator(load(source), converged), record, limit).costs
+        _REFERENCES[key] = _run(converged, record, limit).costs
     return _REFERENCES[key]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
 from importlib import metadata
@@ -32,6 +33,19 @@ def environment() -> dict[str, Any]:
         "host": platform.node(),
         "threads": os.environ.get("OMP_NUM_THREADS"),
     }
+
+
+def environment_words(found: dict[str, Any], names: Iterable[str] = ()) -> str:
+    """An environment in a line: versions of qpmhe, NumPy and these backends, and the machine."""
+    wanted = ["qpmhe", "numpy", *(
+        entry.distribution for entry in backends() if entry.name in set(names)
+    )]
+    versions = found.get("versions", {})
+    packages = [f"{name} {versions[name]}" for name in dict.fromkeys(wanted) if name in versions]
+    return (
+        f"{', '.join(packages)}; {found.get('cpu')}, {found.get('cores')} cores; "
+        f"Python {found.get('python')}, {found.get('os')}"
+    )
 
 
 def _versions(names: list[str]) -> dict[str, str]:

@@ -2,34 +2,43 @@
 
 In a TOML file the keys are the parameters of `Study`. TOML has no None: ``"none"`` stands for it
 in ``qps`` (iterate to convergence) and ``solver_iterations``, ``"default"`` in ``horizons``. Paths
-of models are relative to the file.
+of models and records are relative to the file.
 """
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from qpmhe_solvers import available, backend
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
 from .._checks import choice, count, dimension, flag, positive
-from ..errors import BackendError, InvalidInputError, OptionError
-from ..models.loading import ModelSource, find, load
+from ..errors import BackendError, InvalidInputError, ModelError, OptionError
+from ..models.loading import find
 from .cell import OBSERVER, Cell
+from .experiment import Source, experiment
+
+if TYPE_CHECKING:
+    from .store import Store
 
 Measure = Literal["both", "accuracy", "time"]
 #: Where the sequence of QPs begins: at the candidate, or warm-started where that is better.
 Start = Literal["candidate", "best"]
 #: What stands for None in files and on the command line.
 WORDS = {"qps": "none", "solver_iterations": "none", "horizons": "default"}
+#: How a record is read.
+READING = (
+    "time", "outputs", "inputs", "truth", "dt", "time_scale", "separator", "decimal", "encoding",
+    "missing", "skip_repeated", "skip_lines", "time_format",
+)
 
 
 class StudyError(OptionError):
@@ -39,7 +48,7 @@ class StudyError(OptionError):
 @report_unknown_options
 @dataclass(frozen=True)
 class Study:
-    """A grid of estimators, each run on records of many seeds.
+    """A grid of estimators, each run on simulated records of many seeds, or on measured ones.
 
     All run ``engine="python"``, which alone calls the backends.
 
@@ -52,18 +61,30 @@ class Study:
     models : sequence of str
         Names of the catalogue, with arguments where wanted (``chain_of_masses(masses=2)``), or
         functions that return system, observer, cost and scenario: ``package.module:function`` or
-        ``path/file.py:function``.
+        ``path/file.py:function``. With ``records``, a dict of options may stand in for the
+        scenario, as for ``qpmhe estimate``.
+    records : sequence of str or Path
+        Measured records, CSV or Parquet files, to run each model on; seeds and noise levels do
+        not apply. J and J / converged J judge the configurations, and errors where true states
+        are known.
+    reading : mapping
+        How records are read: ``time``, ``outputs``, ``inputs``, ``truth`` (columns), ``dt``,
+        ``time_scale``, ``separator``, ``decimal``, ``encoding``, ``missing``, ``skip_repeated``,
+        ``skip_lines`` and ``time_format``, as the options of ``qpmhe estimate``.
     backends : sequence of str, optional
         QP backends; by default all that are installed, without the forms ``qpsolvers:...``.
     qps, solver_iterations, horizons : sequence of int or None
         QPs per sample, the paper's i (0 is the observer; None iterates to convergence); caps on
         the solver's iterations in each QP (None: its default); N (None: the scenario's).
+    noise_levels : sequence of float
+        Factors on the standard deviations of the simulated disturbance and noise; the weights of
+        the estimators stay those of the model.
     starts : sequence of {"candidate", "best"}
         Where the sequences of QPs start.
     seeds : int or sequence of int
         Seeds of the records; a number k stands for 0, ..., k-1.
     steps : int, optional
-        Samples of a record; the scenario's by default.
+        Samples of a record; the scenario's by default, or all that were measured.
     measure : {"both", "accuracy", "time"}
         What is recorded. With "time" one cell runs at a time, unless you ask for more jobs.
     deadline : float, optional
@@ -73,7 +94,7 @@ class Study:
     cell_timeout : float
         Seconds for one cell.
     folder : str or Path, optional
-        The paths of models are relative to it; by default to the working directory.
+        The paths of models and records are relative to it; by default to the working directory.
 
     Raises
     ------
@@ -89,10 +110,13 @@ class Study:
     """
 
     models: Sequence[str] = ("batch_reactor",)
+    records: Sequence[str | Path] = ()
+    reading: Mapping[str, Any] = field(default_factory=dict)
     backends: Sequence[str] | None = None
     qps: Sequence[int | None] = (0, 1, 2, 5, None)
     solver_iterations: Sequence[int | None] = (1, 2, 5, 10, None)
     horizons: Sequence[int | None] = (None,)
+    noise_levels: Sequence[float] = (1.0,)
     starts: Sequence[str] = ("candidate",)
     seeds: int | Sequence[int] = 20
     steps: int | None = None
@@ -101,7 +125,7 @@ class Study:
     covariances: bool = False
     cell_timeout: float = 60.0
     folder: str | Path | None = field(default=None, repr=False, compare=False)
-    sources: tuple[ModelSource, ...] = field(init=False, repr=False, compare=False)
+    sources: tuple[Source, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name, check in _CHECKS.items():
@@ -111,11 +135,20 @@ class Study:
                 f"folder is {shown(self.folder)}; expected the name of a folder, or None."
             )
         folder = None if self.folder is None else Path(self.folder)
-        sources = _distinct(find(text, folder) for text in self.models)
+        models = _distinct(find(text, folder) for text in self.models)
+        if self.records and self.noise_levels != (1.0,):
+            raise StudyError(
+                f"noise_levels is {list(self.noise_levels)}, but the noise of measured records is "
+                "what it is; leave noise_levels or records out."
+            )
+        sources = tuple(Source(model) for model in models) if not self.records else tuple(
+            Source.measured(model, str(record), self.reading, folder)
+            for model, record in product(models, self.records)
+        )
         for source in sources:
-            load(source)
+            experiment(source)
         object.__setattr__(self, "sources", sources)
-        object.__setattr__(self, "models", tuple(source.name for source in sources))
+        object.__setattr__(self, "models", tuple(model.name for model in models))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Study:
@@ -147,11 +180,14 @@ class Study:
                 "what is left out has its default."
             )
         options = {key: _translated(key, value) for key, value in found.items()}
+        data = {key: value for key, value in options.items() if key in _DATA}
         for key, value in options.items():  # one by one, so that the error names the line
             try:
-                cls(**{key: value}, folder=path.parent)
+                cls(**(data if key in _DATA else {key: value}), folder=path.parent)
             except InvalidInputError as error:
                 words = str(error)
+                if key in _DATA and data.keys() & {"records"} and not isinstance(error, ModelError):
+                    key = next((one for one in data if words.startswith(one)), "records")
                 if key in WORDS:
                     words = words.replace(" None ", f' "{WORDS[key]}" ')
                 raise StudyError(f"{_place(path, text, key)}: {words}") from error
@@ -167,14 +203,16 @@ class Study:
         assert self.backends is not None
         assert not isinstance(self.seeds, int)
         made: dict[Cell, None] = {}
-        scenarios = {source: load(source).scenario for source in self.sources}
-        for seed, source, horizon, start in product(
-            self.seeds, self.sources, self.horizons, self.starts
+        found = {source: experiment(source) for source in self.sources}
+        for seed, source, level, horizon, start in product(
+            (0,) if self.records else self.seeds, self.sources, self.noise_levels, self.horizons,
+            self.starts,
         ):
-            scenario = scenarios[source]
+            usual = found[source]
+            steps = usual.steps if self.steps is None else self.steps
             place = (
-                scenario.horizon if horizon is None else horizon, start, seed,
-                scenario.steps if self.steps is None else self.steps,
+                usual.horizon if horizon is None else horizon, start, seed,
+                min(steps, usual.steps) if self.records else steps, level,
             )
             for name, qps, cap in product(self.backends, self.qps, self.solver_iterations):
                 if qps == 0:
@@ -185,6 +223,27 @@ class Study:
                     cell = Cell(source.name, name, qps, own, *place)
                 made[cell] = None
         return tuple(made)
+
+    def to_latex(self, store: Store | str | Path) -> str:
+        r"""The results of this study as LaTeX tables, one a model and horizon.
+
+        Numbers are means ± standard errors of the means over the seeds,
+        :math:`s / \sqrt n`, rounded to two digits of the error. Comments above each table say so,
+        and name machine and versions. The tables need the package booktabs.
+
+        Parameters
+        ----------
+        store : Store, str or Path
+            What holds the results.
+
+        Raises
+        ------
+        StoreError, InvalidInputError
+            If it cannot be read, or has none of this study.
+        """
+        from .export import tables
+
+        return tables(store, {cell.key for cell in self.cells()})
 
 
 def _place(path: Path, text: str, key: str) -> str:
@@ -251,6 +310,32 @@ def _numbers(name: str, least: int, nothing: str) -> Callable[[Any], tuple[int |
     return check
 
 
+def _records(value: Any) -> tuple[str, ...]:
+    names = value if isinstance(value, (list, tuple)) else [value]
+    for name in names:
+        if not isinstance(name, (str, Path)):
+            raise StudyError(f"records has {shown(name)}; expected the name of a file.")
+    return _distinct(str(name) for name in names)
+
+
+def _reading(value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise StudyError(f"reading is {shown(value)}; expected a table of options.")
+    for name in value:
+        if name not in READING:
+            near = get_close_matches(str(name), READING, 1)
+            raise StudyError(
+                f"reading has the key {shown(name)}; expected some of {', '.join(READING)}."
+                f"{f' Did you mean {near[0]}?' if near else ''}"
+            )
+    return dict(value)
+
+
+def _levels(value: Any) -> tuple[float, ...]:
+    items = _several("noise_levels", value, "give at least one number")
+    return _distinct(positive("noise_levels", item) for item in items)
+
+
 def _starts(value: Any) -> tuple[str, ...]:
     items = _several("starts", value, "expected 'candidate' or 'best'")
     return _distinct(choice("starts", item, get_args(Start)) for item in items)
@@ -263,13 +348,18 @@ def _seeds(value: Any) -> tuple[int, ...]:
     return _distinct(count("seeds", item, 0) for item in items)
 
 
+# A record can be read only with its model, and a model may need a record.
+_DATA = ("models", "records", "reading")
 # The check of each option, in order; each returns the value in its standard form.
 _CHECKS: dict[str, Callable[[Any], Any]] = {
     "models": _models,
+    "records": _records,
+    "reading": _reading,
     "backends": _backends,
     "qps": _numbers("qps", 0, " None iterates to convergence."),
     "solver_iterations": _numbers("solver_iterations", 1, " None leaves the solver's default."),
     "horizons": _numbers("horizons", 1, " None takes the model's."),
+    "noise_levels": _levels,
     "starts": _starts,
     "seeds": _seeds,
     "steps": lambda value: None if value is None else dimension("steps", value, 1),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .._checks import Array
 from ..estimation.estimate import Status
@@ -31,18 +32,19 @@ def accuracy(
         s_j^2 = \frac1{T+1} \sum_{t=0}^T (x_j(t) - \hat x_j(0))^2
 
     with the scales of `scales`: 1 is the error of keeping the initial estimate for ever. NaN
-    where no time counts as settled. Differences are those of the system's state residual.
+    where no time counts as settled. Differences are those of the system's state residual. Where
+    the true state is unknown, NaN, there is no error.
     """
+    known = np.isfinite(states)
     with np.errstate(all="ignore"):
         sizes = scales(states, estimates[0], residual)
-        errors = difference(residual, estimates, states)
-        squares = errors**2
-        late, relative = squares[settled:], (errors / sizes) ** 2
+        squares = difference(residual, estimates, states) ** 2
+        relative = squares / sizes**2
         return {
-            "rmse": _root(relative),
-            "rmse_settled": _root(relative[settled:]),
-            "rmse_states": [_root(column) for column in squares.T],
-            "rmse_settled_states": [_root(column) for column in late.T],
+            "rmse": _root(relative, known),
+            "rmse_settled": _root(relative[settled:], known[settled:]),
+            "rmse_states": [*map(_root, squares.T, known.T)],
+            "rmse_settled_states": [*map(_root, squares[settled:].T, known[settled:].T)],
         }
 
 
@@ -52,14 +54,17 @@ def scales(states: Array, initial_estimate: Array, residual: Residual | None = N
     A state that never leaves its initial estimate has its own size as scale, and one that is
     always zero has its unit.
     """
-    distance = np.sqrt((difference(residual, states, initial_estimate) ** 2).mean(axis=0))
-    size = np.abs(states).max(axis=0)
+    known = np.isfinite(states)
+    squares = difference(residual, states, initial_estimate) ** 2
+    with np.errstate(invalid="ignore"):
+        distance = np.sqrt(squares.sum(axis=0, where=known) / known.sum(axis=0))
+    size = np.abs(states).max(axis=0, initial=0.0, where=known)
     found: Array = np.where(distance > 0.0, distance, np.where(size > 0.0, size, 1.0))
     return found
 
 
-def _root(squares: Array) -> float:
-    return float(np.sqrt(squares.mean())) if squares.size else float("nan")
+def _root(squares: Array, known: NDArray[np.bool_]) -> float:
+    return float(np.sqrt(squares[known].mean())) if known.any() else float("nan")
 
 
 def consistency(
@@ -98,11 +103,12 @@ def cost_ratio(costs: Array, reference: Array | None) -> float:
 
 
 def outcomes(run: Run) -> dict[str, Any]:
-    """How the steps ended, and how many QPs and iterations they used.
+    """How the steps ended, what they cost, and how many QPs and iterations they used.
 
-    Shares of steps: ``improved``; ``kept``, where the candidate is the estimate and nothing
-    failed; ``fallback``, where it is because something failed or no iterate lowered the cost;
-    ``cap_hits``, where a QP ended at its cap or unconfirmed. Further ``reasons``, the number of
+    ``cost`` is the mean of the true cost J where it is finite. Shares of steps: ``improved``;
+    ``kept``, where the candidate is the estimate and nothing failed; ``fallback``, where it is
+    because something failed or no iterate lowered the cost; ``cap_hits``, where a QP ended at its
+    cap or unconfirmed. Further ``reasons``, the number of
     steps of each flag of `qpmhe.Status`, and the means ``qps_mean`` and
     ``solver_iterations_mean`` per step, NaN where the solver does not report them.
     """
@@ -111,7 +117,9 @@ def outcomes(run: Run) -> dict[str, Any]:
     failed = ~improved & ((flags & _FAILURES.value) != 0)
     counts = {str(flag.name): int(((flags & flag.value) != 0).sum()) for flag in Status}
     known = run.solver_iterations[run.solver_iterations >= 0]
+    costs = run.costs[np.isfinite(run.costs)]
     return {
+        "cost": float(costs.mean()) if costs.size else float("nan"),
         "improved": float(improved.sum() / total),
         "kept": float((~improved & ~failed).sum() / total),
         "fallback": float(failed.sum() / total),

@@ -23,7 +23,9 @@ from ..models import Example
 from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
 from ..plots import save, trajectories
+from ..plots.style import inches_of
 from .cell import ENGINE
+from .environment import environment, environment_words
 from .ipopt import IpoptEstimator
 from .metrics import accuracy, timing
 from .summary import student
@@ -146,6 +148,7 @@ def reproduce(
     backend_name: str = "auto",
     ipopt: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    width: str | float | None = None,
 ) -> Reproduction:
     """Reproduce the paper's figure, and compare every installed backend on the same record.
 
@@ -164,6 +167,8 @@ def reproduce(
         Whether to run CasADi with Ipopt, the paper's tool, as well.
     progress : callable, optional
         Called with the numbers of finished and of all steps.
+    width : {"single", "double"} or float, optional
+        For a paper: the figure is a PDF file, too, of this width; see `qpmhe.plots.save`.
 
     Returns
     -------
@@ -176,6 +181,7 @@ def reproduce(
         If the backend or CasADi is missing, or the folder cannot be made.
     """
     count("seeds", seeds, 1)
+    inches_of(width)
     create(backend_name)  # before any work: a wrong name must not cost a minute
     folder = None if out is None else make_folder(out)
     study = PaperStudy(seed, steps, method)
@@ -216,7 +222,7 @@ def reproduce(
         converged.mean_cost,
     )
     if folder is not None:
-        found.files.extend(_write(found, records[0], folder))
+        found.files.extend(_write(found, records[0], folder, width))
     return found
 
 
@@ -264,14 +270,16 @@ def _stopped(run: Run) -> str:
     return ", ".join(f"{word} {count / total:.0%}" for word, count in order if count)
 
 
-def _write(found: Reproduction, record: Record, folder: Path) -> list[Path]:
+def _write(
+    found: Reproduction, record: Record, folder: Path, width: str | float | None
+) -> list[Path]:
     scenario = found.study.model.scenario
     times = scenario.dt * np.arange(found.study.steps + 1, dtype=np.float64)
     axes = trajectories(
         times, record.states, {row.label: row.states for row in found.rows if row.label in _DRAWN},
         scenario.labels, f"time t ({scenario.time_unit})",
     )
-    paths = save(axes[0].figure, folder / "reproduce")
+    paths = save(axes[0].figure, folder / "reproduce", width=width)
     columns = {"t": times, **_by_state("real", record.states)}
     columns["y"] = np.append(record.measurements[:, 0], np.nan)
     for row in found.rows:
@@ -291,6 +299,10 @@ def _write(found: Reproduction, record: Record, folder: Path) -> list[Path]:
                row.stopped] for row in found.backends),
         ],
     }
+    machine = environment_words(environment(), available())
+    for lines in list(tables.values())[1:]:
+        for line in lines:
+            line.append("environment" if line is lines[0] else machine)
     for name, lines in tables.items():
         paths.append(folder / f"{name}.csv")
         with paths[-1].open("w", newline="") as file:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from qpmhe_solvers import backend
 from qpmhe_solvers.values import shown
 
-from .._checks import dimension, flag, need
+from .._checks import dimension, flag, make_folder, need
 from ..errors import OptionError
 from .cell import ENGINE, OBSERVER, Result, Task, compute, failure
 from .environment import environment, revision
@@ -46,6 +46,7 @@ _SIGNALS = re.compile(r"exit codes of the workers are \{(.*?)\}")
 def run(
     study: Study, store: Store | str | Path, *, jobs: int | None = None,
     scheduler: str | None = None, progress: bool | Console = True, retry_failed: bool = False,
+    keep_failing: str | Path | None = None,
 ) -> Store:
     """Run the cells of a study that the store does not have, and store each as it ends.
 
@@ -69,6 +70,9 @@ def run(
         Whether (and where) to show a progress bar; on the standard error stream by default.
     retry_failed : bool
         Whether cells that failed before run again.
+    keep_failing : str or Path, optional
+        Folder for QPs on which a backend failed, as `qpmhe.solvers.Recording` keeps them, at most
+        20 in a folder for each cell that runs. Such a cell runs twice: writing takes time.
 
     Returns
     -------
@@ -93,6 +97,7 @@ def run(
         raise OptionError(
             f"progress is {shown(progress)}; expected True, False or a rich.console.Console."
         )
+    failing = None if keep_failing is None else make_folder(keep_failing).resolve()
     target = store if isinstance(store, Store) else Store(store)
     alone = study.measure == "time"  # other cells would share the cores
     made = (
@@ -106,7 +111,7 @@ def run(
             },
             {source.name: source.fingerprint for source in study.sources},
         )
-        tasks, found = _tasks(study, writer.present(retry_failed), workers.jobs > 1)
+        tasks, found = _tasks(study, writer.present(retry_failed), workers.jobs > 1, failing)
         git = revision()
         with _shown(progress, len(tasks), found) as advance:
             for result in _results(workers, tasks):
@@ -304,7 +309,7 @@ def _again(workers: _Processes | _Cluster, task: Task) -> Result:
 
 
 def _tasks(
-    study: Study, present: dict[str, frozenset[str]], shared: bool
+    study: Study, present: dict[str, frozenset[str]], shared: bool, failing: Path | None
 ) -> tuple[list[Task], int]:
     """What is missing, and how many cells are there already."""
     parts = {"both": {"accuracy", "time"}, "accuracy": {"accuracy"}, "time": {"time"}}
@@ -322,7 +327,7 @@ def _tasks(
         tasks.append(
             Task(
                 cell, sources[cell.model], wanted | known, study.cell_timeout,
-                keep=first, shared=shared, registered=registered,
+                keep=first, shared=shared, registered=registered, failing=failing,
             )
         )
     return tasks, found

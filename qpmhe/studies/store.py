@@ -14,13 +14,13 @@ from urllib.parse import quote
 import numpy as np
 
 from .._checks import checked_path, need
-from ..errors import InvalidInputError, OptionError, QpmheError
+from ..errors import QpmheError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 #: Version of the tables, and of what their columns mean.
-SCHEMA = 3
+SCHEMA = 4
 # Distinguishes our files from other SQLite files: "qpmh".
 _APPLICATION = 0x71706D68
 # Seconds to wait for another program's lock.
@@ -30,13 +30,13 @@ _PATIENCE = 10.0
 COLUMNS = {
     "key": "TEXT PRIMARY KEY", "model": "TEXT", "backend": "TEXT", "qps": "INTEGER",
     "solver_iterations": "INTEGER", "horizon": "INTEGER", "start": "TEXT", "seed": "INTEGER",
-    "steps": "INTEGER", "outcome": "TEXT", "reason": "TEXT", "rmse": "REAL",
+    "steps": "INTEGER", "noise_level": "REAL", "outcome": "TEXT", "reason": "TEXT", "rmse": "REAL",
     "rmse_settled": "REAL", "rmse_states": "TEXT", "rmse_settled_states": "TEXT",
-    "nees": "REAL", "cost_ratio": "REAL", "improved": "REAL", "kept": "REAL", "fallback": "REAL",
-    "reasons": "TEXT", "cap_hits": "REAL", "qps_mean": "REAL", "solver_iterations_mean": "REAL",
-    "time_median": "REAL", "time_p95": "REAL", "time_p99": "REAL", "time_max": "REAL",
-    "times": "BLOB", "shared": "INTEGER", "environment": "INTEGER", "finished": "TEXT",
-    "parts": "TEXT",
+    "nees": "REAL", "cost": "REAL", "cost_ratio": "REAL", "improved": "REAL", "kept": "REAL",
+    "fallback": "REAL", "reasons": "TEXT", "cap_hits": "REAL", "qps_mean": "REAL",
+    "solver_iterations_mean": "REAL", "time_median": "REAL", "time_p95": "REAL",
+    "time_p99": "REAL", "time_max": "REAL", "times": "BLOB", "shared": "INTEGER",
+    "environment": "INTEGER", "finished": "TEXT", "parts": "TEXT",
 }
 _JSON = ("rmse_states", "rmse_settled_states", "reasons")
 _ARRAYS = ("times", "states", "estimates")
@@ -100,10 +100,10 @@ class Store:
         Its columns are
 
         - key, model, backend, qps (NA: to convergence), solver_iterations (NA: no cap), horizon,
-          start, seed, steps: the cell;
+          start, seed, steps, noise_level: the cell;
         - outcome ("done", "failed") and reason;
-        - rmse, rmse_settled, rmse_states, rmse_settled_states, nees, cost_ratio, improved, kept,
-          fallback, reasons, cap_hits, qps_mean, solver_iterations_mean: see
+        - rmse, rmse_settled, rmse_states, rmse_settled_states, nees, cost, cost_ratio, improved,
+          kept, fallback, reasons, cap_hits, qps_mean, solver_iterations_mean: see
           `qpmhe.studies.metrics`;
         - time_median, time_p95, time_p99, time_max [s], late (share of steps over the last study's
           deadline), times (seconds of each step, None where not measured), shared (whether other
@@ -235,37 +235,6 @@ class Writer:
                     "INSERT OR REPLACE INTO trajectories VALUES (?, ?)",
                     (row["key"], json.dumps(content)),
                 )
-
-
-def export(store: Store | str | Path, path: str | Path) -> Path:
-    """Write all cells of a store into the file ``path``, ``.csv`` or ``.parquet``, and return it.
-
-    In CSV, lists and ``reasons`` are JSON texts; in Parquet, only ``reasons`` is. An existing file
-    is replaced. Raises `OptionError` if the name ends differently, `StoreError` if the store
-    cannot be read, `InvalidInputError` if the file cannot be written or a package is missing.
-    """
-    target = checked_path("the file", path)
-    if target.suffix not in (".csv", ".parquet"):
-        raise OptionError(f"the file is {str(path)!r}; expected a name in .csv or .parquet.")
-    frame = (store if isinstance(store, Store) else Store(store)).frame()
-    lists = ("rmse_states", "rmse_settled_states", "times") if target.suffix == ".csv" else ()
-    for name in ("reasons", *lists):
-        frame[name] = frame[name].map(_text)
-    try:
-        if target.suffix == ".csv":
-            frame.to_csv(target, index=False)
-        else:
-            need("pyarrow", "a Parquet file")
-            frame.to_parquet(target, engine="pyarrow", index=False)
-    except OSError as error:
-        raise InvalidInputError(f"cannot write {target}: {error.strerror or error}.") from error
-    return target
-
-
-def _text(value: Any) -> str | None:
-    if value is None or isinstance(value, float):  # pandas may put NaN for None
-        return None
-    return json.dumps(value if isinstance(value, (list, dict)) else value.tolist())
 
 
 def _environment(connection: sqlite3.Connection, settings: dict[str, Any]) -> int:

@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 #: What distinguishes configurations.
 CONFIGURATION = (
-    "model", "backend", "qps", "solver_iterations", "horizon", "start", "steps",
+    "model", "backend", "qps", "solver_iterations", "horizon", "start", "steps", "noise_level",
 )
 #: What configurations must share to be compared with each other.
-PROBLEM = ("model", "horizon", "steps")
+PROBLEM = ("model", "noise_level", "horizon", "steps")
 #: Columns that are averaged over seeds.
 METRICS = (
-    "rmse", "rmse_settled", "nees", "cost_ratio", "improved", "kept", "fallback", "failed_steps",
-    "cap_hits", "qps_mean", "solver_iterations_mean", "time_median", "time_p95", "time_p99",
-    "time_max", "late", "rmse_excess",
+    "rmse", "rmse_settled", "nees", "cost", "cost_ratio", "improved", "kept", "fallback",
+    "failed_steps", "cap_hits", "qps_mean", "solver_iterations_mean", "time_median", "time_p95",
+    "time_p99", "time_max", "late", "rmse_excess",
 )
 _SHARES = ("improved", "kept", "fallback", "failed_steps", "cap_hits", "late")
 _POSITIVE = tuple(name for name in METRICS if name != "rmse_excess")
@@ -39,6 +39,14 @@ _FAILED = ("SOLVER_FAILED", "MODEL_FAILED")
 _CONFIDENCE = 0.95
 #: RMSEs that agree within this part are equally accurate.
 TOLERANCE = 1e-3
+#: By what configurations are ranked: the first that is known.
+RANKED_BY = {"rmse": "RMSE", "cost_ratio": "J / converged J", "cost": "mean J"}
+
+
+def measure(rows: DataFrame) -> str:
+    """The column by which rows of a summary are ranked; without true states, a cost."""
+    known = (name for name in RANKED_BY if np.isfinite(rows[name].astype(float)).any())
+    return next(known, "rmse")
 
 
 def summarise(frame: DataFrame) -> DataFrame:
@@ -70,8 +78,8 @@ def summarise(frame: DataFrame) -> DataFrame:
           ``_low`` and ``_high``;
         - ``reasons``: dict, share of the steps with each flag of `qpmhe.Status`;
         - ``pareto``: whether no configuration of the same problem is faster (``time_median``)
-          and more accurate (``rmse``, by more than `TOLERANCE`). Only configurations without
-          failed cells take part.
+          and more accurate (``rmse``, by more than `TOLERANCE`; without true states,
+          ``cost_ratio``). Only configurations without failed cells take part.
 
     Raises
     ------
@@ -116,7 +124,7 @@ def summarise(frame: DataFrame) -> DataFrame:
     for _, rows in summary.groupby(list(PROBLEM), dropna=False):
         whole = rows[rows["failures"] == 0]
         summary.loc[whole.index, "pareto"] = pareto_front(
-            whole["time_median"], whole["rmse"], TOLERANCE
+            whole["time_median"], whole[measure(rows)], TOLERANCE
         )
     return summary
 

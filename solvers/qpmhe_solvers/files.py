@@ -159,11 +159,11 @@ def load(path: str | os.PathLike[str]) -> StoredQP:
 
 
 def qp_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The files that are meant by files and folders."""
+    """The files that are meant by files, and by folders with those inside them."""
     found: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():
-            within = sorted(path.glob("*.npz"))
+            within = sorted(path.rglob("*.npz"))
             if not within:
                 raise InvalidInputError(
                     f"the folder {path} holds no .npz file; expected files of "

@@ -15,13 +15,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from .backend import make_solver
 from .errors import InvalidInputError, OptionError
 from .files import dump
 from .options import SolverOptions
 from .qp import QP, Array
 from .registry import backend as registered_backend
-from .registry import backends, register, unregister
+from .registry import backends, create, register, unregister
 from .solution import Solution, SolveStatus
 from .solver import ContainedSolver, Solver
 
@@ -62,6 +61,8 @@ class Recording:
         backend that handles them.
     limit : int
         Most files to write, at least 1.
+    isolated : bool
+        As in `create`: a QP that ends the solver's process is then kept as one that failed.
 
     Attributes
     ----------
@@ -87,6 +88,7 @@ class Recording:
         *,
         only: Which = "suspicious",
         limit: int = 100,
+        isolated: bool = False,
     ) -> None:
         self._backend = registered_backend(backend)
         if only not in get_args(Which):
@@ -94,7 +96,7 @@ class Recording:
             raise OptionError(f"only is {only!r}; expected one of {known}.")
         if isinstance(limit, bool) or not isinstance(limit, (int, np.integer)) or limit < 1:
             raise OptionError(f"limit is {limit!r}; expected an integer >= 1.")
-        self._only, self._limit = only, int(limit)
+        self._only, self._limit, self._isolated = only, int(limit), isolated
         self._folder = _writable(Path(folder))
         self._offset = _last_number(self._folder)
         self.files: list[Path] = []
@@ -156,7 +158,7 @@ class Recording:
         )
 
     def _make(self, options: SolverOptions) -> Solver:
-        return _Recorder(make_solver(self._backend, options), self)
+        return _Recorder(create(self._backend.name, options, isolated=self._isolated), self)
 
     def _take(
         self, qp: QP, start: Array | None, solution: Solution, options: SolverOptions

@@ -8,15 +8,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..summary import PROBLEM, TOLERANCE
+from ..summary import PROBLEM, RANKED_BY, TOLERANCE, measure
 from .words import configuration_words, listed, missing, number, percent, seconds
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: "Within 1 % of the best RMSE".
+#: "Within 1 % of the best".
 NEAR = 0.01
 _FEW_SEEDS = 10
+_RMSE = (
+    "An RMSE has no unit: each state's is divided by the state's root mean square distance from "
+    "its initial estimate over the record, and the states' mean square is taken. So 1 is the error "
+    "of keeping the initial estimate for ever. The first figure's menu and the table give the RMSE "
+    "of each state in its unit."
+)
+_NO_TRUTH = (
+    "The true states are not known, so J ranks the configurations, relative to the converged J of "
+    "the same window. A lower J is not always a smaller error."
+)
 _MOST_NAMED = 6
 
 
@@ -40,10 +50,19 @@ class Case:
     summary: DataFrame
 
     @property
+    def by(self) -> str:
+        """The column by which they are ranked."""
+        return measure(self.summary)
+
+    @property
+    def ranked_by(self) -> str:
+        """The words for that column."""
+        return RANKED_BY[self.by]
+
+    @property
     def whole(self) -> DataFrame:
-        """The configurations of which no cell failed and whose RMSE is finite."""
-        rows = self.summary
-        return rows[(rows["failures"] == 0) & np.isfinite(rows["rmse"].astype(float))]
+        """The configurations of which no cell failed, and whose rank is known."""
+        return _whole(self.summary)
 
     def answers(self) -> list[Answer]:
         """Fastest near the best, most accurate, the observer alone, what is worse, what failed."""
@@ -54,9 +73,9 @@ class Case:
         found = []
         if fastest is not None:
             found.append(Answer(
-                f"Fastest within {percent(NEAR)} of the best RMSE",
+                f"Fastest within {percent(NEAR)} of the best {self.ranked_by}",
                 f"{configuration_words(fastest)}: {seconds(fastest['time_median'])} per step "
-                f"(median), RMSE {_limited(fastest, 'rmse')}.",
+                f"(median), {self._value(fastest)}.",
             ))
         else:
             found.append(Answer("Fastest", "The study has no times: it measured accuracy only."))
@@ -70,24 +89,27 @@ class Case:
         rows = self.summary[self.summary["pareto"]].sort_values("time_median")
         return [
             f"{configuration_words(row)} ({seconds(row['time_median'])}, "
-            f"RMSE {number(row['rmse'])})"
+            f"{self.ranked_by} {number(row[self.by])})"
             for _, row in rows.iterrows()
         ]
+
+    def _value(self, row: Any) -> str:
+        return f"{self.ranked_by} {_limited(row, self.by)}"
 
     def _accurate(self, accurate: Any, fastest: Any) -> str:
         same = fastest is not None and fastest.name == accurate.name
         text = (
             "The same one" if same
-            else f"{configuration_words(accurate)}: RMSE {_limited(accurate, 'rmse')}"
+            else f"{configuration_words(accurate)}: {self._value(accurate)}"
             + ("" if fastest is None else f", {seconds(accurate['time_median'])} per step")
         )
         rest = self.whole.drop(accurate.name)
-        equal = int((rest["rmse"] <= self.whole["rmse"].min() * (1 + TOLERANCE)).sum())
+        equal = int((rest[self.by] <= self.whole[self.by].min() * (1 + TOLERANCE)).sum())
         apart = int((
             (rest["rmse_excess_low"] > 0) & (rest["rmse_excess"] > TOLERANCE)
         ).sum())
         reach = "other reaches" if equal == 1 else "others reach"
-        text += f". {equal} {reach} the same RMSE within {percent(TOLERANCE)}"
+        text += f". {equal} {reach} the same {self.ranked_by} within {percent(TOLERANCE)}"
         if rest["rmse_excess_low"].notna().any():
             text += (
                 f"; {apart} of {len(rest)} are worse by more than chance (95 %, paired by seed)"
@@ -99,11 +121,9 @@ class Case:
         if rows.empty or other["backend"] == "observer":
             return None
         observer = rows.iloc[0]
-        ratio = observer["rmse"] / other["rmse"]
-        text = (
-            f"RMSE {_limited(observer, 'rmse')}, {number(ratio)} times the RMSE of "
-            f"{configuration_words(other)}"
-        )
+        ratio = observer[self.by] / other[self.by] if other[self.by] > 0.0 else np.inf
+        words = configuration_words(other)
+        text = f"{self._value(observer)}, {number(ratio)} times that of {words}"
         if np.isfinite(observer["time_median"]):
             share = observer["time_median"] / other["time_median"]
             text += (
@@ -117,7 +137,7 @@ class Case:
         rows = self.summary[
             (self.summary["backend"] != "observer") & (self.summary["failures"] == 0)
         ]
-        if observers.empty or rows.empty:
+        if observers.empty or rows.empty or self.by != "rmse":
             return None
         question, alone = "Worse than no QP", observers.iloc[0]
         found = []
@@ -174,36 +194,48 @@ def cases(summary: DataFrame) -> list[Case]:
     """The summary, divided by problem, in its order."""
     found: list[Case] = []
     several = {name: summary[name].nunique(dropna=False) > 1 for name in PROBLEM}
-    for place, ((model, horizon, steps), rows) in enumerate(
+    for place, ((model, level, horizon, steps), rows) in enumerate(
         summary.groupby(list(PROBLEM), dropna=False, sort=False)
     ):
         title = f"{model}, " + ("usual N" if missing(horizon) else f"N = {int(horizon)}")
         if several["steps"]:
             title += f", T = {int(steps)}"
-        safe = re.sub(r"[\W_]+", "-", title).strip("-")
-        key = safe if safe not in {case.key for case in found} else f"{safe}-{place}"
+        if several["noise_level"]:
+            title += f", noise x {level:g}"
+        name = file_name(title)
+        key = name if name not in {case.key for case in found} else f"{name}-{place}"
         found.append(Case(key, title, rows))
     return found
 
 
+def file_name(title: str) -> str:
+    """A title as the name of files and links."""
+    return re.sub(r"[\W_]+", "-", title).strip("-")
+
+
 def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
-    """The fastest configuration near the best RMSE, and the most accurate, of equals the fastest.
+    """The fastest configuration near the best, and the most accurate, of equals the fastest.
 
     The first is None where there are no times; all is None where no configuration finished all
     its runs.
     """
-    rows = summary[(summary["failures"] == 0) & np.isfinite(summary["rmse"].astype(float))]
+    rows, by = _whole(summary), measure(summary)
     if rows.empty:
         return None
-    least = rows["rmse"].min()
+    least = rows[by].min()
     timed = rows[rows["time_median"].notna()]
 
     def first(part: float) -> Any:
-        near = timed[timed["rmse"] <= least * (1 + part)]
+        near = timed[timed[by] <= least * (1 + part)]
         return None if near.empty else near.loc[near["time_median"].idxmin()]
 
     accurate = first(TOLERANCE)
-    return first(NEAR), rows.loc[rows["rmse"].idxmin()] if accurate is None else accurate
+    return first(NEAR), rows.loc[rows[by].idxmin()] if accurate is None else accurate
+
+
+def _whole(rows: DataFrame) -> DataFrame:
+    ranks = rows[measure(rows)].astype(float)
+    return rows[(rows["failures"] == 0) & np.isfinite(ranks)]
 
 
 def failures(frame: DataFrame) -> list[dict[str, Any]]:
@@ -226,14 +258,14 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
     notes = [
         "A time covers a whole update: the observer's step, building the QPs, the solver, and the "
         "verdict on its iterate.",
-        "An RMSE has no unit: each state's is divided by the state's root mean square distance "
-        "from its initial estimate over the record, and the states' mean square is taken. So 1 is "
-        "the error of keeping the initial estimate for ever. The first figure's menu and the table "
-        "give the RMSE of each state in its unit.",
-        "Confidence limits are of the mean over seeds (Student's, 95 %). They cover other noise, "
-        "not another machine, model or tuning.",
-        f"RMSEs within {percent(TOLERANCE)} count as equal on the Pareto front.",
+        _RMSE if measure(summary) == "rmse" else _NO_TRUTH,
+        f"Values within {percent(TOLERANCE)} count as equal on the Pareto front.",
     ]
+    if seeds > 1:
+        notes.append(
+            "Confidence limits are of the mean over seeds (Student's, 95 %). They cover other "
+            "noise, not another machine, model or tuning."
+        )
     timed = frame[frame["time_median"].notna()]
     if timed["shared"].eq(True).any():
         share = float(timed["shared"].eq(True).mean())
@@ -250,7 +282,10 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
             "below); compare times within one of them only."
         )
     if seeds == 1:
-        notes.append("There is one seed only: no confidence limits, and luck cannot be ruled out.")
+        notes.append(
+            "There is one run of each configuration only, on one seed or one measured record: no "
+            "confidence limits, and luck cannot be ruled out."
+        )
     elif seeds < _FEW_SEEDS:
         notes.append(f"There are {seeds} seeds only: the confidence limits are wide.")
     short = int((summary["seeds"] < seeds).sum())

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...plots import COLORS
 from .words import percent, time_tick
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _INK, _GRID, _LINE = "#333333", "#ececec", "#999999"
+# Inches below which a legend has no room beside the panels.
+_NARROW = 5.0
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,14 @@ _SHAPES = (
 _DASHES: tuple[tuple[str, Any], ...] = (
     ("solid", "-"), ("dash", "--"), ("dot", ":"), ("dashdot", "-."), ("longdash", (0, (9, 3))),
 )
-_OBSERVER = Style("#222222", "star", "*", "★", "dash", "--")
+_OBSERVER = Style(COLORS["observer"], "star", "*", "★", "dash", "--")
 
 
 def styles(backends: Iterable[str]) -> dict[str, Style]:
-    """A style for each backend in alphabetical order, and the observer's."""
+    """A style for each name in this order, and the observer's."""
     found = {}
-    for place, name in enumerate(sorted({str(one) for one in backends} - {"observer"})):
+    names = dict.fromkeys(str(one) for one in backends)
+    for place, name in enumerate(one for one in names if one != "observer"):
         symbol, marker, glyph = _SHAPES[place % len(_SHAPES)]
         dash, line = _DASHES[place % len(_DASHES)]
         color = _COLORS[place % len(_COLORS)]
@@ -57,7 +61,8 @@ class Axis:
     """An axis, whose ticks follow from its kind and its values, or categories.
 
     Kinds: "linear"; "time", logarithmic seconds; "error", logarithmic where values differ much;
-    "ratio", logarithmic from 1; "share"; "category".
+    "ratio", logarithmic from 1; "share"; "category"; "values", with a tick at each, logarithmic
+    where they differ much.
     """
 
     title: str
@@ -71,7 +76,9 @@ class Axis:
         return (float(values.min()), float(values.max())) if values.size else (1.0, 1.0)
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Values and words of the ticks of a logarithmic axis; none where it is not one."""
+        """Values and words of the ticks; none where the drawing program chooses them."""
+        if self.kind == "values":
+            return [(value, f"{value:g}") for value in self.values]
         if self.kind not in ("time", "error", "ratio"):
             return []
         low, high = self.limits()
@@ -352,8 +359,9 @@ def _set_axis(axes: Any, name: str, axis: Axis) -> None:
         getattr(axes, f"set_{name}lim")(-0.02, 1.03)
         line.set_major_formatter(lambda share, _: percent(round(share, 3)))
     elif ticks := axis.ticks():
-        getattr(axes, f"set_{name}scale")("log")
         low, high = axis.limits()
+        if axis.kind != "values" or high > 8.0 * low > 0.0:
+            getattr(axes, f"set_{name}scale")("log")
         if axis.kind == "ratio":
             getattr(axes, f"set_{name}lim")(0.99, high)
         else:
@@ -380,11 +388,14 @@ def _legends(figure: Any, drawing: Drawing, drawn: Mapping[str, Style]) -> None:
             style = drawn[mark.backend]
             beside.append(Line2D([], [], color=style.color, linestyle=style.line, label=mark.label))
     if beside:
-        figure.legend(handles=beside, loc="outside right center", fontsize=8, title_fontsize=8,
-                      title="Pareto front" if "front" in kinds else None)
+        narrow = figure.get_figwidth() < _NARROW
+        (figure.axes[0] if narrow else figure).legend(
+            handles=beside, loc="best" if narrow else "outside right center", fontsize=8,
+            title_fontsize=8, title="Pareto front" if "front" in kinds else None,
+        )
     if kinds & {"points", "line"}:
         present = {mark.backend for mark in marks} - {""}
-        names = sorted(present - {"observer"}) + sorted(present & {"observer"})
+        names = [name for name in drawn if name in present]
         figure.legend(
             handles=[
                 Line2D([], [], color=drawn[name].color, marker=drawn[name].marker, markersize=5.5,

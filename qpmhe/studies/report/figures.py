@@ -8,9 +8,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..._checks import Array
-from ..summary import CONFIGURATION, PROBLEM
-from .drawing import Axis, Drawing, Mark, Panel
-from .words import cap_words, configuration_words, missing, number, percent, qps_words, seconds
+from ..summary import CONFIGURATION, PROBLEM, RANKED_BY, measure
+from .answers import chosen
+from .drawing import Axis, Drawing, Mark, Panel, Style, styles
+from .words import (
+    cap_words,
+    configuration_words,
+    missing,
+    number,
+    percent,
+    qps_words,
+    ranked,
+    seconds,
+    usual_first,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -94,6 +105,71 @@ def anytime(summary: DataFrame) -> Drawing | None:
             Axis(label, "error", summary[metric].astype(float).tolist()), marks,
         ))
     return Drawing(panels, 60 + 250 * len(panels)) if panels else None
+
+
+#: What errors are drawn against: the column, the words of the axis and the letter of files.
+AXES = {
+    "horizon": ("horizon N", "N"), "noise_level": ("noise level", "noise"),
+    "qps": ("QPs per sample i", "i"),
+}
+
+
+def sweeps(summary: DataFrame) -> dict[str, tuple[Drawing, dict[str, Style]]]:
+    """Errors against N, noise level and i where they vary: the drawing, and how lines look.
+
+    Uncapped, of the usual start and of one backend, which is in the name: the fastest near the
+    best. Bars are confidence limits over the seeds. The lines are those of i, else of N.
+    """
+    drawn = {}
+    for (model, steps), rows in summary.groupby(["model", "steps"], sort=False):
+        rows = rows[(rows["failures"] == 0) & rows["solver_iterations"].isna()]
+        rest = rows[rows["backend"] != "observer"]
+        best = chosen(rest)
+        if best is None:
+            continue
+        backend = str((best[1] if best[0] is None else best[0])["backend"])
+        start = min(rest["start"], key=usual_first)
+        rows = rows[rows["backend"].isin(["observer", backend]) & rows["start"].isin(
+            [start, "candidate"])]
+        varying = [name for name in AXES if rows[name].nunique(dropna=False) > 1]
+        for name in varying:
+            lines = next((one for one in ("qps", "horizon", "noise_level")
+                          if one != name and one in varying), None)
+            others = [one for one in varying if one not in (name, lines)]
+            groups = rows.groupby(others, sort=True) if others else [((), rows)]
+            for values, group in groups:
+                fixed = "".join(
+                    f", {AXES[one][1]} = {value:g}"
+                    for one, value in zip(others, values, strict=True)
+                )
+                title = f"{model}, {backend}{fixed}"
+                if summary["steps"].nunique() > 1:
+                    title += f", T = {steps}"
+                drawn[f"{title} error-{AXES[name][1]}"] = _sweep(group, name, lines)
+    return drawn
+
+
+def _sweep(rows: DataFrame, name: str, lines: str | None) -> tuple[Drawing, dict[str, Style]]:
+    by, words = measure(rows), AXES[name][0]
+    marks, looks = [], []
+    for value, mine in [(None, rows)] if lines is None else rows.groupby(lines, dropna=False):
+        look = str(mine["backend"].iloc[-1])
+        if lines == "qps":
+            look = {"0": "observer", "converged": "converged"}.get(
+                word := qps_words(value), f"i = {word}"
+            )
+        elif lines is not None:
+            look = f"{AXES[lines][1]} = {value:g}"
+        looks.append(look)
+        mine = mine.sort_values(name, na_position="last")
+        x = [qps_words(one) for one in mine[name]] if name == "qps" else mine[name].tolist()
+        marks.append(Mark("line", x, mine[by].astype(float).tolist(), look, bars=_bars(mine, by)))
+    axis = Axis(words, "values", sorted(set(rows[name].dropna().astype(float))))
+    if name == "qps":
+        axis = Axis(words, "category", ranked(map(qps_words, rows["qps"])))
+    values = rows[by].astype(float).tolist()
+    found = Drawing([Panel(axis, Axis(RANKED_BY[by], "error", values), marks)], 400)
+    return found, styles(looks)
 
 
 def times(found: list[Spread], deadline: float | None) -> Drawing | None:

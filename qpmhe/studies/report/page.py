@@ -14,11 +14,13 @@ import numpy as np
 
 from ..._checks import make_folder
 from ...errors import InvalidInputError
-from ...plots import save, trajectories
+from ...plots import COLORS, save, trajectories
+from ...plots.style import inches_of
+from ..environment import environment_words
 from ..store import Store
-from ..summary import PROBLEM, TOLERANCE, cells_of, pareto_front, summarise
+from ..summary import PROBLEM, RANKED_BY, TOLERANCE, cells_of, pareto_front, summarise
 from . import figures
-from .answers import Case, cases, chosen, failures, limitations
+from .answers import Case, cases, chosen, failures, file_name, limitations
 from .drawing import Axis, Drawing, Mark, Panel, Style, interactive, static, styles
 from .figures import SOLVED, Profile
 from .words import (
@@ -41,6 +43,8 @@ _LIBRARIES = ("pandas", "plotly", "itables", "jinja2")
 
 #: States that the page draws, and a file.
 MOST_STATES, _MOST_STATIC = 12, 6
+# Inches that a column of panels needs.
+_COLUMN = 2.2
 # Bytes of trajectories that the page may hold.
 _TRAJECTORY_BYTES = 1_000_000
 _METRICS = {
@@ -48,6 +52,7 @@ _METRICS = {
     "rmse_settled": "RMSE after settling",
     "rmse_excess": f"RMSE above the best (%, at least {100 * TOLERANCE:g})",
     "cost_ratio": "J / converged J",
+    "cost": "mean J",
 }
 # Settings with a unit, and what None means in a setting.
 _HEADINGS = {"deadline": "deadline (s)", "cell_timeout": "cell timeout (s)", "qps": "QPs"}
@@ -57,9 +62,9 @@ _NONE = {
 }
 # How the lines of a trajectory look.
 _ROLES = {
-    "real": Style("#bbbbbb", "circle", "o", "", "solid", "-"),
-    "observer": Style("#222222", "circle", "o", "", "dot", ":"),
-    "estimate": Style("#D55E00", "circle", "o", "", "solid", "-"),
+    "truth": Style(COLORS["truth"], "circle", "o", "", "solid", "-"),
+    "observer": Style(COLORS["observer"], "circle", "o", "", "dash", "--"),
+    "estimate": Style(COLORS["estimate"], "circle", "o", "", "solid", "-"),
 }
 _SIGNIFICANT = """function (value, type) {
   if (type === 'sort' && (value === null || Number.isNaN(value))) { return Infinity; }
@@ -86,6 +91,7 @@ _NUMBERS: tuple[tuple[str, str, float | None], ...] = (
     ("rmse", "RMSE", 1.0),
     ("rmse_half", "±\u00a095\u00a0%", 1.0),
     ("cost_ratio", "J / converged", 1.0),
+    ("cost", "mean J", 1.0),
     ("time_median", "time median (µs)", 1e6),
     ("time_p99", "time 99\u00a0% (µs)", 1e6),
     ("late", "late (%)", 100.0),
@@ -104,6 +110,7 @@ _NUMBERS: tuple[tuple[str, str, float | None], ...] = (
     ("solver_iterations_mean", "solver iterations", 1.0),
     ("seeds", "seeds", None),
 )
+_ORDER = ("time median (µs)", "RMSE", "mean J")
 _WHY = {
     "CONVERGED": "converged", "NO_DECREASE": "no decrease", "SOLVER_STOPPED": "solver stopped",
     "SOLVER_FAILED": "solver failed", "MODEL_FAILED": "model failed", "TIME_UP": "time up",
@@ -112,9 +119,13 @@ _WHY = {
 
 
 def write_report(
-    source: Store | str | Path | tuple[DataFrame, Mapping[str, Any]], out: str | Path
+    source: Store | str | Path | tuple[DataFrame, Mapping[str, Any]], out: str | Path, *,
+    width: str | float | None = None,
 ) -> Path:
     """Write ``index.html``, figures as PNG and SVG, and ``summary.csv`` into a folder.
+
+    The figures show accuracy against time, what caps cost, step times and a run; where the study
+    varies them, the error against N, noise level and i.
 
     Parameters
     ----------
@@ -122,6 +133,8 @@ def write_report(
         A store or its file; or its frame and meta alone, then without trajectories.
     out : path
         The folder; it is made.
+    width : {"single", "double"} or float, optional
+        For a paper: the figures are PDF files, too, of this width; see `qpmhe.plots.save`.
 
     Returns
     -------
@@ -130,11 +143,12 @@ def write_report(
 
     Raises
     ------
-    StoreError, InvalidInputError
-        If the store cannot be read or has no finished cell, the folder cannot be made, or a
-        library is missing.
+    StoreError, InvalidInputError, OptionError
+        If the store cannot be read or has no finished cell, the folder cannot be made, a library
+        is missing, or the width is neither.
     """
     check_libraries()
+    inches = inches_of(width)
     held: Any = source
     if not (isinstance(held, tuple) or hasattr(held, "frame")):
         held = Store(held)
@@ -153,15 +167,16 @@ def write_report(
     if not isinstance(held, tuple):
         for part in found:
             part.runs = choose_runs(held, part.cells, part.case, _TRAJECTORY_BYTES // len(found))
-    drawn, profile = styles(summary["backend"]), figures.profiles(frame)
+    drawn, profile = styles(sorted(summary["backend"])), figures.profiles(frame)
     page, unfinished = folder / "index.html", folder / "index.html.part"
     try:
         # A former report stays whole where the new one cannot be written.
-        unfinished.write_text(_page(frame, meta, found, drawn, profile), encoding="utf-8")
+        unfinished.write_text(_page(frame, summary, meta, found, drawn, profile), "utf-8")
         unfinished.replace(page)
-        summary.to_csv(folder / "summary.csv", index=False)
-        for name, figure in files(found, drawn, profile).items():
-            save(figure, folder / name)
+        summary.assign(environment=" | ".join(_machines(meta, summary))).to_csv(
+            folder / "summary.csv", index=False)
+        for name, figure in files(found, drawn, profile, inches).items():
+            save(figure, folder / name, width=inches)
     except OSError as error:
         unfinished.unlink(missing_ok=True)
         raise InvalidInputError(
@@ -259,7 +274,8 @@ def _run_figure(first: Mapping[str, Any]) -> dict[str, Any]:
         Panel(
             Axis(f"time ({first['time_unit']})" if j == n - 1 else "", "linear"),
             Axis(labels[j], "linear"),
-            [Mark("curve", [], [], role, meta={"role": role, "state": j}) for role in _ROLES],
+            [Mark("curve", [], [], role, meta={"role": role, "state": j}) for role in _ROLES
+             if role != "truth" or np.isfinite(states[:, j]).any()],
         )
         for j in range(n)
     ], 90 + (170 if n <= 4 else 115) * n, gap=0.12)
@@ -268,7 +284,7 @@ def _run_figure(first: Mapping[str, Any]) -> dict[str, Any]:
     for trace in figure["data"]:
         role, j = trace["meta"]["role"], trace["meta"]["state"]
         trace |= {"x": times, "name": role, "legendgroup": role, "showlegend": j == 0}
-        if role == "real":
+        if role == "truth":
             trace["y"], trace["line"]["width"] = _encoded(states[:, j]), 4
     layout = figure["layout"]
     for j in range(n):
@@ -282,10 +298,20 @@ def _run_figure(first: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def files(
-    parts: list[Part], drawn: Mapping[str, Style], profile: list[Profile]
+    parts: list[Part], drawn: Mapping[str, Style], profile: list[Profile],
+    inches: float | None = None,
 ) -> dict[str, Figure]:
     """The figures that are written beside the page, by the name of the file."""
+    import pandas as pd
+
     found: dict[str, Any] = {}
+
+    def size(width: float, height: float) -> tuple[float, float]:
+        return (width, height) if inches is None else (inches, min(height, 0.8 * inches + 0.4))
+
+    summary = pd.concat([part.case.summary for part in parts])
+    for title, (drawing, looks) in figures.sweeps(summary).items():
+        found[file_name(title)] = static(drawing, looks, size(5.4, 3.8), title.rpartition(" ")[0])
     for part in parts:
         case, rows = part.case, part.case.summary
         starts = sorted(rows["start"].unique(), key=usual_first)
@@ -293,12 +319,14 @@ def files(
         of_start = f"; start {start}" if len(starts) > 1 else ""
 
         def columns(words: list[str], **more: str) -> list[tuple[str, dict[str, str]]]:
+            room = len(words) if inches is None else max(1, int(inches / _COLUMN))
+            words = words[-room:] if room > 1 or "2" not in words else ["2"]
             return [(qps_heading(one), {"qps": one, **more}) for one in words]
 
-        one = figures.accuracy(rows, "rmse", "RMSE", rows["pareto"])
+        one = figures.accuracy(rows, case.by, RANKED_BY[case.by], rows["pareto"])
         if one is not None:
             found[f"{case.key}-accuracy-time"] = static(
-                one, drawn, (8.6, 4.8), f"{case.title}\nlarger: more QPs per sample; hollow: "
+                one, drawn, size(8.6, 4.8), f"{case.title}\nlarger: more QPs per sample; hollow: "
                 "capped; pale: runs failed; bars: 95 %",
             )
         one = figures.anytime(rows)
@@ -306,7 +334,7 @@ def files(
         if one is not None and len(rest):
             words = ranked(map(qps_words, rest["qps"]))
             found[f"{case.key}-anytime"] = static(
-                one, drawn, (1.4 + 2.1 * max(2, len(words)), 5.0),
+                one, drawn, size(1.4 + 2.1 * max(2, len(words)), 5.0),
                 f"{case.title}\ncap on the solver's iterations in each QP; dashed: the observer "
                 f"alone{of_start}", columns(words, start=start),
             )
@@ -319,7 +347,7 @@ def files(
         if one is not None and words:
             found[f"{case.key}-step-times"] = static(
                 one, drawn,
-                (1.6 + 2.3 * max(2, len(words)), 1.5 + 0.27 * len(one.panels[0].y.values)),
+                size(1.6 + 2.3 * max(2, len(words)), 1.5 + 0.27 * len(one.panels[0].y.values)),
                 f"{case.title}\nno cap on the solver{of_start}", columns(words),
             )
         if part.runs.static:
@@ -327,7 +355,7 @@ def files(
     one = figures.performance(profile)
     if one is not None:
         found["profile"] = static(
-            one, drawn, (7.2, 4.2),
+            one, drawn, size(7.2, 4.2),
             f"Solved: J on average within {percent(SOLVED)} of the converged one",
         )
     return found
@@ -337,17 +365,22 @@ def _run_file(runs: Runs) -> Figure:
     first = runs.static[0][1]
     labels = [str(one) for one in first["labels"]][:_MOST_STATIC]
     n = len(labels)
+    truth = np.asarray(first["states"])[:, :n]
     figure: Figure = trajectories(
-        np.asarray(first["times"]), np.asarray(first["states"])[:, :n],
+        np.asarray(first["times"]), truth if np.isfinite(truth).any() else None,
         {words: np.asarray(one["estimates"])[:, :n] for words, one in runs.static[:6]},
         labels, f"time t ({first['time_unit']})",
     )[0].figure
     return figure
 
 
+def _machines(meta: Mapping[str, Any], summary: DataFrame) -> list[str]:
+    return [environment_words(one, summary["backend"]) for one in meta.get("environments") or []]
+
+
 def _page(
-    frame: DataFrame, meta: Mapping[str, Any], parts: list[Part], drawn: Mapping[str, Style],
-    profile: list[Profile],
+    frame: DataFrame, summary: DataFrame, meta: Mapping[str, Any], parts: list[Part],
+    drawn: Mapping[str, Style], profile: list[Profile],
 ) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
@@ -362,13 +395,13 @@ def _page(
         "cases": {part.case.key: _figures(part, drawn, overall) for part in parts},
         "columns": {"backend": 0, "case": 1},
     }
-    done = int((frame["outcome"] == "done").sum())
+    done, seeds = int((frame["outcome"] == "done").sum()), frame["seed"].nunique()
     models = listed([str(model) for model in dict.fromkeys(frame["model"])])
     return jinja.get_template("page.html.j2").render(
         title=f"Backends compared: {models}",
         subtitle=f"{len(frame)} runs ({done} finished, {len(frame) - done} failed) of "
         f"{sum(len(case.summary) for case in found)} configurations, "
-        f"{frame['seed'].nunique()} seeds, up to {int(frame['steps'].max())} steps each.",
+        f"{seeds} seed{'s' * (seeds != 1)}, up to {int(frame['steps'].max())} steps each.",
         css=(here / "page.css").read_text(encoding="utf-8"),
         script=(here / "page.js").read_text(encoding="utf-8"),
         plotly=get_plotlyjs(),
@@ -385,10 +418,15 @@ def _page(
         most_states=MOST_STATES,
         trajectories=any(part.runs.all for part in parts),
         left_out=sum(part.runs.left_out for part in parts),
-        limitations=limitations(frame, summarise(frame)),
+        limitations=limitations(frame, summary),
         failures=failures(frame),
         settings=_flat(meta.get("study") or {}),
         environments=[_flat(one) for one in meta.get("environments") or []],
+        machines=_machines(meta, summary),
+        sweeps=listed([
+            words for name, (words, _) in figures.AXES.items()
+            if summary[name].nunique(dropna=False) > 1
+        ]),
     )
 
 
@@ -488,8 +526,7 @@ def _table(cases: list[Case]) -> str:
         name for name in ("model", "N", "start") if frame[name].astype(str).nunique() == 1
     }
     empty = {
-        name for _, name, _ in _NUMBERS
-        if frame[name].isna().all() and name != "RMSE"
+        name for _, name, _ in _NUMBERS if frame[name].isna().all() and name != "mean J"
     }
     frame = frame.drop(columns=sorted(single | empty))
     places = {name: place for place, name in enumerate(frame.columns)}
@@ -519,8 +556,7 @@ def _table(cases: list[Case]) -> str:
         maxBytes=0, maxRows=0, maxColumns=0, showIndex=False, display_logo_when_loading=False,
         columnDefs=definitions, columnControl=["order", ["search"]],
         ordering={"indicators": False, "handler": True},
-        order=[[places["time median (µs)"], "asc"]] if "time median (µs)" in places
-        else [[places["RMSE"], "asc"]],
+        order=[[next(places[one] for one in _ORDER if one in places), "asc"]],
         pageLength=25, lengthMenu=lengths, scrollX=True,
         fixedColumns={"start": 1},
         language={"search": "", "searchPlaceholder": "search", "lengthMenu": "_MENU_ rows",
