@@ -225,6 +225,7 @@ _PAGE = """<!doctype html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Is the estimator healthy?</title>
 <style>
+:root {{ color-scheme: light dark; }}
 body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff; margin: 0 auto;
   max-width: 56rem; padding: 1rem; overflow-wrap: break-word; }}
 h1 {{ font-size: 1.5rem; }} h2 {{ font-size: 1.1rem; margin: 2rem 0 0.2rem; }}
@@ -236,6 +237,11 @@ ol, ul {{ padding-left: 1.4rem; }} li {{ margin: 0.5rem 0; }}
 table {{ border-collapse: collapse; }}
 td, th {{ padding: 0.15rem 0.8rem 0.15rem 0; text-align: left; }}
 .table {{ overflow-x: auto; }} footer {{ margin-top: 2rem; font-size: 0.85rem; }}
+@media (prefers-color-scheme: dark) {{
+  body {{ color: #ddd; background: #1c1c1c; }} .remedy, .caption, footer {{ color: #aaa; }}
+  .warning {{ color: #e69f00; }} .fault {{ color: #f0803c; }}
+  .figure svg {{ filter: invert(0.89) hue-rotate(180deg); }}
+}}
 </style>
 </head>
 <body>

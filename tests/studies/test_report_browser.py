@@ -34,9 +34,9 @@ def browser():
 class Opened:
     """The report in a browser without network, and all it complained about or asked for."""
 
-    def __init__(self, browser, file: Path, width: int) -> None:
+    def __init__(self, browser, file: Path, width: int, scheme: str = "light") -> None:
         self.context = browser.new_context(
-            viewport={"width": width, "height": 900}, offline=True
+            viewport={"width": width, "height": 900}, offline=True, color_scheme=scheme
         )
         self.page = self.context.new_page()
         self.complaints: list[str] = []
@@ -69,6 +69,23 @@ def opened(wide):
     wide.page.select_option("#case", "batch-reactor-N-10")
     yield wide
     wide.check()
+
+
+def test_it_is_dark_where_the_reader_wants_that(browser):
+    light, dark = (Opened(browser, written(), 390, scheme) for scheme in ("light", "dark"))
+    shades = [
+        [max(map(int, one.page.evaluate(
+            f"getComputedStyle(document.querySelector({place!r})).backgroundColor"
+        ).removeprefix("rgb(").rstrip(")").split(",")))
+         for place in ("body", "#filters", "#configurations td", "select")]
+        for one in (light, dark)
+    ]
+    assert min(shades[0]) > 200
+    assert max(shades[1]) < 70
+    assert dark.page.evaluate("document.documentElement.scrollWidth") <= 390
+    for one in (light, dark):
+        one.check()
+        one.context.close()
 
 
 def points(page) -> int:

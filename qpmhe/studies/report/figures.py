@@ -214,7 +214,7 @@ def performance(found: list[Profile]) -> Drawing | None:
             meta={"backend": one.backend}, label=one.words,
         ))
     return Drawing([Panel(
-        Axis("time relative to the fastest backend on the problem", "ratio", [1.0, last]),
+        Axis("time / fastest backend's time", "ratio", [1.0, last]),
         Axis(f"share of {found[0].problems} problems solved", "share"), marks,
     )], 420)
 

@@ -3,6 +3,11 @@
 (() => {
   const data = JSON.parse(document.getElementById("data").textContent);
   const hidden = new Set();
+  // The table's own styles look for this class.
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const shade = () => document.documentElement.classList.toggle("dark", dark.matches);
+  dark.addEventListener("change", shade);
+  shade();
   const wanted = {};            // figure -> what its own menus choose
   const drawn = {};             // figure -> the JSON that is on screen
   const config = { responsive: true, displaylogo: false,
