@@ -9,6 +9,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.estimation.subproblem import Subproblem
 from qpmhe.solvers import Backend, RawSolution, Solution, Solver, SolveStatus, create
 
 SYSTEM, OBSERVER, COST, SCENARIO = qpmhe.models.batch_reactor()
@@ -21,16 +22,16 @@ def estimator(system=SYSTEM, **options):
 
 
 @pytest.fixture
-def registered():
-    """Registers backends until the test is over."""
+def register():
+    """Registers a backend until the test is over."""
     names = []
 
-    def register(name, factory):
+    def registered(name, factory):
         qpmhe.solvers.register(Backend(name, factory, "a test's"))
         names.append(name)
         return name
 
-    yield register
+    yield registered
     for name in names:
         qpmhe.solvers.unregister(name)
 
@@ -51,17 +52,16 @@ class Clock:
             def _solve(self, qp, start):
                 clock.limits.append(self.time_limit)
                 clock.now += 0.375
-                found = inner.solve(qp)
                 # Half of the way, so that the sequence never converges.
-                return RawSolution(0.5 * found.d, False)
+                return RawSolution(0.5 * inner.solve(qp).d, False)
 
         return Ticking(options)
 
 
 @pytest.fixture
-def clock(monkeypatch, registered):
+def clock(monkeypatch, register):
     made = Clock(monkeypatch)
-    registered("ticking", made.solver)
+    register("ticking", made.solver)
     return made
 
 
@@ -73,43 +73,35 @@ def test_each_qp_gets_what_remains(clock):
         assert estimate.qps == 3
         assert Status.TIME_UP in estimate.status
         clock.limits.clear()
-    late = mhe.amend(mhe.time - 2, MEASUREMENTS[0])
+    assert Status.TIME_UP in mhe.amend(mhe.time - 2, MEASUREMENTS[0]).status
     assert clock.limits == [1.0, 0.625, 0.25]
-    assert Status.TIME_UP in late.status
-
-
-def test_without_a_budget_there_is_no_limit(clock):
     estimator(backend="ticking", max_qps=3).update(MEASUREMENTS[0])
-    assert clock.limits == [None, None, None]
+    assert clock.limits[3:] == [None, None, None]
 
 
 def test_time_that_the_model_takes_is_not_left_to_the_solver(clock):
     def f(x):
-        if mhe is not None:
-            clock.now += 0.25
+        clock.now += 0.25 * began[0]
         return SYSTEM.f.direct(x)
 
-    mhe = None
+    began = [False]
     system = qpmhe.System(f, SYSTEM.h.direct, n=2, p=1)
-    made = estimator(system, backend="ticking", max_qps=1, time_budget=1e9)
-    mhe = made
-    began = clock.now
+    mhe, start = estimator(system, backend="ticking", max_qps=1, time_budget=1e9), clock.now
+    began[0] = True
     mhe.update(MEASUREMENTS[0])
     (limit,) = clock.limits
-    assert limit < 1e9 - 0.2
-    assert limit >= 1e9 - (clock.now - began)
+    assert 1e9 - (clock.now - start) <= limit < 1e9 - 0.2
 
 
 @pytest.mark.parametrize("seconds", [1.0, 2.0])
 def test_a_qp_that_is_ready_too_late_is_not_begun(clock, monkeypatch, seconds):
-    mhe = estimator(backend="ticking", max_qps=2, time_budget=1.0)
-    made = qpmhe.estimation.subproblem.Subproblem.at
+    mhe, made = estimator(backend="ticking", max_qps=2, time_budget=1.0), Subproblem.at
 
     def slow(self, problem, trial):
         clock.now += seconds
         return made(self, problem, trial)
 
-    monkeypatch.setattr(qpmhe.estimation.subproblem.Subproblem, "at", slow)
+    monkeypatch.setattr(Subproblem, "at", slow)
     estimate = mhe.update(MEASUREMENTS[0])
     assert clock.limits == []
     assert (estimate.qps, estimate.solve_time) == (0, 0.0)
@@ -124,42 +116,36 @@ import qpmhe
 from qpmhe_solvers.dispatch import DispatchSolver
 
 A = np.array([[1.0, 0.1], [-0.1, 0.9]])
-SETS = {
-    "free": {},
-    "all": {
-        "states": qpmhe.Box([-1.0, -1.0], [0.55, 1.0]),
-        "disturbances": qpmhe.Box([-0.05, 0.0], [0.05, 0.0]),
-    },
+BOUNDED = {
+    "states": qpmhe.Box([-1.0, -1.0], [0.55, 1.0]),
+    "disturbances": qpmhe.Box([-0.05, 0.0], [0.05, 0.0]),
 }
 
-def growth(backend):
-    return [of_one(backend, sets) for sets in SETS]
-
-def of_one(backend, sets):
-    system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1, **SETS[sets])
+def growth(backend, sets):
+    system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1, **sets)
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=9.0 * np.eye(2), noise=[[4.0]])
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([[0.3], [0.1]]), cost, horizon=4, initial_state=[0.5, 0.0],
         backend=backend, max_qps=2,
     )
     before = set(sys.modules)
-    mhe.update([1.0])
-    for y in (0.9, np.nan, 0.4, 0.2, 0.1, 0.0):
+    for y in (1.0, 0.9, np.nan, 0.4, 0.2, 0.1, 0.0):
         mhe.update([y])
     return sorted(set(sys.modules) - before)
 
 def dispatched(name):
     return getattr(qpmhe.solvers.backend(name).factory, "func", None) is DispatchSolver
 
-cases = sorted(qpmhe.solvers.available(), key=dispatched)
 found = {}
-for case in cases:
+for case in sorted(qpmhe.solvers.available(), key=dispatched):
+    if dispatched(case) and len(found) > 2 and "all" not in sys.argv:
+        continue
     if dispatched(case) and "qpsolvers" not in sys.modules:
         import qpsolvers  # as whoever makes one of these does; once for all children
     reader, writer = os.pipe()
     if os.fork() == 0:
         try:
-            answer = growth(case)
+            answer = growth(case, {}) + growth(case, BOUNDED)
         except BaseException:
             answer = traceback.format_exc()
         os.write(writer, json.dumps(answer).encode()[:60000])
@@ -173,109 +159,98 @@ print(json.dumps(found))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
-def test_no_update_imports_anything():
+def test_no_update_imports_anything(pytestconfig):
+    cases = ["all"] if pytestconfig.option.all else []
     done = subprocess.run(
-        [sys.executable, "-c", GROWTH], capture_output=True, text=True, check=True,
+        [sys.executable, "-c", GROWTH, *cases], capture_output=True, text=True, check=True,
         timeout=300,
     )
     found = json.loads(done.stdout.splitlines()[-1])
     assert len(found) > 2
-    assert {case: grown for case, grown in found.items() if grown != [[], []]} == {}
+    assert {case: grown for case, grown in found.items() if grown} == {}
 
 
-@pytest.mark.parametrize("horizon", [3, 16, 40])
-def test_programs_of_jax_are_compiled_when_the_estimator_is_made(horizon):
-    jnp = pytest.importorskip("jax.numpy")
-    system = qpmhe.from_jax(
+def test_programs_of_jax_and_casadi_are_made_with_the_estimator():
+    ca, jnp = pytest.importorskip("casadi"), pytest.importorskip("jax.numpy")
+    x = ca.SX.sym("x", 2)
+    f = ca.Function("f", [x], [ca.vertcat(x[0] + 0.1 * x[1], x[1] - 0.1 * ca.sin(x[0]))])
+    by_jax = qpmhe.from_jax(
         lambda x: jnp.array([x[0] + 0.1 * x[1], x[1] - 0.1 * jnp.sin(x[0])]), lambda x: x[:1],
         n=2, p=1,
     )
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]])
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([[0.3], [0.1]]), cost, horizon=horizon,
-        initial_state=[0.5, 0.0], max_qps=3,
+    by_casadi, interpreted = (
+        qpmhe.from_casadi(f, ca.Function("h", [x], [x[0]]), compiled=one) for one in (None, False)
     )
-    programs = system.kernel._programs._batches
-    before = set(programs)
-    for k in range(horizon + 3):
-        mhe.update([np.cos(0.1 * k)])
-    assert set(programs) == before
-
-
-@pytest.mark.parametrize("compiled", [False, None])
-def test_programs_of_casadi_for_full_windows_are_made_with_the_estimator(compiled):
-    ca = pytest.importorskip("casadi")
-    x = ca.SX.sym("x", 2)
-    system = qpmhe.from_casadi(
-        ca.Function("f", [x], [ca.vertcat(x[0] + 0.1 * x[1], x[1] - 0.1 * ca.sin(x[0]))]),
-        ca.Function("h", [x], [x[0]]), compiled=compiled,
-    )
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]])
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([[0.3], [0.1]]), cost, horizon=4,
-        initial_state=[0.5, 0.0], max_qps=3,
-    )
-    kept = system.kernel._local.kept
-    before = set(kept)
-    for k in range(7):
-        mhe.update([np.cos(0.1 * k)])
-    assert {count for count, _ in set(kept) - before} <= {2, 3}  # of the growing window
+    for system, programs, horizon in (
+        (by_jax, by_jax.kernel._programs._batches, 16), (by_casadi, by_casadi.kernel._local, 4),
+        (interpreted, interpreted.kernel._local, 4),
+    ):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([[0.3], [0.1]]),
+            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]]),
+            horizon=horizon, initial_state=[0.5, 0.0], max_qps=3,
+        )
+        made = programs if system is by_jax else programs.kept
+        before = set(made)
+        for k in range(horizon + 3):
+            mhe.update([np.cos(0.1 * k)])
+        new = set(made) - before
+        # Those of a window that grows may come later.
+        assert not new if system is by_jax else {count for count, _ in new} <= {2, 3}
 
 
 class Panic(BaseException):
     """As compiled code raises it."""
 
 
-def hostile(word):
-    """A class of solvers that does, wherever it can, what the word says."""
-    answers = {
-        "something else": lambda qp: "no Solution",
-        "nothing": lambda qp: None,
-        "short": lambda qp: Solution(np.zeros(3), SolveStatus.SOLVED),
-        "not finite": lambda qp: Solution(np.full((qp.stages, qp.n), np.nan), SolveStatus.SOLVED),
-        "odd status": lambda qp: Solution(np.zeros((qp.stages, qp.n)), "solved"),
-    }
+def answering(make):
+    return lambda qp: Solution(make(qp), SolveStatus.SOLVED)
 
+
+def raising(error):
+    def answer(qp):
+        raise error
+
+    return answer
+
+
+ANSWERS = {
+    "something else": lambda qp: "no Solution", "nothing": lambda qp: None,
+    "short": answering(lambda qp: np.zeros(3)),
+    "not finite": answering(lambda qp: np.full((qp.stages, qp.n), np.nan)),
+    "odd status": lambda qp: Solution(np.zeros((qp.stages, qp.n)), "solved"),
+    "raises": raising(KeyError("P")), "exits": raising(SystemExit(1)), "panics": raising(Panic()),
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"time_budget": 60.0}], ids=["free", "bounded"])
+@pytest.mark.parametrize("word", ANSWERS)
+def test_a_hostile_backend_gets_out_of_no_method(register, word, options):
     class Hostile(Solver):
         def _solve(self, qp, start):
             raise NotImplementedError
 
         def solve(self, qp, start=None):
-            if word in answers:
-                return answers[word](qp)
-            raise {"raises": KeyError, "exits": SystemExit, "panics": Panic}[word](word)
+            return ANSWERS[word](qp)
 
         def shift(self):
             self.solve(None)
 
-        def forget(self):
-            self.solve(None)
+        forget = shift
 
         def prepare(self, size):
             self.solve(None)
 
-    return Hostile
-
-
-BOXED = qpmhe.System(
-    SYSTEM.f.direct, SYSTEM.h.direct, n=2, p=1, states=qpmhe.Box([0.0, 0.0], [9.0, 9.0]),
-    disturbances=qpmhe.Box([-0.1, -0.1], [0.1, 0.1]),
-)
-
-
-@pytest.mark.parametrize("options", [
-    {}, {"system": BOXED}, {"system": BOXED, "time_budget": 60.0},
-], ids=["free", "bounded", "limited"])
-@pytest.mark.parametrize("word", [
-    "something else", "nothing", "short", "not finite", "odd status", "raises", "exits", "panics",
-])
-def test_a_hostile_backend_gets_out_of_no_method(registered, word, options):
-    mhe = estimator(backend=registered("hostile", hostile(word)), **options)
-    plain = estimator(backend="auto", max_qps=0, system=options.get("system", SYSTEM))
+    bounded = {"states": qpmhe.Box([0.0, 0.0], [9.0, 9.0]),
+               "disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}
+    system = qpmhe.System(
+        SYSTEM.f.direct, SYSTEM.h.direct, n=2, p=1, **(bounded if options else {})
+    )
+    mhe = estimator(system, backend=register("hostile", Hostile), **options)
+    plain = estimator(system, backend="auto", max_qps=0)
     for k, y in enumerate(MEASUREMENTS):
         estimate = mhe.update(y)
-        assert Status.SOLVER_FAILED in estimate.status
-        assert Status.CANDIDATE in estimate.status
+        assert Status.SOLVER_FAILED | Status.CANDIDATE in estimate.status
         assert estimate.message
         plain.update(y)
         np.testing.assert_array_equal(mhe.state, plain.state)
