@@ -181,20 +181,12 @@ def test_designed_gains_take_the_matrix():
         np.testing.assert_allclose(observer.gain, full, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "loss", [
-        lambda W: qpmhe.Huber(W, 0.5), lambda W: qpmhe.Power(W, 1.5),
-        lambda W: qpmhe.Huber(W, 0.5, per_component=True),
-    ], ids=["huber", "power", "per component"],
-)
-def test_robust_costs_reach_the_minimum(loss):
+def test_robust_costs_reach_the_minimum():
     W, V = np.linalg.inv(np.diag(Q.diagonal())), np.linalg.inv(R)
-    of_w, of_v = loss(W), loss(V)
+    of_w, of_v = qpmhe.Huber(W, 0.5, per_component=True), qpmhe.Power(V, 1.5)
     price = qpmhe.RobustCost(prior=np.linalg.inv(P), disturbance=of_w, noise=of_v)
     mhe, ys = estimator(price=price, tolerance=1e-12), 2.0 * Y[:4]
-    for y in ys:
-        estimate = mhe.update(y)
-        assert estimate.cost <= estimate.candidate_cost
+    estimate = [mhe.update(y) for y in ys][-1]
 
     def objective(unknowns):
         x = unknowns[:3]
@@ -209,16 +201,6 @@ def test_robust_costs_reach_the_minimum(loss):
     best = minimize(objective, np.zeros(11), method="BFGS").fun
     assert estimate.cost == pytest.approx(best, rel=1e-4)
     assert estimate.cost <= best * (1.0 + 1e-7)
-
-
-def test_snapshots_know_the_matrix():
-    one, other = (estimator(observer=kalman()) for _ in range(2))
-    one.run(Y)
-    state = one.state_dict()
-    other.load_state_dict(state)
-    np.testing.assert_array_equal(one.run(Y).states, other.run(Y).states)
-    another = estimator(system(2.0 * G), kalman())
-    check(InvalidInputError, ["disturbance_matrix"], another.load_state_dict, state)
 
 
 def test_augmented_parameters_and_noisy_inputs_keep_the_matrix():
@@ -246,19 +228,6 @@ def test_scenarios_draw_disturbances_of_lower_dimension():
     np.testing.assert_allclose(states[1:] - f(states[:-1]), w @ G.T, atol=1e-13)
     assert 0.05 < np.abs(w[:, 0]).max() <= 0.2 + 1e-12
     assert np.abs(w[:, 1]).max() <= 1e-12
-
-
-def test_steps_of_other_lengths_have_the_same_matrix():
-    model = qpmhe.System.from_ode(
-        lambda x: x @ (A.T - np.eye(3)), h, dt=0.5, n=3, p=1, disturbance_matrix=G
-    )
-    mhe = estimator(model, kalman())
-    for t, y in enumerate(Y):
-        estimate = mhe.update(y, dt=0.8 if t % 3 == 1 else 0.5)
-    x = estimate.trajectory
-    for k, dt in enumerate([0.5, 0.5, 0.8, 0.5]):
-        predicted = model.timed.f(x[k], np.array([dt]))
-        np.testing.assert_allclose(x[k + 1] - predicted, G @ estimate.disturbances[k], atol=1e-14)
 
 
 def test_bad_matrices():
@@ -294,6 +263,8 @@ def test_what_does_not_fit_the_matrix():
     text = ["disturbance_weight", "singular", "disturbance_matrix"]
     check(OptionError, text, mhe.update, 0.1, disturbance_weight=np.eye(3))
     assert mhe.time == 0
+    state = estimator(system(2.0 * G)).state_dict()
+    check(InvalidInputError, ["disturbance_matrix"], estimator().load_state_dict, state)
     walk = qpmhe.System(lambda x: x, lambda x: x, n=2, p=2)
     noises = {"disturbance": np.diag([1.0, 0.0]), "noise": np.eye(2)}
     text = ["eigenvalue 1", "small variance"]

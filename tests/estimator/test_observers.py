@@ -153,7 +153,7 @@ def test_one_observer_serves_several_estimators():
         prior[...] = plant.P
 
 
-@pytest.mark.parametrize(("n", "p", "radius"), [(1, 1, 1.2), (2, 1, 0.7), (3, 2, 1.05), (4, 3, 1)])
+@pytest.mark.parametrize(("n", "p", "radius"), [(1, 1, 1.2), (2, 1, 0.7), (4, 3, 1.0)])
 def test_the_steady_gain_is_the_limit_of_the_extended_kalman_observer(n, p, radius):
     plant = Plant(n, n, p, radius)
     steady = SteadyStateKalman(plant.system, plant.start, **plant.covariances)
@@ -163,6 +163,7 @@ def test_the_steady_gain_is_the_limit_of_the_extended_kalman_observer(n, p, radi
     gain = [moving.correct(plant.start, v, plant.sample(P))[0] for v in np.eye(p)]
     np.testing.assert_allclose(steady.gain, np.transpose(gain), rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(steady.covariance, P, rtol=1e-8)
+    assert steady.kappa == pytest.approx(np.linalg.svd(steady.gain)[1][0])
     np.testing.assert_array_equal(
         steady.gain, design_luenberger(plant.system, plant.start, **plant.covariances).gain
     )
@@ -215,24 +216,16 @@ def test_sigma_points_stay_within_the_bounds():
 # Designed gains
 
 
-@pytest.mark.parametrize(
-    ("n", "p", "poles"),
-    [
-        (1, 2, [0.3]), (2, 1, [0.5 + 0.2j, 0.5 - 0.2j]), (2, 2, [0.4, 0.4]), (3, 1, [0.0] * 3),
-        (3, 1, [0.6, 0.6, -0.2]), (4, 2, [0.3 - 0.6j, 0.9, 0.3 + 0.6j, -0.5]),
-        (5, 3, [0.1, 0.2, 0.3, 0.4, 0.5]),
-    ],
-)
-def test_poles_are_placed_as_asked(n, p, poles):
-    plant = Plant(20 + n + p, n, p)
-    gain = design_luenberger(plant.system, plant.start, poles=poles).gain
-    assert gain.shape == (n, p)
-    np.testing.assert_allclose(
-        np.poly(plant.A - gain @ plant.C), np.poly(poles).real, rtol=0, atol=1e-8
-    )
-
-
-def test_poles_of_odd_systems():
+def test_poles_are_placed_as_asked():
+    for p, poles in (
+        (2, [0.3]), (1, [0.5 + 0.2j, 0.5 - 0.2j]), (2, [0.4, 0.4]), (1, [0.0, 0.0, 0.0]),
+        (1, [0.6, 0.6, -0.2]), (2, [0.3 - 0.6j, 0.9, 0.3 + 0.6j, -0.5]),
+        (3, [0.1, 0.2, 0.3, 0.4, 0.5]),
+    ):
+        plant = Plant(20 + len(poles) + p, len(poles), p)
+        gain = design_luenberger(plant.system, plant.start, poles=poles).gain
+        placed = np.poly(plant.A - gain @ plant.C)
+        np.testing.assert_allclose(placed, np.poly(poles).real, rtol=0, atol=1e-8)
     for step in (1.0, 1e-2, 1e-4):  # close to 1 in short steps
         A, poles = np.eye(4) + step * np.eye(4, k=1), np.exp(-step * np.arange(1.0, 5.0))
         gain = design_luenberger(linear(A, np.eye(1, 4)), np.zeros(4), poles=poles).gain
@@ -352,9 +345,11 @@ def chain(n, step, sampling="exact"):
     return A
 
 
-@pytest.mark.parametrize("sampling", ["exact", "euler"])
-def test_high_gain_gives_the_chain_the_sampled_poles(sampling):
-    for n, epsilon in ((1, 0.2), (2, 0.02), (3, 3.0), (4, 0.2)):
+def test_high_gain_gives_the_chain_the_sampled_poles():
+    for n, epsilon, sampling in (
+        (1, 0.2, "exact"), (2, 0.02, "euler"), (3, 3.0, "exact"), (3, 0.2, "euler"),
+        (4, 0.2, "exact"),
+    ):
         coefficients = np.poly(-np.arange(1.0, n + 1))[1:]
         options = {"coefficients": coefficients, "sampling": sampling}
         gain = HighGain(n, epsilon=epsilon, dt=DT, **options).gain
@@ -364,10 +359,10 @@ def test_high_gain_gives_the_chain_the_sampled_poles(sampling):
         # In coordinates whose unit of time is another, the same observer.
         other = HighGain(n, epsilon=1000 * epsilon, dt=1000 * DT, **options).gain[:, 0]
         np.testing.assert_allclose(gain[:, 0], other * 1000.0 ** np.arange(n), rtol=1e-9)
-    slow = HighGain(3, epsilon=1.0, dt=1e-5, sampling=sampling).gain[:, 0]
+    slow = HighGain(3, epsilon=1.0, dt=1e-5).gain[:, 0]
     np.testing.assert_allclose(slow, 1e-5 * np.array([3.0, 3.0, 1.0]), rtol=1e-4)
-    fast = HighGain(3, epsilon=1e-9, dt=DT, sampling=sampling).gain
-    error = np.linalg.matrix_power(chain(3, DT, sampling) - fast @ np.eye(1, 3), 3)
+    fast = HighGain(3, epsilon=1e-9, dt=DT).gain
+    error = np.linalg.matrix_power(chain(3, DT) - fast @ np.eye(1, 3), 3)
     np.testing.assert_allclose(error, 0.0, atol=1e-9)
 
 
