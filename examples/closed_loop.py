@@ -32,7 +32,7 @@ from rich.table import Table
 
 import qpmhe
 from qpmhe.plots import save, step_times, trajectories
-from qpmhe.plots.style import LIGHT
+from qpmhe.plots.style import LIGHT, MEASURED
 
 Array = NDArray[np.float64]
 
@@ -230,8 +230,8 @@ def draw(loops: dict[str, list[Loop]], deadline: float) -> Figure:
             ("angle from upright (rad)", "torque (1/s²)"), "time t (s)", axes=axes[:2],
         )
         axes[0].plot(
-            times[:-1], first["MHE"].measurements[:, 0], ".", color="0.7", markersize=3.0, zorder=1,
-            label="measured (MHE's loop)",
+            times[:-1], first["MHE"].measurements[:, 0], zorder=1,
+            **MEASURED | {"label": "measured (MHE's loop)"},
         )
         axes[0].set_ylim(-UPRIGHT, UPRIGHT)  # who leaves has fallen
         axes[1].axhspan(-TORQUE, TORQUE, color="0.96", zorder=0)

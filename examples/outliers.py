@@ -21,6 +21,7 @@ import numpy as np
 
 import qpmhe
 from qpmhe.plots import save, trajectories
+from qpmhe.plots.style import MEASURED
 
 SHARE, SIZE = 0.05, 8.0
 SETTLED = 3.0  # s
@@ -72,9 +73,9 @@ def figure_of(states, measurements, hit, estimates):
     )
     figure, panel = axes[0].figure, axes[-1]
     # The last state has no measurement.
-    panel.plot(times[:-1], measurements, ".", color="0.7", markersize=3, zorder=1)
+    panel.plot(times[:-1], measurements, zorder=1, **MEASURED)
     at = hit[:, 0]
-    panel.plot(times[:-1][at], measurements[at], "x", color="0.3", markersize=5)
+    panel.plot(times[:-1][at], measurements[at], "x", color=MEASURED["color"], markersize=5)
     return figure
 
 

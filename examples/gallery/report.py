@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from qpmhe.plots.style import LIGHT, REAL, STYLES
+from qpmhe.plots.style import LIGHT, REAL, line_styles
 
 from .problem import Array, Problem, Result
 
@@ -132,7 +132,7 @@ def tracks(
         with rc_context(LIGHT):
             axes = Figure(figsize=(6.4, 6.0), layout="constrained").subplots()
     axes.plot(truth[:, 0], truth[:, 1], **REAL)
-    for style, (name, path) in zip(STYLES, estimates.items(), strict=False):
+    for style, (name, path) in zip(line_styles(estimates), estimates.items(), strict=True):
         axes.plot(path[:, 0], path[:, 1], linewidth=1.2, label=name, **style)
     if landmarks is not None:
         axes.plot(landmarks[:, 0], landmarks[:, 1], "^", color="0.2", label="anchors")

@@ -16,7 +16,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import qpmhe
-from qpmhe.plots.style import LIGHT, REAL, STYLES
+from qpmhe.plots.style import LIGHT, REAL, line_styles
 from qpmhe.tuning import Weights
 
 from ..baselines import QPS
@@ -136,7 +136,7 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
                     one.estimator: one.middle[:, 0] for one in reversed(found)
                     if one.record == record.name and one.estimator in SHOWN
                 }
-                for style, name in zip(STYLES, SHOWN, strict=False):
+                for style, name in zip(line_styles(SHOWN), SHOWN, strict=True):
                     how = {"linewidth": 1.2, "label": name, **style}
                     if panel is plain:
                         top.plot(minutes, 100 * np.clip(lines[name], 0.0, 1.0), **how)

@@ -16,7 +16,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import qpmhe
-from qpmhe.plots.style import LIGHT, STYLES
+from qpmhe.plots.style import LIGHT, line_styles
 from qpmhe.tuning import Weights
 
 from ..problem import Array, Problem, Record, Result, Way
@@ -141,7 +141,7 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
             above.set(xlim=(low[0] - margin, high[0] + margin), title=record.name,
                       ylim=(low[1] - margin, high[1] + margin))
             times = np.cumsum(record.inputs[:, 0]) - record.inputs[0, 0]
-            for style, path in zip(STYLES, lines.values(), strict=False):
+            for style, path in zip(line_styles(lines), lines.values(), strict=True):
                 below.plot(times, problem.error(path, record.truth), linewidth=1.0, **style)
             below.set(xlabel="time (s)", ylabel="error (m)", yscale="log", xlim=(0, times[-1]))
         grid[0].legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.15), frameon=False)

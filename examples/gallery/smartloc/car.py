@@ -19,7 +19,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import qpmhe
-from qpmhe.plots.style import LIGHT, STYLES
+from qpmhe.plots.style import LIGHT, line_styles
 from qpmhe.tuning import Weights
 
 from ..problem import Array, Problem, Record, Result, Way
@@ -212,7 +212,7 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
                    labels=("east", "north"), axes=places)
             places.set_title(problem.title, loc="left")
             times = np.cumsum(record.inputs[:, 2]) - record.inputs[0, 2]
-            for style, (name, path) in zip(STYLES, shown.items(), strict=False):
+            for style, (name, path) in zip(line_styles(shown), shown.items(), strict=True):
                 errors.plot(times, problem.error(path, record.truth), linewidth=1.2, label=name,
                             **style)
             errors.set(xlabel="time (s)", ylabel="error (m)", ylim=(0.0, None))

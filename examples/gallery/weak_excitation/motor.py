@@ -13,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import qpmhe
-from qpmhe.plots.style import LIGHT, REAL, STYLES
+from qpmhe.plots.style import LIGHT, MEASURED, REAL, line_styles
 from qpmhe.tuning import Weights
 
 from ..problem import Array, Problem, Record, Result, Way
@@ -115,11 +115,11 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> An
     with rc_context(LIGHT):
         figure = Figure(figsize=(9.6, 6.0), layout="constrained")
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
-    above.plot(time, record.measurements[:, 0], ".", color="0.4", markersize=2.0)
+    above.plot(time, record.measurements[:, 0], **MEASURED)
     above.set_ylabel("speed (rad/s)")
     below.plot(time, inertias, **REAL)
     first = {one.estimator: one.estimates[0] for one in found if one.record == "unseen"}
-    for style, name in zip(STYLES, SHOWN, strict=False):
+    for style, name in zip(line_styles(SHOWN), SHOWN, strict=True):
         below.plot(time, first[name][:, 1], linewidth=1.2, label=name, **style)
     for axes in (above, below):
         axes.axvspan(DT * STEADY, DT * AGAIN, color="0.92", zorder=0)
