@@ -78,7 +78,7 @@ def test_jacobians_of_models_lie_in_their_enclosures(name):
     system = getattr(qpmhe.models, name)()[0]
     # Made directly: enclosures know nothing of the vehicle's angles, which regions refuse.
     ends = (np.append(end, each) for end, each in zip((low, high), u or ([], []), strict=True))
-    region = Region(*ends, len(low))
+    region = Region(qpmhe.Box(low, high), *ends)
     model = SmoothModel(system, region)
     assert model.reason == ""
     generator = np.random.default_rng(3)
@@ -179,7 +179,7 @@ def violations(expression, low, high, generator):
         system = qpmhe.System(
             lambda x: np.stack([value(expression, x, 0) + 0.0 * x[0], x[1]]), lambda x: x, n=2, p=2
         )
-    model = SmoothModel(system, Region(low, high, 2))
+    model = SmoothModel(system, Region(qpmhe.Box(low, high), low, high))
     if model.reason:
         return 0, []
     try:
