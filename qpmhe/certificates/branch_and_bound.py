@@ -21,7 +21,7 @@ _CHUNK, _MOST_CELLS, _MOST_LIPSCHITZ_CELLS = 256, 40_000, 20_000
 # is checked often enough.
 _WORK = 4e7
 # Cells are split by what their width adds to the error; what it adds to the corners counts
-# a little.
+# a little, for cells that reach out of a polytope.
 _CORNER_SHARE = 1e-3
 _TOLERANCE = 1e-3  # of a Lipschitz constant, beside the largest norm seen
 
@@ -70,8 +70,11 @@ class Cells:
         first_high, second_low = high.copy(), low.copy()
         first_high[rows, which] = second_low[rows, which] = middle
         lower, upper = np.vstack((low, second_low)), np.vstack((first_high, high))
-        self._lower, self._upper = np.vstack((self._lower, lower)), np.vstack((self._upper, upper))
-        self.inherited = np.append(self.inherited, np.tile(np.broadcast_to(bounds, len(low)), 2))
+        stay = ~region.outside(lower, upper)
+        self._lower = np.vstack((self._lower, lower[stay]))
+        self._upper = np.vstack((self._upper, upper[stay]))
+        bounds = np.tile(np.broadcast_to(bounds, len(low)), 2)
+        self.inherited = np.append(self.inherited, bounds[stay])
 
 
 def _scores(enclosure: Enclosure, left: NDArray[np.intp]) -> Array:
@@ -120,7 +123,7 @@ def cover(
         left = np.flatnonzero(~shown)
         low, high, centres = low[left], high[left], enclosure.jacobian[left]
         middle = 0.5 * (low + high)
-        broken = _broken(form, centres)
+        broken = _broken(form, centres) & region.contains(middle[:, : region.n])
         if broken.any():
             return Cover(False, cells.taken, middle[broken], centres[broken])
         if len(left):

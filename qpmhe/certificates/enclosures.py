@@ -187,7 +187,7 @@ class SmoothModel:
             return f"{name} is not traced: {expression.reason}. {_TRACEABLE}", []
         roots = read(self._graph, expression.function)
         self._programs[name] = Program(self._graph, roots)
-        middle = 0.5 * self._region.lower + 0.5 * self._region.upper
+        middle = self.points[0]
         obstacle = self._programs[name].obstacle(middle, middle)
         if obstacle:
             return f"{name} has {obstacle}", []
@@ -252,7 +252,8 @@ class SmoothModel:
         if unknown.any():
             self._unknown = lower[unknown][-1], upper[unknown][-1]
             middles = 0.5 * lower[unknown] + 0.5 * upper[unknown]
-            for name in self._programs:
+            middles = middles[self._region.contains(middles[:, : self.n])]
+            for name in self._programs if len(middles) else ():
                 evaluated(name, getattr(self._system, name), middles, self.n)
         return found
 

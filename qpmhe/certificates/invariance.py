@@ -1,12 +1,13 @@
 r"""Whether a region is invariant: f(x, u) + G w in it for all its states x, inputs u and w.
 
-On a cell with middle m, with the Jacobian J enclosed over the cell and the inputs over theirs,
+The state leaves through a side :math:`g^\top x \le c` exactly where the largest value of
+:math:`g^\top f(x, u)`, and what the disturbances add to it, are above c. On a cell with middle m
+it is, with the Jacobian J enclosed over the cell and the inputs over theirs, at most
 
 .. math::
-    f_i(x, u) \in f_i(m, u) + \sum_j [-1, 1]\, |J_{ij}|\, h_j, \qquad h_j \text{ the half-widths},
+    g^\top f(m, u) + \sum_j |g^\top J|_j\, h_j, \qquad h_j \text{ the half-widths},
 
-and cells are divided until that, and what disturbances add, is within the sides, or a state is
-found from which it is not.
+and cells are divided until it is below c, or above it at a state.
 """
 
 from __future__ import annotations
@@ -26,8 +27,7 @@ from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel, halved, place
 from .evidence import Evidence, json_ready
 from .inequalities import Matrices, definite
-from .intervals import Interval
-from .regions import Region, bounded_region
+from .regions import Region, bounded_region, bounds, inequalities, row_bounds
 
 _MOST_CELLS = 40_000
 _SAMPLES, _SEED = 2000, 20210829
@@ -78,22 +78,22 @@ def certify_invariance(
     half-widths by component (r,), which acts on the state as G w.
     """
     deadline, where = Deadline.of(seconds), bounded_region(system, region, inputs)
-    added, model = _added(system, disturbance), SmoothModel(system, where)
+    rows, limits = inequalities(where.states)
+    added, model = _added(system, rows, disturbance), SmoothModel(system, where)
     unknown = "it is not known whether x stays"
     if model.reason:
         return Invariance(None, f"{unknown}: {model.reason}", where)
     cells = Cells(where, _MOST_CELLS, deadline)
     points = where.sample(_SAMPLES, np.random.default_rng(_SEED))
-    leaving = _leaving(model, where, added, points)
+    leaving = _leaving(model, where, rows, limits, added, points)
     for low, high in cells if leaving is None else ():
-        reached, parts = _reached(model, low, high)
-        excess = np.maximum(
-            reached.high - (where.upper[: where.n] - added),
-            where.lower[: where.n] + added - reached.low,
-        )
+        reach, parts = _reach(model, rows, low, high)
+        excess = reach - (limits - added)
         left = np.flatnonzero(~(excess <= 0.0).all(axis=1))
         low, high, excess = low[left], high[left], excess[left]
-        leaving = _leaving(model, where, added, 0.5 * low + 0.5 * high)
+        points = 0.5 * low + 0.5 * high
+        points = points[where.contains(points[:, : where.n])]
+        leaving = _leaving(model, where, rows, limits, added, points)
         if leaving is not None:
             break
         if len(left):
@@ -115,11 +115,25 @@ def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
     the observer's initial bound and its limit, that is at all times; the inner region's own
     invariance can be certified in turn. None if it is empty, or has no interior.
     """
-    n, lower, upper = region.n, region.lower.copy(), region.upper.copy()
-    reach = radius * supports(metric, np.eye(n))
-    lower[:n] = np.nextafter(lower[:n] + reach, np.inf)
-    upper[:n] = np.nextafter(upper[:n] - reach, -np.inf)
-    return Region(lower, upper, n) if (lower[:n] < upper[:n]).all() else None
+    states, n = region.states, region.n
+    sides, slants = (radius * supports(metric, rows) for rows in (np.eye(n), states.matrix))
+    inner = ConvexSet(
+        _inward(states.lower, sides), -_inward(-states.upper, sides), states.matrix,
+        _inward(states.row_lower, slants), -_inward(-states.row_upper, slants),
+    )
+    if not (inner.lower < inner.upper).all() or not (inner.row_lower < inner.row_upper).all():
+        return None
+    lower, upper = region.lower.copy(), region.upper.copy()
+    lower[:n], upper[:n] = bounds(inner)
+    if not (lower[:n] < upper[:n]).all() or not np.isfinite(upper[:n] - lower[:n]).all():
+        return None
+    return Region(inner, lower, upper)
+
+
+def _inward(sides: Array, reach: Array) -> Array:
+    """Lower sides moved up by some lengths, rounded up; infinite ones stay."""
+    moved: Array = np.where(np.isinf(sides), sides, np.nextafter(sides + reach, np.inf))
+    return moved
 
 
 def supports(metric: Array, rows: Array) -> Array:
@@ -136,8 +150,8 @@ def supports(metric: Array, rows: Array) -> Array:
     return np.full(len(rows), np.inf)
 
 
-def _added(system: System, disturbance: ArrayLike) -> Array:
-    """What disturbances add to each state at most."""
+def _added(system: System, rows: Array, disturbance: ArrayLike) -> Array:
+    """What disturbances add to each g^T x at most."""
     size = numbers("disturbance", disturbance)
     if size.shape not in ((), (system.r,)):
         raise ShapeError(
@@ -146,55 +160,61 @@ def _added(system: System, disturbance: ArrayLike) -> Array:
     if (size < 0.0).any():
         raise OptionError(f"disturbance is {size.tolist()}; expected >= 0.")
     G = np.eye(system.n) if system.disturbance_matrix is None else system.disturbance_matrix
-    added: Array = np.linalg.norm(G, axis=1) * size if size.ndim == 0 else np.abs(G) @ size
+    moves = rows @ G
+    added: Array = np.linalg.norm(moves, axis=1) * size if size.ndim == 0 else np.abs(moves) @ size
     return added * _OUTWARD
 
 
-def _reached(model: SmoothModel, low: Array, high: Array) -> tuple[Interval, Array]:
-    """Where f is over cells (B, n), and what each coordinate's width adds (B, n, N)."""
+def _reach(model: SmoothModel, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Upper bounds (B, r) on g^T f over cells, and what each coordinate adds (B, r, N)."""
     n, free, (middle, half) = model.n, model.free, halved(low, high)
     start, end = low.copy(), high.copy()
     start[:, :n] = end[:, :n] = middle[:, :n]
-    parts = np.zeros((len(low), n, low.shape[1]))
+    parts = np.zeros((len(low), len(rows), low.shape[1]))
     with np.errstate(all="ignore"):
-        found = model.enclose(low, high)
-        size = (np.abs(found.centre) + np.abs(found.slopes).sum(axis=1) + found.error)
-        size = size[:, : free.size] * (1.0 + 1e-14) * half[:, None, free] * _OUTWARD
-        parts[:, free[:, None], free] = size
-        parts[:, model.moved] = np.nan  # of these, the values over the cell decide
+        enclosure = model.enclose(low, high)
+        # The sides of free states alone: others do not move, or else the values decide.
+        J, g = enclosure.centre[:, : free.size], rows[:, free]
+        spread = np.abs(enclosure.slopes[:, :, : free.size]).sum(axis=1)
+        spread += enclosure.error[:, : free.size] + 1e-14 * np.abs(J)
+        # r sides, b cells, rows i and columns j.
+        slopes = np.abs(np.einsum("ri,bij->brj", g, J))
+        slopes += np.einsum("ri,bij->brj", np.abs(g), spread)
+        parts[:, :, free] = slopes * half[:, None, free] * _OUTWARD
         at_middle, over_cell = model.values(start, end), model.values(low, high)
-        reach = parts.sum(axis=2) * _OUTWARD
-        mean = Interval(at_middle.low[:, :n], at_middle.high[:, :n]) + Interval(-reach, reach)
-        reached = Interval(
-            np.fmax(mean.low, over_cell.low[:, :n]), np.fmin(mean.high, over_cell.high[:, :n])
-        )
+        first = row_bounds(rows, at_middle.low[:, :n], at_middle.high[:, :n])
+        mean = first[1] + parts.sum(axis=2) * _OUTWARD
+        mean += 1e-15 * np.abs(mean)
+        reach = row_bounds(rows, over_cell.low[:, :n], over_cell.high[:, :n])[1]
+        if not model.moved.size:
+            reach = np.fmin(mean, reach)
     # Inputs count by what their width adds to the values at the middle.
-    width = (at_middle.high - at_middle.low)[:, :n, None]
-    parts[:, :, n:] = width * (half[:, None, n:] > 0.0)
-    return reached, parts
+    parts[:, :, n:] = (first[1] - first[0])[:, :, None] * (half[:, None, n:] > 0.0)
+    return reach, parts
 
 
 def _leaving(
-    model: SmoothModel, region: Region, added: Array, points: Array
+    model: SmoothModel, region: Region, rows: Array, limits: Array, added: Array, points: Array
 ) -> tuple[str, Region, float, float, Array] | None:
     """From which of some states f leaves farthest, in words, and how far, if it leaves."""
     if not len(points):
         return None
     n, found = region.n, model.values(points, points)
-    less = added / _OUTWARD**2  # it was rounded up
-    limits = np.stack((region.upper[:n], -region.lower[:n]))[:, None]
-    reach = np.stack((found.low[:, :n], -found.high[:, :n])) + less
+    # What disturbances add at most was rounded up.
+    most = row_bounds(rows, found.low[:, :n], found.high[:, :n])[0] + added / _OUTWARD**2
     widths = (region.upper - region.lower)[:n]
-    beyond = (reach - limits) / np.where(widths > 0.0, widths, 1.0)
+    beyond = (most - limits) / (np.abs(rows) @ np.where(widths > 0.0, widths, 1.0))
     beyond = np.where(np.isnan(beyond), -np.inf, beyond)
-    side, k, i = np.unravel_index(int(beyond.argmax()), beyond.shape)
-    if not beyond[side, k, i] > 0.0:
+    k, side = np.unravel_index(int(beyond.argmax()), beyond.shape)
+    if not beyond[k, side] > 0.0:
         return None
-    sign, relation = (-1.0, ">=") if side else (1.0, "<=")
-    reached, limit = float(reach[side, k, i]), float(limits[side, 0, i])
-    who = "f and the disturbances reach" if added[i] > 0.0 else "f reaches"
+    reach, limit, row = float(most[k, side]), float(limits[side]), rows[side]
+    sign, relation = (1.0, "<=") if row[np.flatnonzero(row)[0]] > 0.0 else (-1.0, ">=")
+    terms = " ".join(f"{each:+.4g} x{j + 1}" for j, each in enumerate(sign * row) if each)
+    names = terms.replace("+1 x", "+x").replace("-1 x", "-x").lstrip("+")
+    who = "f and the disturbances reach" if added[side] > 0.0 else "f reaches"
     text = (
-        f"{who} x{i + 1} = {sign * reached:.4g} through the face x{i + 1} {relation} "
+        f"{who} {names} = {sign * reach:.4g} through the face {names} {relation} "
         f"{sign * limit:.4g}, from {place(np.round(points[k], 4), n)}"
     )
-    return text, region, limit, reached, points[k]
+    return text, region, limit, reach, points[k]

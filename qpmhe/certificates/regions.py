@@ -23,52 +23,81 @@ _MOST_CORNERS = 256  # among samples; more add little
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A box of states, and of the inputs that may act meanwhile; made by `bounded_region`.
+    """A bounded convex set of states, and the inputs that may act meanwhile.
 
-    Parameters
-    ----------
-    lower, upper : (n + m,) array
-        The sides, of states first. A polytope is taken by the box around it, whose sides are
-        proved by duality and rounded outward.
-    n : int
-        The number of states.
+    ``lower`` and ``upper``, (n + m,), are the sides of a box around states and inputs. It holds
+    them all: for a polytope, they are proved by duality and rounded outward.
     """
 
+    states: ConvexSet
     lower: Array
     upper: Array
-    n: int
+
+    @property
+    def n(self) -> int:
+        """The number of states."""
+        return self.states.dimension
+
+    @property
+    def is_box(self) -> bool:
+        """Whether the states form a box, so that its corners are theirs."""
+        return not self.states.matrix.size
 
     @property
     def diameter(self) -> float:
-        """The largest distance of two of its states."""
+        """The largest distance of two of its states, or a little more."""
         return float(np.linalg.norm((self.upper - self.lower)[: self.n]))
 
     def to_dict(self) -> dict[str, Any]:
-        """The sides and the diameter, in types that JSON knows."""
+        """The box around the region and its diameter, in types that JSON knows."""
         return {
-            "lower": self.lower.tolist(), "upper": self.upper.tolist(), "diameter": self.diameter
+            "lower": self.lower.tolist(), "upper": self.upper.tolist(), "box": self.is_box,
+            "diameter": self.diameter,
         }
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Which of the states (..., n) lie in the region."""
         x = numbers("points", points, finite=False)
-        inside: NDArray[np.bool_] = np.asarray(
-            np.all((x >= self.lower[: self.n]) & (x <= self.upper[: self.n]), axis=-1)
+        inside = np.all((x >= self.states.lower) & (x <= self.states.upper), axis=-1)
+        if not self.is_box:
+            rows = x @ self.states.matrix.T
+            inside &= np.all(
+                (rows >= self.states.row_lower) & (rows <= self.states.row_upper), axis=-1
+            )
+        return np.asarray(inside)
+
+    def outside(self, lower: Array, upper: Array) -> NDArray[np.bool_]:
+        """Which cells, given by corners (B, n + m), certainly have no state of the region."""
+        if self.is_box:
+            return np.zeros(len(lower), np.bool_)
+        least, most = row_bounds(self.states.matrix, lower[:, : self.n], upper[:, : self.n])
+        away: NDArray[np.bool_] = np.any(
+            (least > self.states.row_upper) | (most < self.states.row_lower), axis=1
         )
-        return inside
+        return away
 
     def sample(self, count: int, generator: np.random.Generator) -> Array:
         """About so many points (K, n + m), states and inputs: the middle, corners, random ones."""
         sides = [dict.fromkeys(each) for each in zip(self.lower, self.upper, strict=True)]
         corners = np.array(list(itertools.islice(itertools.product(*sides), _MOST_CORNERS)))
         inner = generator.uniform(self.lower, self.upper, (count, self.lower.size))
-        return np.vstack((0.5 * (self.lower + self.upper), corners, inner))
+        points = np.vstack((0.5 * (self.lower + self.upper), corners, inner))
+        if not self.is_box:  # what is outside moves towards the middle of vertices
+            n, (G, g) = self.n, inequalities(self.states)
+            middle = np.mean([_support(G, g, e)[0] for e in (*np.eye(n), *-np.eye(n))], axis=0)
+            away = points[:, :n] - middle
+            with np.errstate(all="ignore"):
+                room = (g - G @ middle) / (away @ G.T)
+            share = np.where(room > 0.0, room, np.inf).min(axis=1, initial=1.0)
+            points[:, :n] = middle + (1.0 - 1e-9) * share[:, None] * away
+            points[0, :n] = middle
+        return points
 
 
 def bounded_region(
     system: System, region: ConvexSet | Region | None, inputs: Box | None = None
 ) -> Region:
-    """Check a set of states, and put a box around it and the inputs."""
+    """Check a set of states, and put a box around it."""
     checked_system(system)
     for name in ("output_residual", "state_residual"):
         residual = getattr(system, name)
@@ -130,7 +159,7 @@ def _bounded(system: System, region: ConvexSet | None, inputs: Box | None) -> Re
             f"the region is unbounded in {which}; expected a bounded set. Intersect it with the "
             "states that occur: region & qpmhe.Box(lower, upper)."
         )
-    return Region(lower, upper, system.n)
+    return Region(chosen, lower, upper)
 
 
 def stated_region(region: Any) -> Region | None:
@@ -139,18 +168,16 @@ def stated_region(region: Any) -> Region | None:
         return region
     if not isinstance(region, ConvexSet):
         raise SetError(f"region is {region!r}; expected a qpmhe.Box or a qpmhe.Polytope.")
-    return Region(*bounds(region), region.dimension)
+    return Region(region, *bounds(region))
 
 
 def bounds(states: ConvexSet) -> tuple[Array, Array]:
     """Outward bounds on the components of a set's members; infinite where there are none."""
     if states.matrix.shape[0] == 0:
         return states.lower, states.upper
-    n, eye = states.dimension, np.eye(states.dimension)
-    G = np.vstack((eye, -eye, states.matrix, -states.matrix))
-    g = np.concatenate((states.upper, -states.lower, states.row_upper, -states.row_lower))
-    G, g = G[np.isfinite(g)], g[np.isfinite(g)]
-    found = [_support(G, g, e) for e in (*-eye, *eye)]
+    n = states.dimension
+    G, g = inequalities(states)
+    found = [_support(G, g, e)[1:] for e in (*-np.eye(n), *np.eye(n))]
     sides, residuals = np.moveaxis(np.reshape(found, (2, n, 2)), -1, 0)
     if not np.isfinite(sides).all():
         return -sides[0], sides[1]
@@ -164,33 +191,63 @@ def bounds(states: ConvexSet) -> tuple[Array, Array]:
     return np.maximum(-sides[0], states.lower), np.minimum(sides[1], states.upper)
 
 
-def _support(G: Array, g: Array, e: Array) -> tuple[float, float]:
-    """y^T g for the multipliers y >= 0 of max e^T x over G x <= g, and a bound on |G^T y - e|_1.
+def inequalities(states: ConvexSet) -> tuple[Array, Array]:
+    """All inequalities of a set, as G x <= g."""
+    eye = np.eye(states.dimension)
+    G = np.vstack((eye, -eye, states.matrix, -states.matrix))
+    g = np.concatenate((states.upper, -states.lower, states.row_upper, -states.row_lower))
+    finite = np.isfinite(g)
+    return G[finite], g[finite]
 
-    The former is infinite where there is no maximum.
+
+def row_bounds(rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Outward bounds on linear forms over boxes; exact where a form is a coordinate."""
+    positive, negative = np.maximum(rows, 0.0).T, np.minimum(rows, 0.0).T
+    single = (np.count_nonzero(rows, axis=1) == 1) & (np.abs(rows).sum(axis=1) == 1.0)
+    terms = np.where(single, 0.0, 4.0 * (rows.shape[1] + 2))
+    size = np.maximum(np.abs(low), np.abs(high)) @ np.abs(rows).T
+    rounding = terms * np.finfo(np.float64).eps * size
+    return low @ positive + high @ negative - rounding, high @ positive + low @ negative + rounding
+
+
+def _support(G: Array, g: Array, e: Array) -> tuple[Array, float, float]:
+    """A vertex that maximises e^T x over G x <= g, y^T g, and a bound on |G^T y - e|_1.
+
+    The multipliers y >= 0 are the maximum's; y^T g is infinite where there is none.
     """
     from scipy.optimize import linprog
 
     answer = linprog(-e, A_ub=G, b_ub=g, bounds=(None, None), method="highs")
     if answer.x is None or answer.status != 0:
-        return np.inf, 0.0
+        return np.full(e.size, np.nan), np.inf, 0.0
     y = np.maximum(-np.asarray(answer.ineqlin.marginals, np.float64), 0.0)
     rounding = 4.0 * (y.size + 2) * np.finfo(np.float64).eps
     side = float(y @ g) + rounding * float(y @ np.abs(g))
-    residual = float(np.abs(G.T @ y - e).sum())
-    return side, residual + rounding * float((np.abs(G).T @ y + np.abs(e)).sum())
+    residual = float(np.abs(G.T @ y - e).sum()) + rounding * float(
+        (np.abs(G).T @ y + np.abs(e)).sum()
+    )
+    return np.asarray(answer.x, np.float64), side, residual
 
 
 def beyond(inner: Region, outer: Region) -> str:
-    """Where a region reaches beyond another, in words; empty if it lies within it."""
+    """Where a region reaches beyond another, in words; empty if it lies within it.
+
+    An inequality must be one of the inner region's own, or hold on the box around it.
+    """
     n, size = inner.n, outer.lower.size
     if outer.n != n:
         return f"it has {n} states instead of {outer.n}"
-    away = (inner.lower[:size] < outer.lower) | (inner.upper[:size] > outer.upper)
-    return ", ".join(
-        f"{_name(j, n)} may be in [{inner.lower[j]:.6g}, {inner.upper[j]:.6g}], beyond "
-        f"[{outer.lower[j]:.6g}, {outer.upper[j]:.6g}]" for j in np.flatnonzero(away)
-    )
+    own = {(*row, limit) for row, limit in zip(*inequalities(inner.states), strict=True)}
+    eye = np.eye(size)[n:]
+    rows, limits = inequalities(outer.states)
+    rows = np.vstack((np.pad(rows, ((0, 0), (0, size - n))), eye, -eye))
+    limits = np.concatenate((limits, outer.upper[n:], -outer.lower[n:]))
+    most = row_bounds(rows, inner.lower[:size], inner.upper[:size])[1]
+    for row, limit, value in zip(rows, limits, most, strict=True):
+        if value > limit and (*row[:n], limit) not in own:
+            terms = " + ".join(f"{row[j]:.6g} {_name(j, n)}" for j in np.flatnonzero(row))
+            return f"{terms} <= {limit:.6g} is not shown to hold there: it may be {value:.6g}"
+    return ""
 
 
 def _name(j: Any, n: int) -> str:

@@ -207,4 +207,4 @@ def _words(region: Region) -> str:
         f"[{low:.4g}, {high:.4g}]"
         for j, (low, high) in enumerate(zip(region.lower, region.upper, strict=True))
     ]
-    return ", ".join(parts)
+    return ", ".join(parts) + ("" if region.is_box else ", and general inequalities")

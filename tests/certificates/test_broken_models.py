@@ -74,25 +74,27 @@ def test_nothing_is_enclosed_where_the_value_is_not_a_number(f):
     assert np.isfinite(model.enclose(np.array([[-9.0]]), np.array([[4.0]])).error).all()
 
 
-def test_infinite_derivatives_make_no_warning_and_no_proof():
+def test_infinite_derivatives_prove_nothing_and_hide_nothing_of_other_cells():
     system = scalar(lambda x: (1e154 * x) ** 2)
     region = bounded_region(system, box(0.0, 1.0))
     model = SmoothModel(system, region)
     assert np.isnan(model.enclose(region.lower[None], region.upper[None]).error).all()
     assert not cover(model, region, Form(np.eye(1), 0.9, np.eye(1)), 50).proved
-
-
-def test_a_cell_of_which_nothing_is_known_hides_nothing_of_the_others():
     ones, nothing = np.ones((1, 1, 1)), np.full((1, 1, 1), np.nan)
     centre = np.concatenate((ones, nothing))
-    enclosure = Enclosure(
+    corners, error = Enclosure(
         centre, np.concatenate((0.5 * ones[None], nothing[None])),
         np.concatenate((0.0 * ones, nothing)), np.zeros((2, 1)), centre,
-    )
-    corners, error = enclosure.corners()
+    ).corners()
     assert corners[0].min() - error[0].max() <= 0.5
     assert corners[0].max() + error[0].max() >= 1.5
     assert np.isnan(error[1]).all()
+
+
+ASK = (
+    lambda s, r: certify_detectability(s, r, seconds=2.0),
+    lambda s, r: certify_observer(s, GAIN, r, seconds=2.0),
+)
 
 
 @pytest.mark.parametrize("f", [
@@ -100,17 +102,12 @@ def test_a_cell_of_which_nothing_is_known_hides_nothing_of_the_others():
     lambda x: np.array([0.5 * float(x[0]) + (5.0 if x[0] > 0.3 else 0.0)]),
 ])
 def test_what_jumps_is_not_certified_from_its_derivatives(f):
-    for ask in (
-        lambda s, r: certify_detectability(s, r, eta=0.9, seconds=2.0),
-        lambda s, r: certify_observer(s, GAIN, r, seconds=2.0),
-    ):
+    for ask in ASK:
         with pytest.raises(NotCertifiedError, match=r"but not between \[.*may jump"):
             ask(scalar(f, lambda x: 0.0 * x), box(-0.973, 0.931))  # no sample is at a jump
 
 
-@pytest.mark.parametrize("ask", [
-    lambda s, r: certify_detectability(s, r), lambda s, r: certify_observer(s, GAIN, r),
-])
+@pytest.mark.parametrize("ask", ASK)
 def test_a_jump_in_the_middle_is_a_jump(ask):
     system = scalar(lambda x: np.array([0.5 * float(x[0]) + (5.0 if x[0] > 0.0 else 0.0)]))
     with pytest.raises(NotCertifiedError, match=r"f jumps at \[0.0\].*changes by 5"):

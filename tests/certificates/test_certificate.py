@@ -348,12 +348,33 @@ def region(states):
     return bounded_region(qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=n, p=n), states)
 
 
-def test_containment_of_boxes():
-    square, small = region(unit_box(2)), region(box([-0.4] * 2, [0.4] * 2))
-    assert beyond(small, square) == beyond(square, square) == ""
-    assert beyond(square, small) == ", ".join(
-        f"x[{j}] may be in [-1, 1], beyond [-0.4, 0.4]" for j in range(2)
-    )
+SQUARE, SMALL, WIDE = unit_box(2), box([-0.4] * 2, [0.4] * 2), box([-2.0] * 2, [2.0] * 2)
+DIAMOND = qpmhe.Polytope([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]], [1.0] * 4)
+
+
+def test_containment_of_boxes_and_polytopes():
+    for inner, outer in (
+        (SMALL, SQUARE), (SQUARE, SQUARE), (DIAMOND, WIDE & DIAMOND), (DIAMOND, DIAMOND),
+        (SMALL, DIAMOND), (DIAMOND & SMALL, DIAMOND), (DIAMOND, WIDE),
+    ):
+        assert beyond(region(inner), region(outer)) == "", (inner, outer)
+    # The diamond touches the square's sides, which rounding does not let be shown.
+    for inner, outer in (
+        (SQUARE, SMALL), (SQUARE, DIAMOND), (DIAMOND, SMALL), (DIAMOND, SQUARE)
+    ):
+        assert beyond(region(inner), region(outer)), (inner, outer)
+    assert "1 x[0] + 1 x[1] <= 1 " in beyond(region(SQUARE), region(DIAMOND))
+    rng, shown = np.random.default_rng(3), 0
+    for _ in range(20):
+        one, other = (
+            region(box([-side] * 3, [side] * 3)
+                   & qpmhe.Polytope(rng.standard_normal((4, 3)), 0.5 + rng.random(4)))
+            for side in (0.3, 3.0)
+        )
+        if beyond(one, other) == "":
+            shown += 1
+            assert other.contains(one.sample(200, rng)[:, :3]).all()
+    assert shown >= 1
 
 
 def test_figure_shows_error_and_bounds():
