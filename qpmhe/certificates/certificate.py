@@ -4,33 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, TypeVar
-
-import numpy as np
 
 from .._checks import Array, count
 from ..costs import Cost, CostConstants
 from ..errors import OptionError, QpmheError
-from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
-from .audit import (
-    Assumption,
-    about_corrections,
-    about_cost,
-    about_model,
-    about_output,
-    checked_ingredients,
-)
+from .audit import Assumption, about_corrections, about_cost, about_slope, checked_ingredients
 from .contraction import certify_detectability, constant_gain, gain_if_constant
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import (
     CertificateError,
     Evidence,
-    MismatchError,
     NotCertifiedError,
     OutOfTimeError,
     json_ready,
@@ -92,11 +80,6 @@ class Certificate:
     errors: Mapping[str, QpmheError] = field(default_factory=dict)
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
 
-    @cached_property
-    def gain(self) -> Array | None:
-        """The observer's constant gain, if it has one."""
-        return gain_if_constant(self.observer, self.system)
-
     @property
     def diameter(self) -> float:
         """The largest distance of two states of the region, or a little more."""
@@ -122,14 +105,18 @@ class Certificate:
         state, NaN from where the run shows that it no longer does; arguments and errors are those
         of `ObserverBound.along`. An `OptionError` is raised if there is no bound of the observer.
         """
+        band = self.proved.along(run, disturbances, noises, initial_error=initial_error)
+        return band.error
+
+    @property
+    def proved(self) -> ObserverBound:
+        """The observer's bound; an `OptionError` says why there is none."""
         if self.observer_bound is None:
             reason = self.errors.get(
                 "the observer", "its constants were stated, not certified: leave stability out."
             )
             raise OptionError(f"there is no bound of the observer: {reason}")
-        return self.observer_bound.along(
-            run, disturbances, noises, initial_error=initial_error
-        ).error
+        return self.observer_bound
 
     def of(self, horizon: int | None = None) -> TheoremConstants:
         """The theorem's constants for a horizon N, which may be left out if there is only one.
@@ -137,38 +124,18 @@ class Certificate:
         ``certificate.of(N).result.bound(...)`` is its bound (eq:RGES_result) along a run. An
         `OptionError` says for which horizons there are some, or why there are none.
         """
-        if horizon is None and len(self.constants) == 1:
-            return next(iter(self.constants.values()))
         if not self.constants:
             raise OptionError(
                 f"the theorem's constants could not be certified: {'; '.join(self.failures)}"
             )
+        if horizon is None and len(self.constants) == 1:
+            (horizon,) = self.constants
         if horizon is None or horizon not in self.constants:
             raise OptionError(
                 f"horizon is {horizon!r}; expected one of {list(self.constants)}, for which there "
                 "are constants. Certify again with this horizon."
             )
         return self.constants[horizon]
-
-    def check_estimator(self, estimator: MovingHorizonEstimator) -> None:
-        """Raise a `MismatchError` unless an estimator has this system, observer and cost.
-
-        An observer with the same constant gain is the same one, whatever its metric. The cost
-        matters only to the theorem's constants.
-        """
-        gain, own = gain_if_constant(estimator.observer, self.system), self.gain
-        for name, same in (
-            ("system", estimator.system is self.system),
-            ("observer", estimator.observer is self.observer or (
-                gain is not None and own is not None and np.array_equal(gain, own)
-            )),
-            ("cost", estimator.cost is self.cost or not self.constants),
-        ):
-            if not same:
-                raise MismatchError(
-                    f"the certificate is of another {name} than the estimator's; certify the very "
-                    "objects that the estimator is made of."
-                )
 
     @property
     def headline(self) -> str:
@@ -272,21 +239,13 @@ def examined(
 ) -> Certificate:
     """The certificate of `certify`, also where nothing holds: its errors say why."""
     errors: dict[str, QpmheError] = {}
-
-    def attempt(what: str, question: Callable[[], Result]) -> Result | None:
-        try:
-            return question()
-        except (NotCertifiedError, CertificateError) as error:
-            errors[what] = error
-            return None
-
-    attempt("the theorem", lambda: checked_ingredients(system, observer, cost))
+    _attempt(errors, "the theorem", lambda: checked_ingredients(system, observer, cost))
     chosen, gain = Sizes.of(sizes, system, cost), gain_if_constant(observer, system)
     if detectability is not None:
         detectability = fitting(detectability, system, region, gain)
     proved = None
     if stability is None:
-        proved = attempt("the observer", lambda: bound_observer(
+        proved = _attempt(errors, "the observer", lambda: bound_observer(
             system, observer, cost, region, sizes=chosen, seconds=deadline.part(_OBSERVER)
         ))
         stability = None if proved is None else proved.stability
@@ -301,7 +260,7 @@ def examined(
         system, observer, cost, region, chosen, proved, stability=stability, errors=errors
     )
     if "the theorem" not in errors:
-        certificate = _with_theorem(certificate, horizons, detectability, deadline, attempt)
+        certificate = _with_theorem(certificate, horizons, detectability, deadline, errors)
     if certificate.holds and stability is not None:
         parts = [stability.evidence]
         if certificate.constants and certificate.detectability is not None:
@@ -314,25 +273,25 @@ def examined(
 
 def _with_theorem(
     bare: Certificate, horizons: Sequence[int], detectability: Detectability | None,
-    deadline: Deadline, attempt: Callable[..., Any],
+    deadline: Deadline, errors: dict[str, QpmheError],
 ) -> Certificate:
     """The certificate with the theorem's assumptions and, where they hold, its constants."""
-    system, cost, region, stability = bare.system, bare.cost, bare.region, bare.stability
-    weights, about = about_cost(cost)
+    system, region, stability = bare.system, bare.region, bare.stability
+    weights, about = about_cost(bare.cost)
     if weights is None:
-        attempt("the theorem", lambda: _refused(about))
-    output = about_output(system, region, deadline.part(_OUTPUT))
+        errors["the theorem"] = CertificateError(f"{about.text}; the theorem needs them.")
+    output = about_slope(system, region, "h", deadline.part(_OUTPUT))
     found = [output, *about_corrections(system, bare.observer), about]
     if detectability is None:
-        detectability = attempt("detectability", lambda: certify_detectability(
+        detectability = _attempt(errors, "detectability", lambda: certify_detectability(
             system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
         ))
     constants: dict[int, TheoremConstants] = {}
     if weights is not None and detectability is not None and stability is not None:
-        slope, proved, bent = output.value, bare.observer_bound, None
+        slope, bound, bent = output.value, bare.observer_bound, None
         assert slope is not None
-        if system.states is not None and proved is not None and proved.projects:
-            found.append(about_model(system, region, deadline))
+        if system.states is not None and bound is not None and bound.projects:
+            found.append(about_slope(system, region, "f", deadline))
             bent = found[-1].value
         observer = stability.sums
         if slope > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
@@ -349,8 +308,14 @@ def _with_theorem(
     )
 
 
-def _refused(about: Assumption) -> None:
-    raise CertificateError(f"{about.text}; the theorem needs them.")
+def _attempt(
+    errors: dict[str, QpmheError], what: str, question: Callable[[], Result]
+) -> Result | None:
+    try:
+        return question()
+    except (NotCertifiedError, CertificateError) as error:
+        errors[what] = error
+        return None
 
 
 def _cheapest(constants: CostConstants | None) -> tuple[float, float]:

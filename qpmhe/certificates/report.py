@@ -24,7 +24,6 @@ from .contraction import certify_observer, synthesise_gain
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import CertificateError, NotCertifiedError, json_ready
 from .lyapunov import Design
-from .monitor import Monitor, monitored_run
 from .observer_bound import Band, ObserverBound
 from .properties import ObserverStability
 from .regions import Region, bounded_region
@@ -43,7 +42,7 @@ _QPS = 2  # a sample, in the run on the simulated record
 
 @dataclass(eq=False)
 class Report:
-    """What was certified of a model, what was not, and a monitored run on a simulated record.
+    """What was certified of a model, what was not, and a run on a simulated record.
 
     Made by `certify_model`.
 
@@ -55,9 +54,9 @@ class Report:
         How the model is simulated, if that is known, and a simulated record.
     certificate : Certificate
         What could be certified, with the reasons where something could not; perhaps nothing.
-    run, band, monitor : Run, Band and Monitor, or None
-        Where something bounds the error: the estimator's run on the record, with the largest
-        horizon and two QPs a sample, the observer's bound along it, and what the monitor saw.
+    run, band : Run and Band, or None
+        Where the observer has a bound: the estimator's run on the record, with the largest
+        horizon and two QPs a sample, and the bound along it.
     replaced : str
         Which observer took the place of the model's own, and why; empty if none did.
     design : Design or None
@@ -70,26 +69,16 @@ class Report:
     certificate: Certificate
     run: Run | None = None
     band: Band | None = None
-    monitor: Monitor | None = None
     replaced: str = ""
     design: Design | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything in types that JSON knows; rates that are not known are None."""
+        """Everything in types that JSON knows."""
         certificate = self.certificate
-        suggestions = [
-            text for each in certificate.errors.values()
-            for text in getattr(each, "suggestions", ())
-        ]
         return certificate.to_dict() | {
             "model": self.name, "certified": certificate.holds, "replaced": self.replaced,
-            "monitor": self.monitor and self.monitor.summary(),
-            "monitored": json_ready(self.monitor), "design": json_ready(self.design),
-            "suggestions": list(dict.fromkeys(suggestions)),
-            "smallest_rates": {
-                name: getattr(certificate.errors.get(what), "smallest_rate", None)
-                for name, what in (("eta", "detectability"), ("rho", "the observer"))
-            },
+            "simulated": "" if self.band is None else str(self.band),
+            "design": json_ready(self.design),
         }
 
     def draw(self, axes: Any = None) -> Any:
@@ -100,17 +89,15 @@ class Report:
         certificate, run, record, scenario = self.certificate, self.run, self.record, self.scenario
         if run is None or record is None or scenario is None:
             raise InvalidInputError(
-                "there is no certificate or no scenario to simulate, hence no run and no bound to "
-                "draw."
+                "there is no bound of the observer or no scenario to simulate, hence no run and no "
+                "bound to draw."
             )
-        system, steps = certificate.system, len(record.measurements)
+        f, h, steps = certificate.system.f, certificate.system.h, len(run)
         u = np.zeros((steps, 0)) if record.inputs is None else record.inputs
-        w = record.states[1:] - system.f.batch(record.states[:-1], u)
-        v = record.measurements - system.h.batch(record.states[:-1], u)
+        w = record.states[1:] - f.batch(record.states[:-1], u)
+        v = record.measurements - h.batch(record.states[:-1], u)
         start = record.states[0] - run.observer_states[0]
-        bounds = {}
-        if certificate.observer_bound is not None:
-            bounds[LABELS["observer"]] = certificate.bound(run, w, v, initial_error=start)
+        bounds = {LABELS["observer"]: certificate.bound(run, w, v, initial_error=start)}
         if certificate.constants:
             lengths = (np.linalg.norm(each, axis=1) for each in (w, v))
             last = certificate.of(max(certificate.constants))
@@ -146,7 +133,7 @@ def certify_model(
     inputs: Box | None = None, seed: int = 0, seconds: float | Deadline = DEFAULT_SECONDS,
     name: str = "",
 ) -> Report:
-    """Certify a model as far as possible, and monitor its estimator on a simulated record.
+    """Certify a model as far as possible, and follow its estimator on a simulated record.
 
     The observer, the assumptions and detectability are each examined, whatever is found of the
     others.
@@ -194,17 +181,14 @@ def certify_model(
     )
     title = "" if scenario is None else scenario.title
     report = Report(name or title, scenario, record, certificate, replaced=replaced)
-    if certificate.holds and scenario is not None and record is not None:
+    proved = certificate.observer_bound
+    if proved is not None and scenario is not None and record is not None:
         mhe = MovingHorizonEstimator(
             system, observer, cost, horizon=horizons[-1],
             initial_state=scenario.initial_estimate, max_qps=_QPS, engine="python",
         )
-        start = initial_error(scenario)
-        report.run, report.monitor = monitored_run(
-            certificate, mhe, record.measurements, record.inputs, initial_error=start
-        )
-        if certificate.observer_bound is not None:
-            report.band = certificate.observer_bound.along(report.run, initial_error=start)
+        report.run = mhe.run(record.measurements, record.inputs)
+        report.band = proved.along(report.run, initial_error=initial_error(scenario))
     return report
 
 
