@@ -13,7 +13,7 @@ from ..observers import Observer
 from .branch_and_bound import lipschitz
 from .contraction import gain_if_constant
 from .deadline import Deadline
-from .evidence import CertificateError, Evidence, json_ready
+from .evidence import CertificateError, Evidence
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region
 
@@ -42,11 +42,6 @@ class Assumption:
     evidence: Evidence | None
     text: str
     value: float | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """The finding in types that JSON knows; numbers that are not finite become None."""
-        content: dict[str, Any] = json_ready(vars(self))
-        return content
 
 
 def about_slope(

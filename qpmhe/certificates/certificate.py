@@ -63,8 +63,8 @@ class Certificate:
     errors : mapping of str to QpmheError
         What could not be certified, and why.
     evidence : Evidence
-        What the theorem's constants rest on, the weakest evidence among their ingredients'; where
-        there are none, what the observer's bound rests on.
+        The weakest that the theorem's constants rest on; where there are none, the observer's
+        bound.
     """
 
     system: System
@@ -144,15 +144,12 @@ class Certificate:
             return "No bound of the observer's error is proved."
         return self.observer_bound.headline
 
-    def summary(self) -> str:
-        """The headline, for what it holds, what it rests on, and what could not be certified."""
-        lines = [self.headline]
-        if self.observer_bound is not None:
-            lines += [f"for {self.observer_bound.sizes}", self.observer_bound.condition]
-        return "\n".join([*lines, *(f"Not certified: {each}" for each in self.failures)])
-
     def __str__(self) -> str:
-        return self.summary()
+        """The headline, for what it holds, what it rests on, and what could not be certified."""
+        bound = self.observer_bound
+        lines = [] if bound is None else [f"for {bound.sizes}", bound.condition]
+        failures = (f"Not certified: {each}" for each in self.failures)
+        return "\n".join([self.headline, *lines, *failures])
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
@@ -163,10 +160,16 @@ class Certificate:
             "assumed": ASSUMED, "failures": self.failures, "observer_bound": self.observer_bound,
             "assumptions": self.assumptions, "detectability": self.detectability,
             "observer": self.stability, "sizes": self.sizes, "paper": [
-                each.to_dict(self.sizes.largest, self.diameter) for each in self.constants.values()
+                json_ready(each) | {"limit": limit, "vacuous": not limit < self.diameter}
+                for each, limit in self.limits()
             ],
         })
         return content
+
+    def limits(self) -> list[tuple[TheoremConstants, float]]:
+        """What the theorem's bounds tend to for the sizes; vacuous from the diameter on."""
+        sizes = self.sizes.largest
+        return [(each, each.result.limit(*sizes)) for each in self.constants.values()]
 
 
 Result = TypeVar("Result")
@@ -239,13 +242,21 @@ def examined(
 ) -> Certificate:
     """The certificate of `certify`, also where nothing holds: its errors say why."""
     errors: dict[str, QpmheError] = {}
-    _attempt(errors, "the theorem", lambda: checked_ingredients(system, observer, cost))
+
+    def attempt(what: str, question: Callable[[], Result]) -> Result | None:
+        try:
+            return question()
+        except (NotCertifiedError, CertificateError) as error:
+            errors[what] = error
+            return None
+
+    attempt("the theorem", lambda: checked_ingredients(system, observer, cost))
     chosen, gain = Sizes.of(sizes, system, cost), gain_if_constant(observer, system)
     if detectability is not None:
         detectability = fitting(detectability, system, region, gain)
     proved = None
     if stability is None:
-        proved = _attempt(errors, "the observer", lambda: bound_observer(
+        proved = attempt("the observer", lambda: bound_observer(
             system, observer, cost, region, sizes=chosen, seconds=deadline.part(_OBSERVER)
         ))
         stability = None if proved is None else proved.stability
@@ -256,66 +267,51 @@ def examined(
                 ObserverBound(stability, region, chosen, observer.metric), system,
                 deadline.part(_INVARIANCE),
             )
-    certificate = Certificate(
-        system, observer, cost, region, chosen, proved, stability=stability, errors=errors
-    )
-    if "the theorem" not in errors:
-        certificate = _with_theorem(certificate, horizons, detectability, deadline, errors)
-    if certificate.holds and stability is not None:
-        parts = [stability.evidence]
-        if certificate.constants and certificate.detectability is not None:
-            parts += [certificate.detectability.evidence] + [
-                each.evidence for each in certificate.assumptions if each.evidence is not None
-            ]
-        object.__setattr__(certificate, "evidence", weakest(parts))
-    return certificate
-
-
-def _with_theorem(
-    bare: Certificate, horizons: Sequence[int], detectability: Detectability | None,
-    deadline: Deadline, errors: dict[str, QpmheError],
-) -> Certificate:
-    """The certificate with the theorem's assumptions and, where they hold, its constants."""
-    system, region, stability = bare.system, bare.region, bare.stability
-    weights, about = about_cost(bare.cost)
-    if weights is None:
-        errors["the theorem"] = CertificateError(f"{about.text}; the theorem needs them.")
-    output = about_slope(system, region, "h", deadline.part(_OUTPUT))
-    found = [output, *about_corrections(system, bare.observer), about]
-    if detectability is None:
-        detectability = _attempt(errors, "detectability", lambda: certify_detectability(
-            system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
-        ))
+    assumptions: tuple[Assumption, ...] = ()
     constants: dict[int, TheoremConstants] = {}
-    if weights is not None and detectability is not None and stability is not None:
-        slope, bound, bent = output.value, bare.observer_bound, None
-        assert slope is not None
-        if system.states is not None and bound is not None and bound.projects:
-            found.append(about_slope(system, region, "f", deadline))
-            bent = found[-1].value
-        observer = stability.sums
-        if slope > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
-            observer = replace(observer, noise=max(observer.noise, 1.0 / slope))
-        constants = {
-            N: TheoremConstants(
-                detectability.sums, observer, weights, kappa=stability.kappa, lipschitz=slope,
-                horizon=N, model_lipschitz=bent,
-            )
-            for N in horizons
-        }
-    return replace(
-        bare, assumptions=tuple(found), detectability=detectability, constants=constants
+    parts = [] if stability is None else [stability.evidence]
+    if "the theorem" not in errors:
+        weights, about = about_cost(cost)
+        if weights is None:
+            errors["the theorem"] = CertificateError(f"{about.text}; the theorem needs them.")
+        output = about_slope(system, region, "h", deadline.part(_OUTPUT))
+        assumptions = output, *about_corrections(system, observer), about
+        if detectability is None:
+            detectability = attempt("detectability", lambda: certify_detectability(
+                system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
+            ))
+        if weights is not None and detectability is not None and stability is not None:
+            if system.states is not None and proved is not None and proved.projects:
+                assumptions = *assumptions, about_slope(system, region, "f", deadline)
+            constants = _theorem(assumptions, weights, detectability, stability, horizons)
+            parts += [detectability.evidence, *(
+                each.evidence for each in assumptions if each.evidence is not None
+            )]
+    found = Certificate(
+        system, observer, cost, region, chosen, proved, assumptions, detectability, stability,
+        constants, errors,
     )
+    if found.holds:
+        object.__setattr__(found, "evidence", weakest(parts))
+    return found
 
 
-def _attempt(
-    errors: dict[str, QpmheError], what: str, question: Callable[[], Result]
-) -> Result | None:
-    try:
-        return question()
-    except (NotCertifiedError, CertificateError) as error:
-        errors[what] = error
-        return None
+def _theorem(
+    assumptions: Sequence[Assumption], weights: CostConstants, detectability: Detectability,
+    stability: ObserverStability, horizons: Sequence[int],
+) -> dict[int, TheoremConstants]:
+    """The constants for each horizon."""
+    values = {each.label: each.value for each in assumptions}
+    slope, observer = values["ass:lipschitz"] or 0.0, stability.sums
+    if slope > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
+        observer = replace(observer, noise=max(observer.noise, 1.0 / slope))
+    return {
+        N: TheoremConstants(
+            detectability.sums, observer, weights, kappa=stability.kappa, lipschitz=slope,
+            horizon=N, model_lipschitz=values.get("in place of eq:kappa"),
+        )
+        for N in horizons
+    }
 
 
 def _cheapest(constants: CostConstants | None) -> tuple[float, float]:

@@ -64,8 +64,8 @@ class Design:
     sizes : Sizes
         The largest disturbances and noises.
     horizon : int
-        The horizon given, or the least one whose limit for a minimiser is at most a tenth above
-        that of endless horizons.
+        The given one, or the least one whose limit for a minimiser is at most a tenth above the one
+        of endless horizons.
     evidence : Evidence
         What the inequality rests on.
     notes : tuple of str
@@ -211,27 +211,23 @@ class Design:
     def _check(self, source: MovingHorizonEstimator) -> None:
         """Raise a `MismatchError` unless the bound is of this estimator."""
         cost, settings = source.cost, source.settings
-        if source.system is not self.system:
-            raise MismatchError("the estimator is of another system; design for its own.")
         same = isinstance(cost, QuadraticCost) and cost.discount == self.discount and all(
             np.array_equal(getattr(cost, name), getattr(self, name))
             for name in ("prior", "disturbance", "noise")
         )
-        if not same or source.has_changed or settings.arrival != "observer":
-            raise MismatchError(
-                "the estimator has other weights, another discount, or arrival='smoothed'; make it "
-                "with cost=design.cost() and leave arrival out."
-            )
-        if source.system.held:
-            raise MismatchError(
-                "the estimator holds parameters, a term of J that the bound does not have; make "
-                "its system without hold."
-            )
-        if settings.candidate != "reinitialized":
-            raise MismatchError(
-                f"the estimator has candidate={settings.candidate!r}, whose prior is the running "
-                "observer's; make it with candidate='reinitialized', or take the observer's bound."
-            )
+        for differs, text in (
+            (source.system is not self.system, "is of another system; design for its own"),
+            (not same or source.has_changed or settings.arrival != "observer",
+             "has other weights, another discount, or arrival='smoothed'; make it with "
+             "cost=design.cost() and leave arrival out"),
+            (source.system.held, "holds parameters, a term of J that the bound does not have; make "
+             "its system without hold"),
+            (settings.candidate != "reinitialized",
+             f"has candidate={settings.candidate!r}, whose prior is the running observer's; make "
+             "it with candidate='reinitialized', or take the observer's bound"),
+        ):
+            if differs:
+                raise MismatchError(f"the estimator {text}.")
 
     def code(self) -> str:
         """Python that makes the cost and says which horizon and candidate belong to it."""
@@ -251,12 +247,13 @@ class Design:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
-        content: dict[str, Any] = json_ready({
-            "prior": self.prior, "disturbance": self.disturbance, "noise": self.noise,
-            "discount": self.discount, "horizon": self.horizon, "region": self.region,
-            "sizes": self.sizes, "evidence": self.evidence, "notes": self.notes,
-            "contraction": self.contraction(),
-            "least_horizon": self.least_horizon(), "limit": self.components(self.limit()),
+        names = (
+            "prior", "disturbance", "noise", "discount", "horizon", "region", "sizes", "evidence",
+            "notes",
+        )
+        content: dict[str, Any] = json_ready({name: getattr(self, name) for name in names} | {
+            "contraction": self.contraction(), "least_horizon": self.least_horizon(),
+            "limit": self.components(self.limit()),
         })
         return content
 
@@ -326,7 +323,7 @@ def design(
 
 
 def _sizes(system: System, sizes: Sizes | None) -> Sizes:
-    """What is stated, or else the system's W and V."""
+    """The stated ones, or else the system's W and V."""
     if sizes is not None:
         return Sizes.stated(sizes)
     if system.disturbances is None or system.noises is None:

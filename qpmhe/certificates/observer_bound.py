@@ -15,9 +15,9 @@ or detectability enters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,7 @@ from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region
 from .properties import ObserverStability
 from .regions import Region, bounded_region
-from .sizes import OUTWARD, UNIT, Size, Sizes, lengths_of, sides_of, weighted_lengths
+from .sizes import OUTWARD, UNIT, Size, Sizes, lengths_of, weighted_lengths
 
 # How close to its limit the bound is when it is called settled, and in how many samples at most.
 _SETTLED, _MOST_SAMPLES = 0.1, 10**6
@@ -348,28 +348,23 @@ class ObserverBound:
         steps (T,) beside the one that is certified.
         """
         events = _EVENTS if self.projects else _EVENTS | {Status.OBSERVER_PROJECTED: _PROJECTED}
-        where: list[tuple[Any, Callable[[int], str]]] = [
-            ((flags & flag.value) != 0, lambda _, text=text: text)  # type: ignore[misc]
-            for flag, text in events.items()
+        where: list[tuple[Any, str, Any]] = [
+            ((flags & flag.value) != 0, text, flags) for flag, text in events.items()
         ]
-        where.append((~self.region.contains(observer), lambda t: (
-            f"the observer was outside of the region, at {np.round(observer[t], 6).tolist()}"
-        )))
+        outside = "the observer was outside of the region, at {}"
+        where.append((~self.region.contains(observer), outside, observer))
         if inputs is not None:
             low, high = self.region.lower[self.region.n :], self.region.upper[self.region.n :]
-            where.append((~((low <= inputs) & (inputs <= high)).all(axis=1), lambda t: (
-                f"the input {inputs[t].tolist()} is outside of what was certified"
-            )))
+            beyond = ~((low <= inputs) & (inputs <= high)).all(axis=1)
+            where.append((beyond, "the input {} is outside of what was certified", inputs))
         if steps is not None:
-            lengths = np.asarray(steps)
-            where.append((lengths != usual, lambda t: (
-                f"the step had the length {lengths[t]:.6g}, and {usual or 0.0:.6g} is certified"
-            )))
-        first = [(int(there.argmax()), k) for k, (there, _) in enumerate(where) if there.any()]
+            text = f"the step had the length {{}}, and {usual or 0.0:.6g} is certified"
+            where.append((np.asarray(steps) != usual, text, np.asarray(steps)))
+        first = [(int(there.argmax()), *rest) for there, *rest in where if there.any()]
         if not first:
             return None, ""
-        t, k = min(first)
-        return t, where[k][1](t)
+        t, text, values = min(first, key=itemgetter(0))
+        return t, text.format(np.round(values[t], 6).tolist())
 
     def is_empty(self, radius: ArrayLike, observer: Array) -> NDArray[np.bool_]:
         """Whether no state of the region is in the set around z."""
@@ -377,15 +372,14 @@ class ObserverBound:
         return np.asarray(np.any(lower > upper, axis=-1))
 
     @property
-    def widths(self) -> Array:
-        """How wide the region is in each component, (n,)."""
+    def _widths(self) -> Array:
         n = self.region.n
         return self.region.upper[:n] - self.region.lower[:n]
 
     @property
     def settling_samples(self) -> int | None:
         """Samples until b(t) is within 10 % of its limit, from anywhere; None where that is 0."""
-        radius, limit = self.initial(Box(-self.widths, self.widths)), self.limit()
+        radius, limit = self.initial(Box(-self._widths, self._widths)), self.limit()
         if not limit > 0.0:
             return None
         entering, samples = self.entering(), 0
@@ -399,8 +393,8 @@ class ObserverBound:
         limit, after = self.components(self.limit()), self.settling_samples
         each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {size:.2g}" for i, size in enumerate(limit))
         when = f" after {after} samples" if after else ""
-        wide = " x ".join(f"{width:.3g}" for width in self.widths)
-        vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self.widths))
+        wide = " x ".join(f"{width:.3g}" for width in self._widths)
+        vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self._widths))
         nothing = f": it says nothing of {vacuous}" if vacuous else ""
         stays = self.invariance is not None and self.invariance.holds
         condition = "" if stays else " while x stays in the region"
@@ -410,9 +404,10 @@ class ObserverBound:
     def condition(self) -> str:
         """Whether state and observer stay in the region, in words."""
         if self.inner is not None:
-            low, high = self.inner.region.lower, self.inner.region.upper
+            sides = zip(self.inner.region.lower, self.inner.region.upper, strict=True)
             start = ", ".join(
-                f"x{i + 1} in [{low[i]:.4g}, {high[i]:.4g}]" for i in range(self.region.n)
+                f"x{i + 1} in [{low:.4g}, {high:.4g}]"
+                for i, (low, high) in enumerate(sides) if i < self.region.n
             )
             return (
                 f"x and z stay in the region (proved) from {start} on, if the initial error is at "
@@ -426,11 +421,10 @@ class ObserverBound:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""
+        names = ("evidence", "rate", "metric", "gain", "sizes", "condition", "invariance")
         limit = self.limit()
-        content: dict[str, Any] = json_ready({
-            "evidence": self.evidence, "rate": self.rate, "metric": self.metric,
-            "gain": self.gain, "sizes": self.sizes, "limit": limit, "condition": self.condition,
-            "invariance": self.invariance, "components": self.components(limit),
+        content: dict[str, Any] = json_ready({name: getattr(self, name) for name in names} | {
+            "limit": limit, "components": self.components(limit),
             "length": self.farthest(limit, np.zeros(len(self.gain))),
         })
         return content
@@ -461,16 +455,15 @@ def with_invariance(
     """The bound with what is found of whether state and observer stay in the region."""
     if system.disturbance_matrix is not None:
         return bound
-    deadline, w = Deadline.of(seconds), bound.sizes.disturbance
-    size: Any = np.abs(sides_of("disturbances", w)).max(axis=0) if isinstance(w, ConvexSet) else w
+    deadline, size, inner = Deadline.of(seconds), bound.sizes.extent[0], None
     found = certify_invariance(
         system, bound.region, disturbance=size, seconds=deadline.part(_INVARIANCE)
     )
-    kept: Invariance | None = None
     region = inner_region(bound.region, bound.metric, bound.limit())
     if region is not None:
-        kept = certify_invariance(system, region, disturbance=size, seconds=deadline)
-    return replace(bound, invariance=found, inner=kept if kept is not None and kept.holds else None)
+        inner = certify_invariance(system, region, disturbance=size, seconds=deadline)
+    kept = inner is not None and inner.holds
+    return replace(bound, invariance=found, inner=inner if kept else None)
 
 
 def initial_length(error: Size, weight: Array) -> float:

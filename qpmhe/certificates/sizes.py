@@ -133,13 +133,6 @@ class Sizes:
     def __str__(self) -> str:
         return f"{_words('w', self.disturbance)}, {_words('v', self.noise)} ({self.source})"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything in types that JSON knows."""
-        return {"source": self.source} | {
-            name: sides_of(name, given).tolist() if isinstance(given, ConvexSet) else float(given)
-            for name, given in (("disturbance", self.disturbance), ("noise", self.noise))
-        }
-
 
 def sides_of(name: str, given: ConvexSet) -> Array:
     """Sides (2, n) of the box around a set, which must be bounded."""

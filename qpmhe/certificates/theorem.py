@@ -247,17 +247,6 @@ class TheoremConstants:
             checked_length("model_lipschitz", self.model_lipschitz)
             positive("the observer's C_w", self.observer.disturbance)
 
-    def to_dict(self, sizes: tuple[float, float], diameter: float) -> dict[str, Any]:
-        """The constants, and the limit for the largest |w| and |v|, in types that JSON knows.
-
-        The limit is vacuous if it is no less than the region's diameter.
-        """
-        given = ("detectability", "observer", "cost", "result", "lam")
-        limit = self.result.limit(*sizes)
-        return {name: value for name, value in vars(self).items() if name not in given} | {
-            "lambda": self.lam, "limit": limit, "vacuous": not limit < diameter,
-        }
-
 
 def _geometric(slope: float, count: int) -> float:
     """The sum of exp(k slope) over k = 0, ..., count - 1, accurate for small slopes."""

@@ -110,8 +110,7 @@ def certify(
         str | None, typer.Option(help="Horizons N, separated by commas. Default: the model's own.")
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(help="Write all results to this JSON file, and a picture beside "
-                                       "it.")
+        Path | None, typer.Option(help="Write all results to this JSON file.")
     ] = None,
     input_box: Annotated[
         str | None, typer.Option(help="Bounds on the inputs, in the form of --box.")

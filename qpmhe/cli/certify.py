@@ -35,8 +35,7 @@ def certify(
     if report is not None:  # before any work
         if report.suffix != ".json":
             raise OptionError(
-                f"--report is {str(report)!r}; expected a file name that ends with .json, beside "
-                "which the picture goes as .png and .svg."
+                f"--report is {str(report)!r}; expected a file name that ends with .json."
             )
         make_folder(report.parent)
     source = find(model)
@@ -71,8 +70,8 @@ def certify(
     if with_design:
         found.design = _designed(console, certificate, horizons, seconds)
     if report is not None:
-        for path in found.save(report):
-            console.print(f"wrote {escape(str(path))}", highlight=False, soft_wrap=True)
+        found.save(report)
+        console.print(f"wrote {escape(str(report))}", highlight=False, soft_wrap=True)
     return certificate.holds
 
 
@@ -113,14 +112,13 @@ def _findings(found: Report, seed: int) -> Rows:
             "simulated", f"seed {seed}: the largest |x - x_hat| is {errors[held].max():.3g}, and "
             f"the largest bound {found.band.error[held].max():.3g}; {found.band}",
         ))
-    for N, each in certificate.constants.items():
-        limit = each.result.limit(*certificate.sizes.largest)
+    for each, limit in certificate.limits():
         vacuous = ""
         if not limit < certificate.diameter:
             vacuous = f": vacuous, the region's diameter is {certificate.diameter:.3g}"
         rows.append((
-            f"N = {N}", f"|x - x_hat| <= {limit:.4g} in the limit by the paper's constants "
-            f"({certificate.evidence}){vacuous}",
+            f"N = {each.horizon}", f"|x - x_hat| <= {limit:.4g} in the limit by the paper's "
+            f"constants ({certificate.evidence}){vacuous}",
         ))
     return rows
 

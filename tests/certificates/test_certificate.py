@@ -99,7 +99,7 @@ def test_json_holds_everything(reactor):
     assert content["evidence"] == content["detectability"]["evidence"] == "proved"
     for N, each in zip((1, 5, 10), content["paper"], strict=True):
         paper = certificate.of(N)
-        assert (each["horizon"], each["C"], each["lambda"]) == (N, list(paper.C), paper.lam)
+        assert (each["horizon"], each["C"], each["lam"]) == (N, list(paper.C), paper.lam)
         assert each["limit"] == pytest.approx(paper.result.limit(*certificate.sizes.largest))
         assert each["vacuous"] is True
     assert [each["name"] for each in content["assumptions"]] == [
@@ -162,7 +162,7 @@ def test_a_cost_without_constants_leaves_the_observers_bound(reactor, cost, word
     assert list(found.errors) == ["the theorem"]
     assert words in str(found.errors["the theorem"])
     assert found.headline.startswith("|x1 - z1| <= ")
-    assert "Not certified: the theorem: the cost has no constants" in found.summary()
+    assert "Not certified: the theorem: the cost has no constants" in str(found)
     with pytest.raises(OptionError, match=rf"could not be certified.*{words}"):
         found.of()
 
@@ -318,3 +318,16 @@ def test_containment_of_boxes_and_polytopes():
             shown += 1
             assert other.contains(one.sample(200, rng)[:, :3]).all()
     assert shown >= 1
+
+
+def test_figure_shows_error_and_bounds():
+    axes = qpmhe.plots.error_and_bounds(
+        np.arange(3.0), np.array([1.0, 0.0, 0.2]), {"one": np.full(3, 30.0)},
+        diameter=3.0,
+    )
+    assert axes.get_yscale() == "log"
+    labels = [text.get_text() for text in axes.get_figure().legends[0].get_texts()]
+    assert labels == ["error", "one"]
+    assert axes.get_ylim()[1] > 30.0
+    with pytest.raises(ShapeError, match="error"):
+        qpmhe.plots.error_and_bounds(np.arange(5.0), np.ones(4), {})

@@ -264,7 +264,7 @@ def scalar_certificate(slope, w=0.01):
 def test_a_region_that_the_state_leaves_is_said_first():
     certificate = scalar_certificate(1.5)
     assert "(proved while x stays in the region)" in certificate.headline
-    text = certificate.summary()
+    text = str(certificate)
     assert "not proved that x stays in the region: f and the disturbances reach x1 = " in text
     assert "1.51 through the face" in text
     assert certificate.observer_bound.inner is None
@@ -297,7 +297,7 @@ def test_time_up_leaves_what_was_reached(monkeypatch):
     assert certificate.observer_bound.evidence is Evidence.PROVED
     assert isinstance(certificate.errors["detectability"], OutOfTimeError)
     assert not certificate.constants
-    assert "Not certified: detectability: the time for this search" in certificate.summary()
+    assert "Not certified: detectability: the time for this search" in str(certificate)
     monkeypatch.setattr(observer_bound, "certify_observer", late)
     with pytest.raises(OutOfTimeError, match="more seconds"):
         scalar_certificate(0.8)
