@@ -11,7 +11,7 @@ from .evidence import (
     OutOfTimeError,
 )
 from .lyapunov import Design, design
-from .monitor import Monitor, Reading, monitored_run
+from .monitor import Monitor, Reading
 from .observer_bound import Band, ObserverBound
 from .properties import Detectability, ObserverStability
 from .regions import Region
@@ -24,5 +24,5 @@ __all__ = [
     "Detectability", "Evidence", "MismatchError", "Monitor", "NotCertifiedError",
     "ObserverBound", "ObserverStability", "OutOfTimeError", "Reading", "Region", "Report", "Sizes",
     "Synthesis", "TheoremConstants", "certify", "certify_detectability", "certify_model",
-    "certify_observer", "design", "monitored_run", "synthesise_gain",
+    "certify_observer", "design", "synthesise_gain",
 ]

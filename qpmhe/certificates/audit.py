@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, ShapeError
@@ -13,7 +13,7 @@ from ..observers import Observer
 from .branch_and_bound import lipschitz
 from .contraction import gain_if_constant
 from .deadline import Deadline
-from .evidence import CertificateError, Evidence, json_ready
+from .evidence import CertificateError, Evidence
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region
 
@@ -33,7 +33,7 @@ class Assumption:
     text : str
         What was found, in words.
     value : float or None
-        The constant: L_h or kappa in units of the system, or the cost's exponent.
+        The constant: L_h, L_f or kappa in units of the system, or the cost's exponent.
     """
 
     name: str
@@ -43,28 +43,17 @@ class Assumption:
     text: str
     value: float | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """The finding in types that JSON knows; numbers that are not finite become None."""
-        content: dict[str, Any] = json_ready(vars(self))
-        return content
 
-
-def about_output(system: System, region: Region, deadline: Deadline) -> Assumption:
-    """L_h, Assumption ass:lipschitz."""
-    slope = lipschitz(system, region, "h", deadline)
-    return Assumption(
-        "output Lipschitz", "ass:lipschitz", True, slope.evidence,
-        f"L_h = {slope.value:.6g}, {slope.note}", slope.value,
-    )
-
-
-def about_model(system: System, region: Region, deadline: Deadline) -> Assumption:
-    """L_f, which takes the place of kappa where the observer is projected."""
-    slope = lipschitz(system, region, "f", deadline)
-    return Assumption(
-        "model Lipschitz", "in place of eq:kappa", True, slope.evidence,
-        f"L_f = {slope.value:.6g}, {slope.note}, for the projected observer", slope.value,
-    )
+def about_slope(
+    system: System, region: Region, function: Literal["f", "h"], deadline: Deadline
+) -> Assumption:
+    """L_h; or L_f, which takes the place of kappa where the observer is projected."""
+    slope = lipschitz(system, region, function, deadline)
+    name, label = {
+        "h": ("output Lipschitz", "ass:lipschitz"), "f": ("model Lipschitz", "in place of eq:kappa")
+    }[function]
+    text = f"L_{function} = {slope.value:.6g}, {slope.note}"
+    return Assumption(name, label, True, slope.evidence, text, slope.value)
 
 
 def about_corrections(system: System, observer: Observer) -> tuple[Assumption, Assumption]:
@@ -72,19 +61,19 @@ def about_corrections(system: System, observer: Observer) -> tuple[Assumption, A
     none = partial(Assumption, "no correction without error", "ass:observer_0")
     bound = partial(Assumption, "correction bound", "eq:kappa")
     gain = gain_if_constant(observer, system)
-    if gain is not None:
-        kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
-        return none(True, Evidence.PROVED, "L(z, v) = L v vanishes with v"), bound(
-            True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa
-        )
-    stated = f"{type(observer).__name__} has no constant gain: its constants are stated"
-    return none(True, Evidence.ASSUMED, stated), bound(None, None, stated)
+    if gain is None:
+        stated = f"{type(observer).__name__} has no constant gain: its constants are stated"
+        return none(True, Evidence.ASSUMED, stated), bound(None, None, stated)
+    kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
+    return none(True, Evidence.PROVED, "L(z, v) = L v vanishes with v"), bound(
+        True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa
+    )
 
 
 def about_cost(cost: Cost) -> tuple[CostConstants | None, Assumption]:
     """The cost's constants, rounded outward where they could be, Assumption ass:stagecosts."""
     found = partial(Assumption, "cost bounds", "ass:stagecosts")
-    constants = cost.constants
+    constants, evidence, stated = cost.constants, Evidence.ASSUMED, ", as the cost states them"
     if constants is None:
         why = (
             f"the discount {cost.discount:.6g} makes the lower bounds shrink with a stage's age"
@@ -94,7 +83,6 @@ def about_cost(cost: Cost) -> tuple[CostConstants | None, Assumption]:
             else "its terms are not bounded by powers with one exponent, above and below"
         )
         return None, found(False, Evidence.PROVED, f"the cost has no constants: {why}")
-    evidence, stated = Evidence.ASSUMED, ", as the cost states them"
     if cost.quadratic:
         evidence, stated, (low, high) = Evidence.PROVED, "", constants.prior
         prior = (
@@ -116,7 +104,7 @@ def about_cost(cost: Cost) -> tuple[CostConstants | None, Assumption]:
 
 
 def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:
-    """Check that system, observer and cost go together."""
+    """Check that system, observer and cost go together, and that the theorem covers them."""
     checked_system(system)
     if system.extensions:
         raise CertificateError(

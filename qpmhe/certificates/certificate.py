@@ -4,33 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, TypeVar
-
-import numpy as np
 
 from .._checks import Array, count
 from ..costs import Cost, CostConstants
 from ..errors import OptionError, QpmheError
-from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
-from .audit import (
-    Assumption,
-    about_corrections,
-    about_cost,
-    about_model,
-    about_output,
-    checked_ingredients,
-)
+from .audit import Assumption, about_corrections, about_cost, about_slope, checked_ingredients
 from .contraction import certify_detectability, constant_gain, gain_if_constant
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import (
     CertificateError,
     Evidence,
-    MismatchError,
     NotCertifiedError,
     OutOfTimeError,
     json_ready,
@@ -75,8 +63,8 @@ class Certificate:
     errors : mapping of str to QpmheError
         What could not be certified, and why.
     evidence : Evidence
-        What the theorem's constants rest on, the weakest evidence among their ingredients'; where
-        there are none, what the observer's bound rests on.
+        The weakest that the theorem's constants rest on; where there are none, the observer's
+        bound.
     """
 
     system: System
@@ -91,11 +79,6 @@ class Certificate:
     constants: Mapping[int, TheoremConstants] = field(default_factory=dict)
     errors: Mapping[str, QpmheError] = field(default_factory=dict)
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
-
-    @cached_property
-    def gain(self) -> Array | None:
-        """The observer's constant gain, if it has one."""
-        return gain_if_constant(self.observer, self.system)
 
     @property
     def diameter(self) -> float:
@@ -122,14 +105,18 @@ class Certificate:
         state, NaN from where the run shows that it no longer does; arguments and errors are those
         of `ObserverBound.along`. An `OptionError` is raised if there is no bound of the observer.
         """
+        band = self.proved.along(run, disturbances, noises, initial_error=initial_error)
+        return band.error
+
+    @property
+    def proved(self) -> ObserverBound:
+        """The observer's bound; an `OptionError` says why there is none."""
         if self.observer_bound is None:
             reason = self.errors.get(
                 "the observer", "its constants were stated, not certified: leave stability out."
             )
             raise OptionError(f"there is no bound of the observer: {reason}")
-        return self.observer_bound.along(
-            run, disturbances, noises, initial_error=initial_error
-        ).error
+        return self.observer_bound
 
     def of(self, horizon: int | None = None) -> TheoremConstants:
         """The theorem's constants for a horizon N, which may be left out if there is only one.
@@ -137,38 +124,18 @@ class Certificate:
         ``certificate.of(N).result.bound(...)`` is its bound (eq:RGES_result) along a run. An
         `OptionError` says for which horizons there are some, or why there are none.
         """
-        if horizon is None and len(self.constants) == 1:
-            return next(iter(self.constants.values()))
         if not self.constants:
             raise OptionError(
                 f"the theorem's constants could not be certified: {'; '.join(self.failures)}"
             )
+        if horizon is None and len(self.constants) == 1:
+            (horizon,) = self.constants
         if horizon is None or horizon not in self.constants:
             raise OptionError(
                 f"horizon is {horizon!r}; expected one of {list(self.constants)}, for which there "
                 "are constants. Certify again with this horizon."
             )
         return self.constants[horizon]
-
-    def check_estimator(self, estimator: MovingHorizonEstimator) -> None:
-        """Raise a `MismatchError` unless an estimator has this system, observer and cost.
-
-        An observer with the same constant gain is the same one, whatever its metric. The cost
-        matters only to the theorem's constants.
-        """
-        gain, own = gain_if_constant(estimator.observer, self.system), self.gain
-        for name, same in (
-            ("system", estimator.system is self.system),
-            ("observer", estimator.observer is self.observer or (
-                gain is not None and own is not None and np.array_equal(gain, own)
-            )),
-            ("cost", estimator.cost is self.cost or not self.constants),
-        ):
-            if not same:
-                raise MismatchError(
-                    f"the certificate is of another {name} than the estimator's; certify the very "
-                    "objects that the estimator is made of."
-                )
 
     @property
     def headline(self) -> str:
@@ -177,15 +144,12 @@ class Certificate:
             return "No bound of the observer's error is proved."
         return self.observer_bound.headline
 
-    def summary(self) -> str:
-        """The headline, for what it holds, what it rests on, and what could not be certified."""
-        lines = [self.headline]
-        if self.observer_bound is not None:
-            lines += [f"for {self.observer_bound.sizes}", self.observer_bound.condition]
-        return "\n".join([*lines, *(f"Not certified: {each}" for each in self.failures)])
-
     def __str__(self) -> str:
-        return self.summary()
+        """The headline, for what it holds, what it rests on, and what could not be certified."""
+        bound = self.observer_bound
+        lines = [] if bound is None else [f"for {bound.sizes}", bound.condition]
+        failures = (f"Not certified: {each}" for each in self.failures)
+        return "\n".join([self.headline, *lines, *failures])
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
@@ -196,10 +160,16 @@ class Certificate:
             "assumed": ASSUMED, "failures": self.failures, "observer_bound": self.observer_bound,
             "assumptions": self.assumptions, "detectability": self.detectability,
             "observer": self.stability, "sizes": self.sizes, "paper": [
-                each.to_dict(self.sizes.largest, self.diameter) for each in self.constants.values()
+                json_ready(each) | {"limit": limit, "vacuous": not limit < self.diameter}
+                for each, limit in self.limits()
             ],
         })
         return content
+
+    def limits(self) -> list[tuple[TheoremConstants, float]]:
+        """What the theorem's bounds tend to for the sizes; vacuous from the diameter on."""
+        sizes = self.sizes.largest
+        return [(each, each.result.limit(*sizes)) for each in self.constants.values()]
 
 
 Result = TypeVar("Result")
@@ -297,60 +267,51 @@ def examined(
                 ObserverBound(stability, region, chosen, observer.metric), system,
                 deadline.part(_INVARIANCE),
             )
-    certificate = Certificate(
-        system, observer, cost, region, chosen, proved, stability=stability, errors=errors
-    )
-    if "the theorem" not in errors:
-        certificate = _with_theorem(certificate, horizons, detectability, deadline, attempt)
-    if certificate.holds and stability is not None:
-        parts = [stability.evidence]
-        if certificate.constants and certificate.detectability is not None:
-            parts += [certificate.detectability.evidence] + [
-                each.evidence for each in certificate.assumptions if each.evidence is not None
-            ]
-        object.__setattr__(certificate, "evidence", weakest(parts))
-    return certificate
-
-
-def _with_theorem(
-    bare: Certificate, horizons: Sequence[int], detectability: Detectability | None,
-    deadline: Deadline, attempt: Callable[..., Any],
-) -> Certificate:
-    """The certificate with the theorem's assumptions and, where they hold, its constants."""
-    system, cost, region, stability = bare.system, bare.cost, bare.region, bare.stability
-    weights, about = about_cost(cost)
-    if weights is None:
-        attempt("the theorem", lambda: _refused(about))
-    output = about_output(system, region, deadline.part(_OUTPUT))
-    found = [output, *about_corrections(system, bare.observer), about]
-    if detectability is None:
-        detectability = attempt("detectability", lambda: certify_detectability(
-            system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
-        ))
+    assumptions: tuple[Assumption, ...] = ()
     constants: dict[int, TheoremConstants] = {}
-    if weights is not None and detectability is not None and stability is not None:
-        slope, proved, bent = output.value, bare.observer_bound, None
-        assert slope is not None
-        if system.states is not None and proved is not None and proved.projects:
-            found.append(about_model(system, region, deadline))
-            bent = found[-1].value
-        observer = stability.sums
-        if slope > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
-            observer = replace(observer, noise=max(observer.noise, 1.0 / slope))
-        constants = {
-            N: TheoremConstants(
-                detectability.sums, observer, weights, kappa=stability.kappa, lipschitz=slope,
-                horizon=N, model_lipschitz=bent,
-            )
-            for N in horizons
-        }
-    return replace(
-        bare, assumptions=tuple(found), detectability=detectability, constants=constants
+    parts = [] if stability is None else [stability.evidence]
+    if "the theorem" not in errors:
+        weights, about = about_cost(cost)
+        if weights is None:
+            errors["the theorem"] = CertificateError(f"{about.text}; the theorem needs them.")
+        output = about_slope(system, region, "h", deadline.part(_OUTPUT))
+        assumptions = output, *about_corrections(system, observer), about
+        if detectability is None:
+            detectability = attempt("detectability", lambda: certify_detectability(
+                system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
+            ))
+        if weights is not None and detectability is not None and stability is not None:
+            if system.states is not None and proved is not None and proved.projects:
+                assumptions = *assumptions, about_slope(system, region, "f", deadline)
+            constants = _theorem(assumptions, weights, detectability, stability, horizons)
+            parts += [detectability.evidence, *(
+                each.evidence for each in assumptions if each.evidence is not None
+            )]
+    found = Certificate(
+        system, observer, cost, region, chosen, proved, assumptions, detectability, stability,
+        constants, errors,
     )
+    if found.holds:
+        object.__setattr__(found, "evidence", weakest(parts))
+    return found
 
 
-def _refused(about: Assumption) -> None:
-    raise CertificateError(f"{about.text}; the theorem needs them.")
+def _theorem(
+    assumptions: Sequence[Assumption], weights: CostConstants, detectability: Detectability,
+    stability: ObserverStability, horizons: Sequence[int],
+) -> dict[int, TheoremConstants]:
+    """The constants for each horizon."""
+    values = {each.label: each.value for each in assumptions}
+    slope, observer = values["ass:lipschitz"] or 0.0, stability.sums
+    if slope > 0.0:  # a larger C_v holds as well, and from 1 / L_h on L_bar is L_h
+        observer = replace(observer, noise=max(observer.noise, 1.0 / slope))
+    return {
+        N: TheoremConstants(
+            detectability.sums, observer, weights, kappa=stability.kappa, lipschitz=slope,
+            horizon=N, model_lipschitz=values.get("in place of eq:kappa"),
+        )
+        for N in horizons
+    }
 
 
 def _cheapest(constants: CostConstants | None) -> tuple[float, float]:

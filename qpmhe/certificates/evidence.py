@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
 from ..errors import InvalidInputError, QpmheError
+from ..model.sets import ConvexSet
 
 
 class Evidence(Enum):
@@ -74,9 +76,13 @@ class OutOfTimeError(NotCertifiedError):
 
 
 def json_ready(value: Any) -> Any:
-    """Types that JSON knows; numbers that are not finite become None."""
+    """Types that JSON knows: of dataclasses their fields, None for numbers that are not finite."""
     if hasattr(value, "to_dict"):
         value = value.to_dict()
+    elif is_dataclass(value):
+        value = {each.name: getattr(value, each.name) for each in fields(value)}
+    elif isinstance(value, ConvexSet):
+        value = [value.lower, value.upper]
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Evidence):

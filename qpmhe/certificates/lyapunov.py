@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -27,14 +26,11 @@ from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import Evidence, MismatchError, json_ready
 from .inequalities import Form
 from .invariance import supports
-from .observer_bound import largest_ratio
+from .observer_bound import initial_length, largest_ratio
 from .regions import Region, bounded_region
 from .sdp import started
 from .search import Search
-from .sizes import OUTWARD, Size, Sizes, initial_length, lengths_of, read_size
-
-Kind = Literal["minimiser", "measured"]
-KINDS: tuple[Kind, ...] = ("minimiser", "measured")
+from .sizes import OUTWARD, Size, Sizes, lengths_of
 
 _SUMS = 1.0 + 1e-9  # covers the rounding of a sum over a horizon, and of roots
 _MOST = 10_000  # samples of a horizon
@@ -52,17 +48,10 @@ class Design:
         |f(x_1) + w_1 - f(x_2) - w_2|_P^2 \le \gamma |x_1 - x_2|_P^2 + |w_1 - w_2|_Q^2
         + |h(x_1) - h(x_2)|_R^2 .
 
-    So for the truth x, any trajectory :math:`\hat x` that fits the window's measurements, and the
-    cost J of these weights, :math:`|\hat x - x|_P \le \sqrt{J(\hat x)} + \sqrt{J(x)}` at the
-    window's end. The window's prior is the estimate N samples before, as with
-    ``candidate="reinitialized"``. What bounds :math:`J(\hat x)` is the ``kind``:
-
-    - ``minimiser``: it is at most J(x), as for a global minimiser. That the QPs have converged
-      does not prove it.
-    - ``measured``: it is known. For any number of QPs.
-
-    Bounds are of :math:`|\hat x - x|_P`; `components` converts them to the states' units. They
-    hold while truth and estimates stay in the region.
+    So :math:`|\hat x - x|_P \le \sqrt{J(\hat x)} + \sqrt{J(x)}` at the end of a window whose prior
+    is the estimate N samples before, as with ``candidate="reinitialized"``. Bounds are of
+    :math:`|\hat x - x|_P`; `components` converts them to the states' units. They hold while truth
+    and estimates stay in the region.
 
     Parameters
     ----------
@@ -75,8 +64,8 @@ class Design:
     sizes : Sizes
         The largest disturbances and noises.
     horizon : int
-        The horizon given, or the least one whose limit for a minimiser is at most a tenth above
-        that of endless horizons.
+        The given one, or the least one whose limit for a minimiser is at most a tenth above the one
+        of endless horizons.
     evidence : Evidence
         What the inequality rests on.
     notes : tuple of str
@@ -116,8 +105,7 @@ class Design:
 
     def contraction(self, horizon: int | None = None) -> float:
         """The factor on a minimiser's error over a window whose prior is an estimate."""
-        N = self.horizon if horizon is None else count("horizon", horizon, 1)
-        return 2.0 * math.sqrt(self.discount**N)
+        return 2.0 * math.sqrt(self.discount ** self._horizon(horizon))
 
     def least_horizon(self) -> int | None:
         """The least N for which a minimiser's error contracts; None if none up to 10,000 does."""
@@ -128,30 +116,27 @@ class Design:
 
         Infinite where its error does not contract.
         """
-        N = self.horizon if horizon is None else count("horizon", horizon, 1)
         (supply,) = self._supply(None, None, 1)
-        return math.sqrt(float(supply) * growth(self.discount, N)) * OUTWARD if supply else 0.0
+        factor = growth(self.discount, self._horizon(horizon))
+        return math.sqrt(float(supply) * factor) * OUTWARD if supply else 0.0
 
-    @cached_property
-    def _slopes(self) -> Array:
-        return supports(self.prior, np.eye(len(self.prior)))
+    def _horizon(self, horizon: int | None) -> int:
+        return self.horizon if horizon is None else count("horizon", horizon, 1)
 
     def components(self, bound: ArrayLike) -> Array:
         """Bounds of each component's error, (..., n), from bounds in the design's norm."""
-        return np.multiply.outer(numbers("bound", bound, finite=False), self._slopes) * OUTWARD
+        slopes = supports(self.prior, np.eye(len(self.prior)))
+        return np.multiply.outer(numbers("bound", bound, finite=False), slopes) * OUTWARD
 
     def length(self, bound: ArrayLike) -> Array:
         """Bounds of the error's Euclidean length, from bounds in the design's norm."""
-        found: Array = numbers("bound", bound, finite=False) * self._length
-        return found
-
-    @cached_property
-    def _length(self) -> float:
-        return largest_ratio(np.eye(len(self.prior)), self.prior)
+        found: Array = numbers("bound", bound, finite=False)
+        return found * largest_ratio(np.eye(len(self.prior)), self.prior)
 
     def along(
         self, run: Run, source: MovingHorizonEstimator, *, initial_error: Size,
-        disturbances: Size | None = None, noises: Size | None = None, kind: Kind = "measured",
+        disturbances: Size | None = None, noises: Size | None = None,
+        kind: Literal["measured", "minimiser"] = "measured",
     ) -> Array:
         r"""The bound of :math:`|\hat x(t) - x(t)|_P` along a run at t = 0, ..., T, (T + 1,).
 
@@ -168,10 +153,11 @@ class Design:
         initial_error : (n,) array_like, float or set
             x(0) minus the first guess, a bound on its length, or a set that holds it.
         disturbances, noises : optional
-            w(t) and v(t) as vectors (T, r) and (T, p), lengths (T,), or bounds for all times: a
-            number for the length or a set, such as ``qpmhe.Box``. Left out, `sizes`.
+            w(t) and v(t) as vectors (T, r) and (T, p), or bounds for all times: a number for the
+            length or a set, such as ``qpmhe.Box``. Left out, `sizes`.
         kind : {"measured", "minimiser"}
-            What bounds the estimate's cost.
+            What bounds the estimate's cost: it is known, for any number of QPs; or it is at most
+            J(x), as for a global minimiser, which converged QPs do not prove.
 
         Raises
         ------
@@ -180,14 +166,14 @@ class Design:
         ShapeError, OptionError, SetError
             If an argument does not fit.
         """
-        choice("kind", kind, KINDS)
+        choice("kind", kind, ("minimiser", "measured"))
         self._check(source)
         steps, N, gamma = len(run), source.horizon, self.discount
         supply, spoilt = self._supply(disturbances, noises, steps), np.zeros(steps, np.bool_)
         for k in np.flatnonzero(self._unusual(run)).tolist():
             spoilt[k : k + N] = True
         width = (self.region.upper - self.region.lower)[: self.system.n]
-        widest = float(lengths_of("the region", Box(-width, width), len(width), self.prior))
+        widest = float(lengths_of("the region", Box(-width, width), self.prior))
         bound = np.full(steps + 1, math.nan)
         bound[0] = initial_length(initial_error, self.prior)
         for t in (np.flatnonzero(~spoilt) + 1).tolist():
@@ -211,44 +197,37 @@ class Design:
 
     def _supply(self, w: Size | None, v: Size | None, steps: int) -> Array:
         """What the truth costs at each sample, (T,)."""
-        w = read_size("disturbances", self.sizes.disturbance if w is None else w)
-        v = read_size("noises", self.sizes.noise if v is None else v)
-        r, p = len(self.disturbance), self.system.p
+        w, v = self.sizes.disturbance if w is None else w, self.sizes.noise if v is None else v
         parts = (
-            lengths_of("disturbances", w, r, self.disturbance),
-            lengths_of("noises", v, p, self.noise),
+            lengths_of("disturbances", w, self.disturbance), lengths_of("noises", v, self.noise)
         )
         if any(each.shape not in ((), (steps,)) for each in parts):
             raise ShapeError(
-                f"disturbances or noises are not of {steps} samples, as the run is; expected "
-                f"({steps}, {r}) and ({steps}, {p}), or lengths ({steps},)."
+                f"disturbances or noises are not of {steps} samples, as the run is; expected as "
+                "many vectors, or bounds for all times."
             )
         return np.broadcast_to(parts[0] ** 2 + parts[1] ** 2, (steps,))
 
     def _check(self, source: MovingHorizonEstimator) -> None:
         """Raise a `MismatchError` unless the bound is of this estimator."""
         cost, settings = source.cost, source.settings
-        if source.system is not self.system:
-            raise MismatchError("the estimator is of another system; design for its own.")
         same = isinstance(cost, QuadraticCost) and cost.discount == self.discount and all(
             np.array_equal(getattr(cost, name), getattr(self, name))
             for name in ("prior", "disturbance", "noise")
         )
-        if not same or source.has_changed or settings.arrival != "observer":
-            raise MismatchError(
-                "the estimator has other weights, another discount, or arrival='smoothed'; make it "
-                "with cost=design.cost() and leave arrival out."
-            )
-        if source.system.held:
-            raise MismatchError(
-                "the estimator holds parameters, a term of J that the bound does not have; make "
-                "its system without hold."
-            )
-        if settings.candidate != "reinitialized":
-            raise MismatchError(
-                f"the estimator has candidate={settings.candidate!r}, whose prior is the running "
-                "observer's; make it with candidate='reinitialized', or take the observer's bound."
-            )
+        for differs, text in (
+            (source.system is not self.system, "is of another system; design for its own"),
+            (not same or source.has_changed or settings.arrival != "observer",
+             "has other weights, another discount, or arrival='smoothed'; make it with "
+             "cost=design.cost() and leave arrival out"),
+            (source.system.held, "holds parameters, a term of J that the bound does not have; make "
+             "its system without hold"),
+            (settings.candidate != "reinitialized",
+             f"has candidate={settings.candidate!r}, whose prior is the running observer's; make "
+             "it with candidate='reinitialized', or take the observer's bound"),
+        ):
+            if differs:
+                raise MismatchError(f"the estimator {text}.")
 
     def code(self) -> str:
         """Python that makes the cost and says which horizon and candidate belong to it."""
@@ -268,12 +247,13 @@ class Design:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows; infinite numbers become None."""
-        content: dict[str, Any] = json_ready({
-            "prior": self.prior, "disturbance": self.disturbance, "noise": self.noise,
-            "discount": self.discount, "horizon": self.horizon, "region": self.region,
-            "sizes": self.sizes, "evidence": self.evidence, "notes": self.notes,
-            "contraction": self.contraction(),
-            "least_horizon": self.least_horizon(), "limit": self.components(self.limit()),
+        names = (
+            "prior", "disturbance", "noise", "discount", "horizon", "region", "sizes", "evidence",
+            "notes",
+        )
+        content: dict[str, Any] = json_ready({name: getattr(self, name) for name in names} | {
+            "contraction": self.contraction(), "least_horizon": self.least_horizon(),
+            "limit": self.components(self.limit()),
         })
         return content
 
@@ -343,7 +323,7 @@ def design(
 
 
 def _sizes(system: System, sizes: Sizes | None) -> Sizes:
-    """What is stated, or else the system's W and V."""
+    """The stated ones, or else the system's W and V."""
     if sizes is not None:
         return Sizes.stated(sizes)
     if system.disturbances is None or system.noises is None:

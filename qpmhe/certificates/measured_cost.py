@@ -9,7 +9,7 @@ import numpy as np
 from ..costs import Cost
 from .observer_bound import ObserverBound, largest_ratio
 from .properties import Detectability
-from .sizes import OUTWARD, Sizes, lengths_of, read_size
+from .sizes import OUTWARD, Sizes, lengths_of
 
 _SUMS = 1.0 + 1e-9  # covers the rounding of a sum over a window, and of roots
 
@@ -19,25 +19,8 @@ class MeasuredCost:
 
     With detectability's norms P and V, a trajectory of k stages with the cost B is at most
     :math:`\alpha_k \sqrt B` from one without disturbances and noises that starts at its prior's
-    mean z: with the cost's weights :math:`\Pi, Q, R`,
-
-    .. math::
-        \alpha_0^2 = \lambda(P \Pi^{-1}), \qquad
-        \alpha_{k+1}^2 = \max\{\eta^2 \alpha_k^2, \lambda(V R^{-1})\} + \lambda(P Q^{-1}) .
-
-    The true one is at most :math:`d_k` from it, :math:`d_{j+1} = \sqrt{\eta^2 d_j^2 + |v|_V^2} +
-    |w|_P` from :math:`d_0 \ge |x - z|_P` on. `docs/explanation/guarantees.md` derives both.
-
-    Parameters
-    ----------
-    detectability : Detectability
-        With its norms P and V.
-    cost : Cost
-        A quadratic one without discount.
-    bound : ObserverBound
-        Of the observer whose state is the prior's mean.
-    sizes : Sizes
-        What bounds w and v.
+    mean z, and the true one at most :math:`d_k`. `docs/explanation/guarantees.md` derives both.
+    The cost is quadratic, without discount; the bound is of the observer whose state is z.
     """
 
     def __init__(
@@ -53,8 +36,8 @@ class MeasuredCost:
         )
         self._entry = largest_ratio(P, bound.metric)
         self._length = largest_ratio(np.eye(len(P)), P)
-        self._w = float(lengths_of("disturbance", read_size("w", sizes.disturbance), len(P), P))
-        self._v = float(lengths_of("noise", read_size("v", sizes.noise), len(V), V))
+        self._w = float(lengths_of("disturbance", sizes.disturbance, P))
+        self._v = float(lengths_of("noise", sizes.noise, V))
 
     @staticmethod
     def applies(detectability: Detectability | None, cost: Cost) -> bool:

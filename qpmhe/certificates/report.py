@@ -1,4 +1,4 @@
-"""Everything that can be certified of a model at once: as text, JSON and a figure."""
+"""Everything that can be certified of a model at once."""
 
 from __future__ import annotations
 
@@ -17,22 +17,16 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..models.scenario import Record, Scenario
 from ..observers import Observer
-from ..plots.bounds import error_and_bounds
-from ..plots.style import save
 from .certificate import Certificate, examined, horizons_of
 from .contraction import certify_observer, synthesise_gain
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import CertificateError, NotCertifiedError, json_ready
 from .lyapunov import Design
-from .monitor import Monitor, monitored_run
 from .observer_bound import Band, ObserverBound
 from .properties import ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
 from .sizes import Sizes
-
-#: Names of the kinds of bounds in figures and tables.
-LABELS = {"observer": "set around the observer", "paper": "theorem, paper's constants"}
 
 # Without a region: the simulated states, with this share of their extent on each side.
 _ROOM = 0.75
@@ -43,7 +37,7 @@ _QPS = 2  # a sample, in the run on the simulated record
 
 @dataclass(eq=False)
 class Report:
-    """What was certified of a model, what was not, and a monitored run on a simulated record.
+    """What was certified of a model, what was not, and a run on a simulated record.
 
     Made by `certify_model`.
 
@@ -55,9 +49,9 @@ class Report:
         How the model is simulated, if that is known, and a simulated record.
     certificate : Certificate
         What could be certified, with the reasons where something could not; perhaps nothing.
-    run, band, monitor : Run, Band and Monitor, or None
-        Where something bounds the error: the estimator's run on the record, with the largest
-        horizon and two QPs a sample, the observer's bound along it, and what the monitor saw.
+    run, band : Run and Band, or None
+        Where the observer has a bound: the estimator's run on the record, with the largest
+        horizon and two QPs a sample, and the bound along it.
     replaced : str
         Which observer took the place of the model's own, and why; empty if none did.
     design : Design or None
@@ -70,74 +64,25 @@ class Report:
     certificate: Certificate
     run: Run | None = None
     band: Band | None = None
-    monitor: Monitor | None = None
     replaced: str = ""
     design: Design | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything in types that JSON knows; rates that are not known are None."""
+        """Everything in types that JSON knows."""
         certificate = self.certificate
-        suggestions = [
-            text for each in certificate.errors.values()
-            for text in getattr(each, "suggestions", ())
-        ]
         return certificate.to_dict() | {
             "model": self.name, "certified": certificate.holds, "replaced": self.replaced,
-            "monitor": self.monitor and self.monitor.summary(),
-            "monitored": json_ready(self.monitor), "design": json_ready(self.design),
-            "suggestions": list(dict.fromkeys(suggestions)),
-            "smallest_rates": {
-                name: getattr(certificate.errors.get(what), "smallest_rate", None)
-                for name, what in (("eta", "detectability"), ("rho", "the observer"))
-            },
+            "simulated": "" if self.band is None else str(self.band),
+            "design": json_ready(self.design),
         }
 
-    def draw(self, axes: Any = None) -> Any:
-        """Draw the error of the run and its bounds into axes; see `error_and_bounds`.
-
-        Without a run there is nothing to draw: an `InvalidInputError` is raised.
-        """
-        certificate, run, record, scenario = self.certificate, self.run, self.record, self.scenario
-        if run is None or record is None or scenario is None:
-            raise InvalidInputError(
-                "there is no certificate or no scenario to simulate, hence no run and no bound to "
-                "draw."
-            )
-        system, steps = certificate.system, len(record.measurements)
-        u = np.zeros((steps, 0)) if record.inputs is None else record.inputs
-        w = record.states[1:] - system.f.batch(record.states[:-1], u)
-        v = record.measurements - system.h.batch(record.states[:-1], u)
-        start = record.states[0] - run.observer_states[0]
-        bounds = {}
-        if certificate.observer_bound is not None:
-            bounds[LABELS["observer"]] = certificate.bound(run, w, v, initial_error=start)
-        if certificate.constants:
-            lengths = (np.linalg.norm(each, axis=1) for each in (w, v))
-            last = certificate.of(max(certificate.constants))
-            bounds[LABELS["paper"]] = last.result.bound(np.linalg.norm(start), *lengths)
-        return error_and_bounds(
-            scenario.dt * np.arange(steps + 1.0),
-            np.linalg.norm(record.states - run.states, axis=1), bounds,
-            diameter=certificate.diameter, time_label=f"time t ({scenario.time_unit})",
-            error_label=f"error, {_QPS} QPs a sample", axes=axes,
-        )
-
-    def save(self, path: str | Path) -> list[Path]:
-        """Write everything as JSON to a path, and return the paths of all files.
-
-        The figure, if there is one, goes beside it as ``.png`` and ``.svg``. An
-        `InvalidInputError` is raised if the file cannot be written.
-        """
-        path = Path(path)
-        written: list[Path] = []
-        if self.run is not None:
-            written += save(self.draw().get_figure(), path.with_suffix(""))
+    def save(self, path: str | Path) -> None:
+        """Write everything as JSON; an `InvalidInputError` says why that cannot be."""
         text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
         try:
-            path.write_text(text, encoding="utf-8")
+            Path(path).write_text(text, encoding="utf-8")
         except OSError as error:
             raise InvalidInputError(f"cannot write {path}: {error.strerror}.") from error
-        return [*written, path]
 
 
 def certify_model(
@@ -146,7 +91,7 @@ def certify_model(
     inputs: Box | None = None, seed: int = 0, seconds: float | Deadline = DEFAULT_SECONDS,
     name: str = "",
 ) -> Report:
-    """Certify a model as far as possible, and monitor its estimator on a simulated record.
+    """Certify a model as far as possible, and follow its estimator on a simulated record.
 
     The observer, the assumptions and detectability are each examined, whatever is found of the
     others.
@@ -194,17 +139,14 @@ def certify_model(
     )
     title = "" if scenario is None else scenario.title
     report = Report(name or title, scenario, record, certificate, replaced=replaced)
-    if certificate.holds and scenario is not None and record is not None:
+    proved = certificate.observer_bound
+    if proved is not None and scenario is not None and record is not None:
         mhe = MovingHorizonEstimator(
             system, observer, cost, horizon=horizons[-1],
             initial_state=scenario.initial_estimate, max_qps=_QPS, engine="python",
         )
-        start = initial_error(scenario)
-        report.run, report.monitor = monitored_run(
-            certificate, mhe, record.measurements, record.inputs, initial_error=start
-        )
-        if certificate.observer_bound is not None:
-            report.band = certificate.observer_bound.along(report.run, initial_error=start)
+        report.run = mhe.run(record.measurements, record.inputs)
+        report.band = proved.along(report.run, initial_error=initial_error(scenario))
     return report
 
 
@@ -250,16 +192,13 @@ def region_of(
     What is left out is the scenario's; else the system's own X if that is bounded, or a box around
     the simulated record, and the box around its inputs. Errors name the region by ``option``.
     """
-    given = inputs
     if record is None and scenario is not None:
         record = scenario.simulate(0)
-    if (
-        inputs is None and record is not None and record.inputs is not None
-        and not isinstance(region, Region)
-    ):
-        inputs = Box(record.inputs.min(axis=0), record.inputs.max(axis=0))
     if region is None and scenario is not None and scenario.region is not None:
-        region, inputs = scenario.region, given or scenario.input_region or inputs
+        region, inputs = scenario.region, inputs or scenario.input_region
+    bounded = inputs is not None or isinstance(region, Region)
+    if not bounded and record is not None and record.inputs is not None:
+        inputs = Box(record.inputs.min(axis=0), record.inputs.max(axis=0))
     if region is not None:
         return bounded_region(system, region, inputs)
     if system.states is not None:
@@ -272,10 +211,8 @@ def region_of(
             f"{option} is missing, and the model has neither a bounded set of states nor a "
             "scenario to simulate; give the set in which the states stay."
         )
-    start = scenario.initial_estimate
-    low, high = np.minimum(record.states.min(axis=0), start), np.maximum(
-        record.states.max(axis=0), start
-    )
+    points = np.vstack((record.states, scenario.initial_estimate))
+    low, high = points.min(axis=0), points.max(axis=0)
     width = np.where(high > low, high - low, np.abs(high))
     room = _ROOM * np.where(width > 0.0, width, 1.0)
     around = Box(low - room, high + room)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ from ..model.system import System
 from .regions import bounds
 from .theorem import checked_length
 
-#: What bounds w or v: a length, a set, or lengths (T,) or vectors (T, n) at each sample.
+#: What bounds w or v: a length, a set, or vectors (T, n), one for each sample.
 Size = ArrayLike | ConvexSet
 
 UNIT = float(np.finfo(np.float64).eps)
@@ -29,8 +30,8 @@ OUTWARD = 1.0 + 16.0 * UNIT
 _SIGMAS = 3.0
 # Of the larger size, what the other one counts at least where a matrix is sought.
 _LEAST = 1e-3
-#: Boxes with more corners are bounded by sums over their sides.
-MOST_CORNERS = 4096
+# Boxes with more corners are bounded by sums over their sides.
+_MOST_CORNERS = 4096
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,10 @@ class Sizes:
     def __post_init__(self) -> None:
         for name in ("disturbance", "noise"):
             given = getattr(self, name)
-            if not isinstance(given, ConvexSet):
+            if isinstance(given, ConvexSet):
+                sides_of(name, given)
+            else:
                 checked_length(name, given)
-            read_size(name, given)
 
     @classmethod
     def usual(
@@ -80,7 +82,7 @@ class Sizes:
 
     @classmethod
     def of(cls, sizes: Any, system: System, cost: Cost) -> Sizes:
-        """Those that are stated, or the usual ones with the weights as inverse covariances."""
+        """The stated ones, or the usual ones with the weights as inverse covariances."""
         if sizes is not None:
             return cls.stated(sizes)
         covariance, factor = inverse(cost.disturbance), cost.disturbance_factor
@@ -90,7 +92,7 @@ class Sizes:
 
     @classmethod
     def stated(cls, sizes: Any) -> Sizes:
-        """Those that the user states, or an `OptionError`."""
+        """What the user states, or an `OptionError`."""
         if not isinstance(sizes, Sizes):
             raise OptionError(
                 f"sizes is {shown(sizes)}; expected Sizes(disturbance=..., noise=...), the largest "
@@ -111,10 +113,7 @@ class Sizes:
     @property
     def largest(self) -> tuple[float, float]:
         """The largest |w| and |v|."""
-        w, v = (
-            each if isinstance(each, float) else float(np.linalg.norm(each)) * OUTWARD
-            for each in self.extent
-        )
+        w, v = (float(np.linalg.norm(each)) * OUTWARD for each in self.extent)
         return w, v
 
     def typical(self, system: System) -> tuple[float | Array, float | Array]:
@@ -125,34 +124,14 @@ class Sizes:
         lengths = self.largest if max(self.largest) > 0.0 else (1.0, 1.0)
         least = _LEAST * max(lengths)
         w, v = (
-            np.maximum(each, least) if np.size(each) == size and np.ndim(each)
+            np.maximum(each, least) if np.ndim(each) and np.size(each) == size
             else max(length, least)
-            for each, length, size in zip(
-                self.extent, lengths, (system.r, system.p), strict=True
-            )
+            for each, length, size in zip(self.extent, lengths, (system.r, system.p), strict=True)
         )
         return w, v
 
     def __str__(self) -> str:
         return f"{_words('w', self.disturbance)}, {_words('v', self.noise)} ({self.source})"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything in types that JSON knows."""
-        return {"source": self.source} | {
-            name: sides_of(name, given).tolist() if isinstance(given, ConvexSet) else float(given)
-            for name, given in (("disturbance", self.disturbance), ("noise", self.noise))
-        }
-
-
-def read_size(name: str, value: Any) -> Array | ConvexSet:
-    """A bounded set, or numbers."""
-    if isinstance(value, ConvexSet):
-        sides_of(name, value)
-        return value
-    found = numbers(name, value)
-    if found.ndim == 0:
-        checked_length(name, found)
-    return found
 
 
 def sides_of(name: str, given: ConvexSet) -> Array:
@@ -166,52 +145,31 @@ def sides_of(name: str, given: ConvexSet) -> Array:
     return sides
 
 
-def corners_of(name: str, given: ConvexSet, size: int) -> Array:
-    """The corners (K, n) of the box around a set; none of them where there are too many."""
-    lower, upper = sides_of(name, given)
-    if lower.size != size:
-        raise ShapeError(f"{name} is a set of dimension {lower.size}; expected {size}.")
-    wide = np.flatnonzero(upper > lower)
-    if 2**wide.size > MOST_CORNERS:
-        return np.empty((0, size))
-    found = np.tile(lower, (2**wide.size, 1))
-    for k, j in enumerate(wide):
-        found[(np.arange(len(found)) >> k) % 2 == 1, j] = upper[j]
-    return found
-
-
-def lengths_of(name: str, given: Array | ConvexSet, size: int, weight: Array) -> Array:
-    """The largest |s|_W, always () or at each sample (T,); a set counts as the box around it."""
+def lengths_of(name: str, given: Size, weight: Array) -> Array:
+    """The largest |s|_W of a length or of the box around a set, or |s|_W of vectors (..., n)."""
+    n = len(weight)
     if isinstance(given, ConvexSet):
-        corners = corners_of(name, given, size)
-        if len(corners):
-            return np.array(weighted_lengths(corners, weight).max())
-        largest = np.abs(sides_of(name, given)).max(axis=0)
-        return np.array(weighted_lengths(largest, np.abs(weight)))
-    if given.ndim > 2 or (given.ndim == 2 and given.shape[1] != size):
+        sides = sides_of(name, given)
+        if sides.shape[1] != n:
+            raise ShapeError(f"{name} is a set of dimension {sides.shape[1]}; expected {n}.")
+        ends = [sorted(set(pair)) for pair in sides.T.tolist()]
+        if math.prod(map(len, ends)) > _MOST_CORNERS:
+            return weighted_lengths(np.abs(sides).max(axis=0), np.abs(weight))
+        corners = np.array(list(itertools.product(*ends)))
+        return np.array(weighted_lengths(corners, weight).max())
+    values = numbers(name, given)
+    if values.ndim == 0:
+        # The largest |s|_W of |s| = 1, rounded up.
+        top = float(np.linalg.eigvalsh(weight)[-1])
+        slack = 16.0 * n * n * UNIT * float(np.linalg.norm(weight))
+        root = math.sqrt(max(top, 0.0) + slack) * OUTWARD
+        return np.array(checked_length(name, values.item()) * root)
+    if values.ndim > 2 or values.shape[-1] != n:
         raise ShapeError(
-            f"{name} has shape {given.shape}; expected vectors (T, {size}), lengths (T,), a "
-            "length, or a set such as qpmhe.Box."
+            f"{name} has shape {values.shape}; expected a length, a set such as qpmhe.Box, a "
+            f"vector ({n},) or vectors (T, {n})."
         )
-    if given.ndim == 2:
-        return weighted_lengths(given, weight)
-    if (given < 0.0).any():
-        raise OptionError(f"{name} is {shown(given)}; expected Euclidean lengths, all >= 0.")
-    return given * root_of(weight)
-
-
-def initial_length(error: Size, weight: Array) -> float:
-    """|e|_W from an initial error: a vector (n,), a bound on its length, or a set that holds it."""
-    given, n = read_size("initial_error", error), len(weight)
-    if isinstance(given, ConvexSet):
-        return float(lengths_of("initial_error", given, n, weight))
-    if given.shape not in ((), (n,)):
-        raise ShapeError(
-            f"initial_error has shape {given.shape}; expected ({n},), a length, or a qpmhe.Box."
-        )
-    if given.shape == (n,):
-        return float(weighted_lengths(given, weight))
-    return float(given) * root_of(weight)
+    return weighted_lengths(values, weight)
 
 
 def weighted_lengths(vectors: Array, weight: Array) -> Array:
@@ -224,22 +182,13 @@ def weighted_lengths(vectors: Array, weight: Array) -> Array:
     return found
 
 
-def root_of(weight: Array) -> float:
-    """The largest |s|_W of |s| = 1, rounded up."""
-    n = len(weight)
-    top = float(np.linalg.eigvalsh(weight)[-1])
-    slack = 16.0 * n * n * UNIT * float(np.linalg.norm(weight))
-    return math.sqrt(max(top, 0.0) + slack) * OUTWARD
-
-
 def _words(letter: str, given: float | ConvexSet) -> str:
     """Bounds of one signal in words."""
     if not isinstance(given, ConvexSet):
         return f"|{letter}| <= {given:.4g}"
-    lower, upper = sides_of(letter, given)
-    several = lower.size > 1
+    sides = sides_of(letter, given).T
+    names = [letter] if len(sides) == 1 else [f"{letter}{j + 1}" for j in range(len(sides))]
     return ", ".join(
-        f"|{letter}{j + 1 if several else ''}| <= {high:.4g}" if low == -high
-        else f"{letter}{j + 1 if several else ''} in [{low:.4g}, {high:.4g}]"
-        for j, (low, high) in enumerate(zip(lower, upper, strict=True))
+        f"|{name}| <= {high:.4g}" if low == -high else f"{name} in [{low:.4g}, {high:.4g}]"
+        for name, (low, high) in zip(names, sides, strict=True)
     )

@@ -1,4 +1,4 @@
-"""The theorem's constants and its lemma's (lem:boundedness_of_J), as the proof gives them."""
+"""The theorem's constants, as its proof gives them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class DecayingSums:
     ) -> Array:
         """The right-hand side at t = 0, ..., T, (T + 1,), from lengths (T,) of w and v.
 
-        Lengths that are not nonnegative, finite and equally many are refused.
+        A `ShapeError` or an `OptionError` names lengths that are negative or not equally many.
         """
         start = checked_length("initial", initial)
         w, v = numbers("disturbances", disturbances), numbers("noises", noises)
@@ -73,22 +73,17 @@ class DecayingSums:
             )
         if (w < 0.0).any() or (v < 0.0).any():
             raise OptionError("a length is negative; expected Euclidean lengths, all >= 0.")
-        if not all(math.isfinite(each) for each in self.constants):
+        if not all(map(math.isfinite, self.constants)):
             return np.full(len(w) + 1, np.inf)
         decay: Array = self.initial * start * self.rate ** np.arange(len(w) + 1.0)
         return decay + self.rate * decaying_sums(self.rate, self.disturbance * w + self.noise * v)
 
     def limit(self, disturbance: float, noise: float) -> float:
-        """What the bound tends to for |w| <= disturbance and |v| <= noise as t grows.
-
-        An `OptionError` names a length that is negative or not finite.
-        """
-        checked_length("disturbance", disturbance)
-        checked_length("noise", noise)
-        if not all(math.isfinite(each) for each in self.constants):
+        """What the bound tends to as t grows, for lengths |w| and |v| up to these."""
+        w, v = checked_length("disturbance", disturbance), checked_length("noise", noise)
+        if not all(map(math.isfinite, self.constants)):
             return math.inf
-        gain = self.rate / (1.0 - self.rate)
-        return gain * (self.disturbance * disturbance + self.noise * noise)
+        return self.rate / (1.0 - self.rate) * (self.disturbance * w + self.noise * v)
 
 
 def decaying_sums(rate: float, entering: Array) -> Array:
@@ -101,9 +96,7 @@ def decaying_sums(rate: float, entering: Array) -> Array:
 
 def checked_length(name: str, value: Any) -> float:
     """A finite number >= 0, checked."""
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value.item()
-    length = finite(value)
+    length = finite(value.item() if isinstance(value, np.ndarray) and not value.ndim else value)
     if length is None or length < 0.0:
         raise OptionError(
             f"{name} is {shown(value)}; expected a finite number >= 0, which bounds a Euclidean "
@@ -149,18 +142,12 @@ class TheoremConstants:
 
     Attributes
     ----------
-    L_bar, kappa_bar : float
-        max(L_h, 1 / C_v), before (eq:proof_2), and kappa or what takes its place.
-    c_bar : float
-        (3 L_bar)^a (c_w kappa_bar^a + c_v), (eq:proof_rho).
-    rho_bar_1, rho_bar_2 : float
-        The sums of rho^(-a k) over k = 1, ..., N, (eq:proof_rho4), and from 0 on, (eq:proof_rho5).
-    C_bar : (float, float, float)
-        Of the estimate's parts, (eq:bound_hat_x).
-    eta_bar, lam : float
-        eta / (1 - eta), (eq:proof_ali), and the rate of the result, max(eta, rho).
-    C_prime, C_double_prime, C : (float, float, float)
-        Those for t >= N and for t < N, and the larger ones, of (eq:RGES_result).
+    L_bar, kappa_bar, c_bar, rho_bar_1, rho_bar_2, eta_bar : float
+        As in the proof; kappa_bar is kappa or what takes its place.
+    C_bar, C_prime, C_double_prime, C : (float, float, float)
+        Those of (eq:bound_hat_x), those for t >= N and for t < N, and the larger ones.
+    lam : float
+        The rate of the result, max(eta, rho).
     result : DecayingSums
         (eq:RGES_result): the estimator's own robust stability.
 
@@ -194,10 +181,10 @@ class TheoremConstants:
     rho_bar_2: float = field(init=False)
     C_bar: Triple = field(init=False)
     eta_bar: float = field(init=False)
-    lam: float = field(init=False)
     C_prime: Triple = field(init=False)
     C_double_prime: Triple = field(init=False)
     C: Triple = field(init=False)
+    lam: float = field(init=False)
     result: DecayingSums = field(init=False)
 
     def __post_init__(self) -> None:
@@ -205,8 +192,7 @@ class TheoremConstants:
         cost, a, N = self.cost, self.cost.exponent, self.horizon
         eta, (c_p, c_w, c_v) = self.detectability.rate, self.detectability.constants
         rho, (C_p, C_w, C_v) = self.observer.rate, self.observer.constants
-        L_bar = max(self.lipschitz, 1.0 / C_v)
-        kappa_bar = self.kappa
+        L_bar, kappa_bar = max(self.lipschitz, 1.0 / C_v), self.kappa
         if self.model_lipschitz is not None:
             kappa_bar = (rho + self.model_lipschitz + 1.0 / C_w) / L_bar
         c_bar = _power(3.0 * L_bar, a) * (
@@ -214,31 +200,30 @@ class TheoremConstants:
         )
         rho_bar_2 = _geometric(-a * math.log(rho), N)
         rho_bar_1 = rho_bar_2 * _power(rho, -a)
-        first = _power(3.0 * c_bar * rho_bar_1, 1.0 / a)
-        second = _power(3.0 * c_bar * rho_bar_2, 1.0 / a) / rho
-        C_bar = C_p * first, _product(C_w, second), C_v * second
+        later = _power(3.0 * c_bar * rho_bar_2, 1.0 / a) / rho
+        C_bar = (
+            C_p * _power(3.0 * c_bar * rho_bar_1, 1.0 / a), _product(C_w, later), C_v * later
+        )
         eta_bar, lam = eta / (1.0 - eta), max(eta, rho)
         # From the bounds of the estimate's parts to bounds of its error.
         prior, disturbance, noise = (
             each[0] ** (-1.0 / a) for each in (cost.prior, cost.disturbance, cost.noise)
         )
         window = eta_bar * (c_w * disturbance + c_v * noise)
-        late, early = c_p * prior * eta**N + window, c_p * prior + window
         begun = c_p * (eta / lam) ** N
-        C_prime = (
-            _product(late, C_bar[0]) + begun * C_p,
-            _product(late, C_bar[1]) + begun * C_w + c_w,
-            _product(late, C_bar[2]) + begun * C_v + c_v,
+        C_prime = tuple(
+            _product(c_p * prior * eta**N + window, bar) + begun * own + direct
+            for bar, own, direct in zip(C_bar, (C_p, C_w, C_v), (0.0, c_w, c_v), strict=True)
         )
-        C_double_prime = (
-            _product(early, C_bar[0]) + c_p, _product(early, C_bar[1]) + c_w,
-            _product(early, C_bar[2]) + c_v,
+        C_double_prime = tuple(
+            _product(c_p * prior + window, bar) + direct
+            for bar, direct in zip(C_bar, (c_p, c_w, c_v), strict=True)
         )
         C = tuple(map(max, C_prime, C_double_prime))
         vars(self).update(
             L_bar=L_bar, kappa_bar=kappa_bar, c_bar=c_bar, rho_bar_1=rho_bar_1,
-            rho_bar_2=rho_bar_2, C_bar=C_bar, eta_bar=eta_bar, lam=lam, C_prime=C_prime,
-            C_double_prime=C_double_prime, C=C, result=DecayingSums(lam, *C),
+            rho_bar_2=rho_bar_2, C_bar=C_bar, eta_bar=eta_bar, C_prime=C_prime,
+            C_double_prime=C_double_prime, C=C, lam=lam, result=DecayingSums(lam, *C),
         )
 
     def _check(self) -> None:
@@ -261,21 +246,6 @@ class TheoremConstants:
         if self.model_lipschitz is not None:
             checked_length("model_lipschitz", self.model_lipschitz)
             positive("the observer's C_w", self.observer.disturbance)
-
-    def to_dict(self, sizes: tuple[float, float], diameter: float) -> dict[str, Any]:
-        """The constants, and the limit for the largest |w| and |v|, in types that JSON knows.
-
-        The limit is vacuous if it is no less than the diameter of the region, in which state and
-        estimate are anyway.
-        """
-        names = (
-            "horizon", "L_bar", "kappa_bar", "c_bar", "eta_bar", "rho_bar_1", "rho_bar_2", "C_bar",
-            "C_prime", "C_double_prime", "C",
-        )
-        limit = self.result.limit(*sizes)
-        return {name: getattr(self, name) for name in names} | {
-            "lambda": self.lam, "limit": limit, "vacuous": not limit < diameter,
-        }
 
 
 def _geometric(slope: float, count: int) -> float:

@@ -103,33 +103,31 @@ def certify(
         str, typer.Argument(help="Model of the zoo, package.module:function or file.py:function.")
     ],
     box: Annotated[
-        str | None, typer.Option(help="Set of states, such as 0.1:9,-1:9; default is the "
+        str | None, typer.Option(help="Region of the states, such as 0.1:9,-1:9. Default: the "
                                       "model's own, else a box around a simulated record."),
     ] = None,
     horizon: Annotated[
-        str | None, typer.Option(help="Horizons N, between commas; the model's own if left out.")
+        str | None, typer.Option(help="Horizons N, separated by commas. Default: the model's own.")
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(help="JSON file for all results; a picture is written beside "
-                                       "it.")
+        Path | None, typer.Option(help="Write all results to this JSON file.")
     ] = None,
     input_box: Annotated[
         str | None, typer.Option(help="Bounds on the inputs, in the form of --box.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated record.")] = 0,
     seconds: Annotated[
-        float, typer.Option(help="Time limit of the search, about, in seconds.")
+        float, typer.Option(help="Time limit of the search, in seconds.")
     ] = 60.0,
     details: Annotated[
-        bool, typer.Option("--details", help="Show the theorem's assumptions and constants, "
-                                             "too.")
+        bool, typer.Option("--details", help="Show the theorem's assumptions and constants.")
     ] = False,
     design: Annotated[
         bool, typer.Option("--design", help="Design weights, discount and horizon by a "
-                                            "Lyapunov function, ready to paste.")
+                                            "Lyapunov function, and print code to paste.")
     ] = False,
 ) -> None:
-    """Prove how far the observer can be from the truth, and what the theorem guarantees."""
+    """Prove how far the observer can be from the true state."""
     from .certify import certify as run
 
     certified = run(

@@ -35,8 +35,7 @@ def certify(
     if report is not None:  # before any work
         if report.suffix != ".json":
             raise OptionError(
-                f"--report is {str(report)!r}; expected a file name that ends with .json, beside "
-                "which the picture goes as .png and .svg."
+                f"--report is {str(report)!r}; expected a file name that ends with .json."
             )
         make_folder(report.parent)
     source = find(model)
@@ -63,7 +62,7 @@ def certify(
             "observer's candidate, at each step and with any solver.",
         )
     if details:
-        _show(console, _details(found), "The theorem's assumptions and constants")
+        _show(console, _details(certificate), "The theorem's assumptions and constants")
         for text in ASSUMED:
             _print(console, f"Assumed: {text}.")
     elif certificate.assumptions:
@@ -71,8 +70,8 @@ def certify(
     if with_design:
         found.design = _designed(console, certificate, horizons, seconds)
     if report is not None:
-        for path in found.save(report):
-            console.print(f"wrote {escape(str(path))}", highlight=False, soft_wrap=True)
+        found.save(report)
+        console.print(f"wrote {escape(str(report))}", highlight=False, soft_wrap=True)
     return certificate.holds
 
 
@@ -91,43 +90,41 @@ def _show(console: Console, rows: Rows, title: str = "") -> None:
 
 
 def _findings(found: Report, seed: int) -> Rows:
-    """What the bounds are for, what they need, and what they came to on the simulated record."""
+    """What the bounds are for, what they need, and what they are on the simulated record."""
     certificate, proved = found.certificate, found.certificate.observer_bound
     title = "" if found.scenario is None else found.scenario.title
     rows = [("model", title or found.name), ("states", _words(certificate.region))]
     if found.replaced:
         rows.append(("observer", found.replaced))
     if proved is not None:
-        rows += [("for", str(proved.sizes)), ("stays", proved.condition)]
+        rows += [("sizes", str(proved.sizes)), ("region", proved.condition)]
         if certificate.system.states is not None and not proved.projects:
             metric = np.array2string(proved.metric, separator=", ", floatmode="unique")
             rows.append((
                 "projection", "the observer is projected onto X in another metric than the "
-                "certified one: samples at which it is end the bound. Luenberger(gain, metric="
-                f"{metric})".replace("\n", "") + " keeps it",
+                "certified one, which ends the bound at that sample. Use Luenberger(gain, metric="
+                f"{metric})".replace("\n", "") + " to keep it",
             ))
     if found.band is not None and found.run is not None and found.record is not None:
         errors = np.linalg.norm(found.record.states - found.run.states, axis=1)
         held = np.isfinite(found.band.error)
         rows.append((
-            "simulated", f"seed {seed}: |x - x_hat| <= {found.band.error[held].max():.3g} was "
-            f"guaranteed, and {errors[held].max():.3g} was the largest; {found.band}",
+            "simulated", f"seed {seed}: the largest |x - x_hat| is {errors[held].max():.3g}, and "
+            f"the largest bound {found.band.error[held].max():.3g}; {found.band}",
         ))
-    for N, each in certificate.constants.items():
-        limit = each.result.limit(*certificate.sizes.largest)
+    for each, limit in certificate.limits():
         vacuous = ""
         if not limit < certificate.diameter:
             vacuous = f": vacuous, the region's diameter is {certificate.diameter:.3g}"
         rows.append((
-            f"N = {N}", f"|x - x_hat| <= {limit:.4g} in the limit by the paper's constants "
-            f"({certificate.evidence}){vacuous}",
+            f"N = {each.horizon}", f"|x - x_hat| <= {limit:.4g} in the limit by the paper's "
+            f"constants ({certificate.evidence}){vacuous}",
         ))
     return rows
 
 
-def _details(found: Report) -> Rows:
-    """The theorem's assumptions, constants and hypotheses."""
-    certificate = found.certificate
+def _details(certificate: Certificate) -> Rows:
+    """The theorem's assumptions and constants."""
     rows = [
         (f"{each.name} ({each.label})", " ".join(filter(None, (
             {True: "", False: "does not hold", None: "not examined"}[each.holds],
@@ -136,23 +133,18 @@ def _details(found: Report) -> Rows:
         for each in certificate.assumptions
     ]
 
-    def constants(sums: DecayingSums, names: tuple[str, str, str, str]) -> str:
-        values = (*sums.constants, sums.rate)
-        return ", ".join(f"{name} {value:.4g}" for name, value in zip(names, values, strict=True))
+    def add(name: str, sums: DecayingSums, symbols: tuple[str, ...], end: str = "") -> None:
+        values = zip(symbols, (*sums.constants, sums.rate), strict=True)
+        rows.append((name, ", ".join(f"{symbol} {value:.4g}" for symbol, value in values) + end))
 
-    for name, part in (
-        ("e-IOSS (eq:eIOSS)", certificate.detectability),
-        ("observer (eq:RGES)", certificate.stability),
+    for name, part, symbols in (
+        ("e-IOSS (eq:eIOSS)", certificate.detectability, ("c_p", "c_w", "c_v", "eta")),
+        ("observer (eq:RGES)", certificate.stability, ("C_p", "C_w", "C_v", "rho")),
     ):
         if part is not None:
-            text = constants(part.sums, ("c_p", "c_w", "c_v", "rate"))
-            rows.append((name, f"{text} ({part.evidence})"))
+            add(name, part.sums, symbols, f" ({part.evidence})")
     for N, each in certificate.constants.items():
-        rows.append((
-            f"N = {N} (eq:RGES_result)", constants(each.result, ("C_1", "C_2", "C_3", "lambda"))
-        ))
-    if found.monitor is not None:
-        rows.append(("simulated record", found.monitor.summary()))
+        add(f"N = {N} (eq:RGES_result)", each.result, ("C_1", "C_2", "C_3", "lambda"))
     return rows
 
 
@@ -173,14 +165,14 @@ def _designed(
     widths = (made.region.upper - made.region.lower)[: limits.size]
     nothing = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limits >= widths))
     rows = [
-        ("for", str(made.sizes)),
-        ("contraction", f"of the error by {made.contraction():.3g} over a window of N = "
-         f"{made.horizon} that starts at an estimate, if J(estimate) <= J(truth), as of a global "
-         f"minimiser; below 1 from N = {made.least_horizon() or '-'} on"),
+        ("sizes", str(made.sizes)),
+        ("contraction", f"a window of N = {made.horizon} that starts at an estimate shrinks the "
+         f"error by {made.contraction():.3g}, if J(estimate) <= J(truth), as for a global "
+         f"minimiser; the least N is {made.least_horizon() or '-'}"),
         ("limit", "then "
          + ", ".join(f"|x{i + 1} - x_hat{i + 1}| <= {each:.3g}" for i, each in enumerate(limits))
          + (f": it says nothing of {nothing}" if nothing else "")),
-        ("any QPs", "the bound with J(estimate) as it came back: Design.along"),
+        ("any QPs", "Design.along bounds the error by the J(estimate) that came back"),
         *(("note", each) for each in made.notes),
     ]
     _show(console, rows, f"Lyapunov design ({made.evidence})")

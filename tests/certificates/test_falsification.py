@@ -84,8 +84,8 @@ def constrained(name):
 def test_no_closed_run_exceeds_a_bound(pytestconfig, name):
     certificate, runs = constrained(name), 60 if pytestconfig.option.all else 20
     share, _ = attack_observer(
-        certificate.system, certificate.region, certificate.gain, certificate.stability.sums,
-        trials=PAIRS,
+        certificate.system, certificate.region, certificate.stability.gain,
+        certificate.stability.sums, trials=PAIRS,
     )
     assert 0.5 < share <= 1.0 + RELATIVE
     assert attack_detectability(
