@@ -69,8 +69,9 @@ def batch_of(one, members=3, starts=(0.5, 0.0), **options):
 
 FIELDS = {
     "candidates": "candidate", "trajectories": "trajectory", "states": "state",
-    "filtered": "filtered", "costs": "cost", "candidate_costs": "candidate_cost",
-    "statuses": "status", "qps": "qps", "improved": "improved",
+    "filtered": "filtered", "observer_states": "observer_state", "costs": "cost",
+    "candidate_costs": "candidate_cost", "statuses": "status", "qps": "qps",
+    "improved": "improved",
 }
 
 
