@@ -20,11 +20,8 @@ from .untraced import untraced
 NAN = np.nan
 A = np.array([[1.0, 0.1], [-0.1, 0.95]])
 SETS = {"states": qpmhe.Box([-9.0, -9.0], [9.0, 9.0])}
-engines = pytest.mark.parametrize("engine", [
-    "python", pytest.param("compiled", marks=pytest.mark.skipif(
-        find_compiler() is None, reason="there is no C compiler"
-    )),
-])
+ENGINES = ("python", "compiled") if find_compiler() is not None else ("python",)
+compiled = pytest.mark.skipif(len(ENGINES) < 2, reason="there is no C compiler")
 
 
 def turn(x):
@@ -69,8 +66,9 @@ def batch_of(one, members=3, starts=(0.5, 0.0), **options):
 
 FIELDS = {
     "candidates": "candidate", "trajectories": "trajectory", "states": "state",
-    "filtered": "filtered", "costs": "cost", "candidate_costs": "candidate_cost",
-    "statuses": "status", "qps": "qps", "improved": "improved",
+    "filtered": "filtered", "observer_states": "observer_state", "costs": "cost",
+    "candidate_costs": "candidate_cost", "statuses": "status", "qps": "qps",
+    "improved": "improved",
 }
 
 
@@ -133,31 +131,31 @@ def test_systems_and_measurements_that_are_missing(name):
         assert Status.MISSING in compare(one, Y, starts=case.start, **options)
 
 
-@engines
 @pytest.mark.parametrize("options", [
     {"max_qps": 0, "threads": 1, "horizon": 1}, {"max_qps": None, "warm_start": True, "delay": 3},
     {"max_qps": 2, "sets": {"disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}, "threads": 2},
     {"max_qps": 1, "candidate": "reinitialized"},
 ])
-def test_engines_and_threads(engine, options):
-    options, members = dict(options), 12
-    one = reactor(**options.pop("sets", {}))
+def test_engines_and_threads(options):
+    one, members = reactor(**options.get("sets", {})), 12
+    options = {key: value for key, value in options.items() if key != "sets"}
     starts = np.array([3.0, 0.1]) + 0.1 * np.arange(members)[:, None] / members
-    compare(one, reactor_records(members), starts=starts, engine=engine, **options)
+    for engine in ENGINES:
+        compare(one, reactor_records(members), starts=starts, engine=engine, **options)
 
 
-@engines
-@pytest.mark.parametrize("shared", [True, False])
-def test_inputs(engine, shared):
+def test_inputs_of_each_member_and_shared_ones():
     one = parts(driven, lambda x, u: x[..., :1] * (1.0 + 0.1 * u[..., :1]), m=3)
     generator = np.random.default_rng(3)
     Y, U = generator.standard_normal((3, 20, 1)), generator.standard_normal((3, 20, 3))
     U[1, 5] = NAN
-    seen = compare(one, Y, U[0] if shared else U, starts=np.eye(3, 2), max_qps=2, engine=engine)
-    assert (Status.MODEL_FAILED in seen) != shared
+    for engine in ENGINES:
+        for inputs in (U, U[0]):
+            seen = compare(one, Y, inputs, starts=np.eye(3, 2), max_qps=2, engine=engine)
+            assert (Status.MODEL_FAILED in seen) == (inputs is U)
 
 
-@engines
+@pytest.mark.parametrize("engine", ENGINES)
 def test_resets_copies_and_what_the_caller_does_to_an_estimate(engine):
     one, Y = parts(**SETS), np.random.default_rng(4).standard_normal((3, 30, 1))
     starts = np.array([[0.5, 0.0], [0.4, 0.1], [0.3, 0.2]])
@@ -233,6 +231,7 @@ def test_one_state_one_output_one_input_without_brackets():
     assert "improved=2" in repr(found)
 
 
+@compiled
 def test_without_a_compiler_it_is_a_loop_and_says_so_once(monkeypatch):
     one = reactor()
     monkeypatch.setenv("CC", "/nowhere/cc")

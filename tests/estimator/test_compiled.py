@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import itertools
 import math
 import pickle
 
@@ -12,7 +13,7 @@ from oracles.systems import SYSTEMS, around, reactor
 import qpmhe
 from qpmhe import Box, Polytope, Status
 from qpmhe.codegen.compiler import find_compiler
-from qpmhe.errors import InvalidInputError, ShapeError, WeightError
+from qpmhe.errors import InvalidInputError
 from tests.codegen.cases import Case, case, recorded, spd
 from tests.codegen.test_agreement import ARRAYS, agree
 
@@ -209,25 +210,6 @@ def test_a_discount_that_underflows_within_the_window():
         np.testing.assert_allclose(long.state, short.state, rtol=1e-9)
 
 
-def test_wrong_arguments_change_nothing():
-    one = case("inputs")
-    y, u = one.samples[0].values()
-    spoilt_one, twin = (one.estimator("compiled") for _ in range(2))
-    for t, sample in enumerate(one.samples[:7]):
-        for error, call in (
-            (ShapeError, lambda m: m.update([1.0], u)), (ShapeError, lambda m: m.update(y, [0.0])),
-            (InvalidInputError, lambda m: m.update(y)),
-            (InvalidInputError, lambda m: m.update(y, u, dt=0.1)),
-            (WeightError, lambda m: m.update(y, u, noise_weight=-np.eye(2))),
-            (InvalidInputError, lambda m: m.amend(99, y)),
-            (ShapeError, lambda m: m.run(np.zeros((5, 2)), np.zeros((4, 2)))),
-        ):
-            with pytest.raises(error):
-                call(spoilt_one)
-        assert spoilt_one.time == t
-        equal(spoilt_one.update(**sample), twin.update(**sample))
-
-
 # Models that are not finite everywhere, with outliers that drive the observer there.
 
 
@@ -357,53 +339,6 @@ def estimator_in(name, kind, engine="compiled", sets=None, x_unit=1.0, y_unit=1.
     )
 
 
-@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
-@pytest.mark.parametrize("name", ["reactor", "van_der_pol", "stirred_tank", "pendulum"])
-def test_sets_that_the_observer_leaves_nearly_always(name, infeasible):
-    """All rungs, with the same rows where the QPs have solutions."""
-    rungs, apart = {"again": 0, "dropped": 0, "kept": 0, "nearest": 0}, 0
-    for backend in ("auto", "banded"):  # the banded one knows no inequalities
-        options = {"infeasible": infeasible, "max_qps": None, "backend": backend}
-        (one, reference), (_, compiled) = (
-            estimator_in(name, "tight", engine, **options) for engine in ENGINES
-        )
-        for y in one.record(0, 30):
-            expected, found = reference.update(y), compiled.update(y)
-            assert found.cost <= found.candidate_cost
-            assert found.candidate_cost == pytest.approx(expected.candidate_cost, rel=1e-9)
-            if Status.SOLVER_STOPPED in expected.status | found.status:
-                apart += found.cost != pytest.approx(expected.cost, rel=1e-6)
-            else:
-                rung = Status.IMPROVED | Status.CANDIDATE_OUTSIDE | Status.ROWS_DROPPED
-                assert (found.status & rung, found.dropped) == (
-                    expected.status & rung, expected.dropped
-                )
-                assert found.cost == pytest.approx(expected.cost, rel=1e-6)
-            assert backend == "auto" or found.solver_iterations == 0
-            rungs["nearest"] += found.nearest_points > 0
-            if Status.CANDIDATE_OUTSIDE in found.status:
-                rungs["dropped" if found.dropped else "again" if found.improved else "kept"] += 1
-    assert apart <= 4
-    assert min(rungs["again"], rungs["nearest"]) > 2
-    assert rungs["dropped" if infeasible == "drop_rows" else "kept"] > 2
-
-
-@pytest.mark.parametrize("name", ["reactor", "stirred_tank"])
-def test_caps_on_iterations(name):
-    for cap in (1, 2, 5):
-        options, flags = {"max_qps": 3, "max_solver_iterations": cap}, Status(0)
-        one, mhe = estimator_in(name, "polytope", **options)
-        for y in one.record(1, 30):
-            estimate = mhe.update(y)
-            solves = estimate.qps + estimate.corrections + estimate.nearest_points
-            assert estimate.solver_iterations <= cap * solves
-            assert estimate.cost <= estimate.candidate_cost
-            flags |= estimate.status
-        # The active rows are mostly found by a few guesses.
-        assert Status.SOLVER_STOPPED in flags or cap > 1
-        assert Status.IMPROVED in flags
-
-
 def test_bounds_that_are_all_but_infinite():
     costs = []
     for far in (INF, 1e20, 1e200, 1e300):
@@ -478,61 +413,17 @@ def test_no_unit_matters(name, kind):
     assert Status.CANDIDATE_OUTSIDE in flags
 
 
-@both_engines
-@pytest.mark.parametrize("whole", [False, True])
-def test_rows_dropped_for_long_are_worth_a_warning(engine, whole):
-    one, mhe = estimator_in("pendulum", "tight", engine)
-    take = mhe.run if whole else lambda ys: [mhe.update(y) for y in ys]
-    with pytest.warns(qpmhe.ObserverWarning, match="inequalities were dropped in") as caught:
-        take(one.record(1, 30))
-    assert len(caught) == 1
-    assert caught[0].filename == __file__ or (engine, whole) == ("python", True)
-
-
-def test_whatever_the_system_and_the_options():
-    """The promise with coefficients that are inputs, sets that may be open, and odd numbers."""
-    generator, cost = np.random.default_rng(0), {"prior": 1, "disturbance": 1, "noise": 1}
-    odd = [NAN, INF, 0.0, 1e12, -1e149, 1e200]
-
-    def number(often=0.8):
-        return generator.uniform(-3.0, 3.0) if generator.random() < often else generator.choice(odd)
-
-    def box():
-        low, high = (np.where(generator.random(3) < 0.3, INF, generator.uniform(0.05, 3.0, 3))
-                     for _ in range(2))
-        rows = np.array([[1.0, 2.0]])
-        return qpmhe.model.sets.ConvexSet(-low[:2], high[:2], rows, -low[2:], high[2:])
-
-    for k in range(12):
-        system = system_of(
-            lambda x, u: [u[0] * x[0] + u[1] * casadi.sin(x[1]) + u[2] * x[0] ** 2,
-                          u[3] * x[1] + u[1] * x[0] + 0.1 * casadi.sqrt(x[0] + u[4])],
-            lambda x, u: [x[0] + u[2] * x[1] ** 2, casadi.log(x[1] + u[4])],
-            n=2, m=5, disturbances=box(), noises=box(),
+@pytest.mark.parametrize("backend", ["auto", "banded"])  # the latter knows no inequalities
+def test_rows_dropped_for_long_are_worth_a_warning(backend):
+    dropped = []
+    for engine, whole in itertools.product(ENGINES, (False, True)):
+        one, mhe = estimator_in("pendulum", "tight", engine, backend=backend, max_qps=3)
+        take = mhe.run if whole else lambda ys, mhe=mhe: dropped.append(
+            [mhe.update(y).dropped for y in ys]
         )
-        weights = {
-            name: 10.0 ** generator.uniform(-4, 4) * np.array([[1.0, 0.3], [0.3, 0.5]])
-            for name in cost
-        }
-        mhe = qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger(generator.uniform(-0.5, 0.5, (2, 2))),
-            qpmhe.QuadraticCost(**weights, discount=(1.0, 0.9, 0.1)[k % 3]), horizon=3,
-            initial_state=[0.01, 0.02], engine="compiled", max_qps=(1, 2, None, 0)[k % 4],
-            max_solver_iterations=(None, 1, 3)[k // 3 % 3], warm_start=bool(k % 2),
-            infeasible=("drop_rows", "keep_candidate")[k // 2 % 2],
-            candidate=("observer", "reinitialized")[k // 6],
-        )
-        usual = [*generator.uniform(-1.1, 1.1, 4), 2.0]
-        for t in range(20):
-            u = [number(0.5) for _ in range(5)] if generator.random() < 0.1 else usual
-            estimates = [mhe.update([number(), number()], u)]
-            estimates.append(mhe.amend(max(0, t - 1), [number(), number()]))
-            for estimate in estimates:
-                status = estimate.status
-                assert estimate.cost <= estimate.candidate_cost
-                assert estimate.improved != (Status.CANDIDATE in status)
-                assert np.isfinite(estimate.trajectory).all()
-                assert (Status.ROWS_DROPPED in status) == bool(estimate.dropped)
-                if not estimate.improved:
-                    np.testing.assert_array_equal(estimate.trajectory, estimate.candidate)
-                    assert estimate.cost == estimate.candidate_cost
+        with pytest.warns(qpmhe.ObserverWarning, match="inequalities were dropped in") as caught:
+            take(one.record(1, 30))
+        assert len(caught) == 1
+        assert caught[0].filename == __file__ or (engine, whole) == ("python", True)
+    assert dropped[0] == dropped[1]
+    assert len(set(dropped[0])) > 5
