@@ -4,6 +4,7 @@ import itertools
 import math
 import re
 import warnings
+from operator import and_
 
 import numpy as np
 import pytest
@@ -51,17 +52,21 @@ def test_parts():
     )
 
 
+def injected(gain):
+    return estimator(observer=qpmhe.Luenberger(gain))
+
+
 def test_gains():
-    for gain, shape in (
-        (0.3, (1, 1)), ([[0.3, 0.1]], (1, 2)), (np.ones((2, 1, 1)), (2, 1, 1)),
+    for gain, kind, text in (
+        (0.3, ShapeError, ["gain has shape (1, 1)", "(n, p) = (2, 1)"]),
+        (np.ones((2, 1, 1)), ShapeError, ["gain has shape (2, 1, 1)", "(n, p) = (2, 1)"]),
+        ([[0.1], [math.inf]], InvalidInputError, ["gain is ", "inf", "finite"]),
+        ("high", InvalidInputError, ["gain is 'high'", "numbers"]),
+        ([[1j], [0.1]], InvalidInputError, ["gain is ", "1j", "numbers"]),
+        ([[0.1], [0.1, 0.2]], InvalidInputError, ["gain is ", "0.2", "numbers"]),
+        (None, InvalidInputError, ["gain is ", "nan", "numbers"]),
     ):
-        text = [f"gain has shape {shape}", "(n, p) = (2, 1)"]
-        check(ShapeError, text, lambda gain=gain: estimator(observer=qpmhe.Luenberger(gain)))
-    for gain, text in (
-        ([[math.nan], [0.1]], "nan"), ([[0.1], [math.inf]], "inf"), ("high", "'high'"),
-        ([[1j], [0.1]], "1j"), ([[0.1], [0.1, 0.2]], "0.2"), (None, "nan"),
-    ):
-        check(InvalidInputError, ["gain is ", text, "numbers"], qpmhe.Luenberger, gain)
+        check(kind, text, injected, gain)
 
 
 INITIAL_STATES = [
@@ -155,63 +160,52 @@ def test_weights_of_other_sizes(build):
     )
 
 
-def test_boxes():
-    for lower, upper, kind, text in (
-        ([0.0, 0.0], [1.0], SetError, ["(2,)", "(1,)", "equal length"]),
-        ([[0.0]], [[1.0]], SetError, ["(1, 1)", "vectors"]),
-        ([0.0, math.nan], [1.0, 1.0], SetError, ["nan", "-inf or inf"]),
-        ([0.0, 2.0], [1.0, 1.0], SetError, ["component 1", "lower 2.0", "upper 1.0"]),
-        ([math.inf], [math.inf], SetError, ["component 0", "lower inf", "lower <= upper"]),
-        ([-math.inf], [-math.inf], SetError, ["component 0", "upper -inf", "lower <= upper"]),
-        (["a"], [1.0], InvalidInputError, ["lower is ['a']", *NO_NUMBERS]),
+def test_sets():
+    Box, Polytope, empty = qpmhe.Box, qpmhe.Polytope, ["the set is empty", "no point satisfies all"]
+    quarter = Polytope([[1.0, 0.0]], [0.0]) & Polytope([[0.0, -1.0]], [0.0])
+    for build, one, other, kind, text in (
+        (Box, [0.0, 0.0], [1.0], SetError, ["(2,)", "(1,)", "equal length"]),
+        (Box, [[0.0]], [[1.0]], SetError, ["(1, 1)", "vectors"]),
+        (Box, [0.0, math.nan], [1.0, 1.0], SetError, ["nan", "-inf or inf"]),
+        (Box, [0.0, 2.0], [1.0, 1.0], SetError, ["component 1", "lower 2.0", "upper 1.0"]),
+        (Box, [math.inf], [math.inf], SetError, ["component 0", "lower inf", "lower <= upper"]),
+        (Box, [-math.inf], [-math.inf], SetError, ["component 0", "upper -inf"]),
+        (Box, ["a"], [1.0], InvalidInputError, ["lower is ['a']", *NO_NUMBERS]),
+        (Polytope, np.eye(2), [1.0], SetError, ["shape (2, 2)", "bound (1,)", "(r, d) and (r,)"]),
+        (Polytope, [1.0, 2.0], [1.0, 2.0], SetError, ["matrix has shape (1, 2)", "bound (2,)"]),
+        (Polytope, np.ones((2, 0)), [1.0] * 2, SetError, ["matrix has shape (2, 0)", "(r, d)"]),
+        (Polytope, np.diag([1.0, 0.0]), [1.0] * 2, SetError, ["row 1 of matrix is zero", "leave"]),
+        (Polytope, [[1.0, math.nan]], [1.0], InvalidInputError, ["matrix is [[1.0, nan]]"]),
+        (Polytope, [[1.0, 0.0]], [math.inf], InvalidInputError, ["bound is [inf]", "finite"]),
+        (Polytope, [[1.0, 0.0]], [1j], InvalidInputError, ["bound is [1j]", *NO_NUMBERS]),
+        (Polytope, [[1.0], [-1.0]], [0.0, -1.0], SetError, [*empty, "Polytope(", "2 rows"]),
+        (Polytope, [[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [-1.0, 0.0, 0.0], SetError, empty),
+        (and_, Box([0.0], [1.0]), Box([2.0], [3.0]), SetError, empty),
+        (and_, Box([0.0] * 2, [1.0] * 2), Polytope([[-1.0, -1.0]], [-2.1]), SetError, empty),
+        (and_, Polytope([[-1.0, -1.0]], [-2.1]), Box([0.0] * 2, [1.0] * 2), SetError, empty),
+        (and_, quarter, Polytope([[-1.0, 1.0]], [-1.0]), SetError, empty),
+        (and_, quarter, Polytope([[1.0] * 3], [1.0]), SetError, ["dimensions 2 and 3", "equal"]),
     ):
-        check(kind, text, qpmhe.Box, lower, upper)
-
-
-def test_polytopes():
-    empty = ["the set is empty", "no point satisfies all"]
-    for matrix, bound, kind, text in (
-        (np.eye(2), [1.0], SetError, ["matrix has shape (2, 2)", "bound (1,)", "(r, d) and (r,)"]),
-        ([1.0, 2.0], [1.0, 2.0], SetError, ["matrix has shape (1, 2)", "bound (2,)"]),
-        (np.ones((2, 0)), [1.0, 1.0], SetError, ["matrix has shape (2, 0)", "(r, d)"]),
-        ([[1.0, 0.0], [0.0, 0.0]], [1.0, 1.0], SetError, ["row 1 of matrix is zero", "leave out"]),
-        ([[1.0, math.nan]], [1.0], InvalidInputError, ["matrix is [[1.0, nan]]", "finite"]),
-        ([[1.0, 0.0]], [math.inf], InvalidInputError, ["bound is [inf]", "finite"]),
-        ([[1.0, 0.0]], [1j], InvalidInputError, ["bound is [1j]", *NO_NUMBERS]),
-        ([[1.0], [-1.0]], [0.0, -1.0], SetError, [*empty[:1], "Polytope(", "2 rows"]),
-        ([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [-1.0, 0.0, 0.0], SetError, empty),
-    ):
-        check(kind, text, qpmhe.Polytope, matrix, bound)
-    quarter = qpmhe.Polytope([[1.0, 0.0]], [0.0]) & qpmhe.Polytope([[0.0, -1.0]], [0.0])
-    for one, other in (
-        (qpmhe.Box([0.0], [1.0]), qpmhe.Box([2.0], [3.0])),
-        (qpmhe.Box([0.0, 0.0], [1.0, 1.0]), qpmhe.Polytope([[-1.0, -1.0]], [-2.1])),
-        (qpmhe.Polytope([[1.0, 1.0]], [0.0]), qpmhe.Polytope([[-1.0, -1.0]], [-0.5])),
-        (quarter, qpmhe.Polytope([[-1.0, 1.0]], [-1.0])),
-    ):
-        check(SetError, empty, one.__and__, other)
-        check(SetError, empty, other.__and__, one)
-    text = ["dimensions 2 and 3", "expected equal dimensions"]
-    check(SetError, text, quarter.__and__, qpmhe.Polytope([[1.0, 1.0, 1.0]], [1.0]))
-    for other in (None, 1.0, ([0.0], [1.0])):
+        check(kind, text, build, one, other)
+    for value in (None, 1.0, ([0.0], [1.0])):
         with pytest.raises(TypeError, match="unsupported operand"):
-            qpmhe.Box([0.0], [1.0]) & other
+            quarter & value
 
 
 def ode(rate=lambda x: -x, h=lambda x: x[..., :1], **options):
     return qpmhe.System.from_ode(rate, h, **{"n": 2, "p": 1, "dt": 0.1} | options)
 
 
-@pytest.mark.parametrize("make", [system_of, ode])
-def test_sets_of_a_system(make):
+def test_sets_of_a_system():
+    large, rows = qpmhe.Box([0.0] * 3, [1.0] * 3), qpmhe.Polytope(np.ones((1, 4)), [1.0])
     for name, right in (("states", 2), ("disturbances", 2), ("noises", 1)):
-        for value, size in (
-            (qpmhe.Box([0.0] * 3, [1.0] * 3), 3), (qpmhe.Polytope(np.ones((1, 4)), [1.0]), 4)
+        for value, text in (
+            (large, [f"{name} has dimension 3", f"expected {right}"]),
+            (rows, [f"{name} has dimension 4", f"expected {right}"]),
+            ((0.0, 1.0), [f"{name} is (0.0, 1.0)", "qpmhe.Box", "qpmhe.Polytope"]),
         ):
-            text = [f"{name} has dimension {size}", f"expected {right}"]
-            check(SetError, text, make, **{name: value})
-        text = [f"{name} is (0.0, 1.0)", "qpmhe.Box", "qpmhe.Polytope"]
-        check(SetError, text, make, **{name: (0.0, 1.0)})
+            check(SetError, text, system_of, **{name: value})
+            check(SetError, text, ode, **{name: value})
 
 
 def test_sizes_and_options_of_a_system():
