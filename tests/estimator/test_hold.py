@@ -270,24 +270,6 @@ def test_snapshots_of_other_holds_and_damaged_ones_are_refused():
         check(InvalidInputError, ["damaged"], mhe.load_state_dict, state)
 
 
-def test_an_interrupted_step_leaves_the_trusted_value():
-    (y, u, _), mhe, other = record(3), estimator(0.1), estimator(0.1)
-    mhe.run(y[:30], u[:30])
-    other.run(y[:30], u[:30])
-    watch, note = mhe._engine._watch, mhe._engine._watch.note
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    watch.note = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        mhe.update(y[30] + 1.0, u[30])
-    watch.note = note
-    expected = other.run(y[30:40], u[30:40])
-    np.testing.assert_array_equal(mhe.run(y[30:40], u[30:40]).costs, expected.costs)
-    np.testing.assert_array_equal(mhe.hold.target, other.hold.target)
-
-
 @pytest.mark.parametrize("exponents", [(9, -14, 4), (-20, 7, -3)])
 def test_no_unit_matters(exponents):
     scales, (y, u, _) = np.ldexp(1.0, exponents), record(5)

@@ -33,6 +33,7 @@ CASES = {
     "robust": ("numpy", {"robust": True, "max_qps": 2}),
     "dropped": ("numpy", {"sets": NARROW, "max_qps": 2}),
     "smoothed": ("numpy", {"arrival": "smoothed", "discount": 0.8, "warm_start": True}),
+    "held": ("numpy", {"held": {1: 0.5}, "max_qps": 2}),
     "compiled": ("compiled", {"candidate": "reinitialized"}),
 }
 
