@@ -95,22 +95,18 @@ def test_initial_states():
 
 @pytest.mark.parametrize("project", [True, False])
 def test_an_initial_state_outside_of_the_state_set_is_projected(project):
-    box, given = qpmhe.Box([-5.0, -np.inf], [9.0, 9.0]), [2.0, 7.0]
-    for states, nearest in (
-        (qpmhe.Box([-5.0, -5.0], [5.0, 5.0]), [2.0, 5.0]),
-        (qpmhe.Polytope([[1.0, 1.0], [-1.0, -1.0]], [5.0, 5.0]), [0.0, 5.0]),
-        (box & qpmhe.Polytope([[1.0, 1.0]], [5.0]), [0.0, 5.0]),
-    ):
-        system = system_of(states=states)
+    box, rows = qpmhe.Box([-5.0, -np.inf], [9.0, 5.0]), qpmhe.Polytope([[1.0, 1.0]], [5.0])
+    for states, nearest in ((box, [2.0, 5.0]), (rows, [0.0, 5.0]), (box & rows, [0.0, 5.0])):
+        system, given = system_of(states=states), [2.0, 7.0]
         words = f"is {given}, outside of the state set {states!r}; the estimator starts at"
         with pytest.warns(ObserverWarning, match=re.escape(words)):
             mhe = estimator(system, initial_state=given, project_observer=project)
-        np.testing.assert_array_equal(mhe.state, mhe.initial_state)
-        np.testing.assert_allclose(mhe.state, nearest, rtol=1e-12, atol=1e-12)
-        mhe.update([1.0])
-        with pytest.warns(ObserverWarning, match=re.escape(words)):
-            mhe.reset(given)
-        np.testing.assert_array_equal(mhe.state, mhe.initial_state)
+        for _ in range(2):
+            np.testing.assert_array_equal(mhe.state, mhe.initial_state)
+            np.testing.assert_allclose(mhe.state, nearest, rtol=1e-12, atol=1e-12)
+            mhe.update([1.0])
+            with pytest.warns(ObserverWarning, match=re.escape(words)):
+                mhe.reset(given)
         mhe.update([1.0])
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -220,45 +216,30 @@ def test_sizes_and_options_of_a_system():
             check(OptionError, [f"{name} is {value!r}", expected], make, **{name: value})
 
 
-def changing(which):
-    def f(x, u):
-        (x if which == "x" else u)[...] *= 2.0
-        return x
-
-    return f
-
-
-def raising(x):
-    raise ZeroDivisionError("no way out")
+def double(x, u=None):
+    (x if u is None else u)[...] *= 2.0
+    return x
 
 
 def test_functions_of_a_system():
-    for name in ("f", "h"):
+    for name, size in (("f", "n"), ("h", "p")):
         for value in (A, "f", 3.0):
             functions = {"f": lambda x: x, "h": lambda x: x[..., :1], name: value}
             text = [f"{name} is {value!r}", "expected a function"]
             check(ModelError, text, qpmhe.System, **functions, n=2, p=1)
-        text = [f"{name} needs 2 arguments", "pass m"]
-        check(ModelError, text, system_of, **{name: lambda x, u: x})
-    check(
-        ModelError, ["f takes no argument", "f(x) or f(x, u)"],
-        system_of, lambda: np.ones(2), m=1,
-    )
-    for shape, right in (((2, 1), 2), ((1, 2), 2), ((), 2), ((1,), 2), ((2,), 1)):
-        for name, size in (("f", "n"), ("h", "p")):
+        for shape, right in (((2, 1), 2), ((1, 2), 2), ((), 2), ((1,), 2), ((2,), 1)):
             made = {name: lambda x, shape=shape: np.ones(shape), size: right}
             text = [f"{name} returned shape {shape} at x = ", f"expected ({right},)", "Check n, p"]
             check(ModelError, text, system_of, **made)
-    check(
-        ModelError, ["rate returned shape (3,)", "expected (2,)"], ode, lambda x: np.ones(3)
-    )
-    for which in "xu":
-        text = ["f changes its argument in place", "copy"]
-        check(ModelError, text, system_of, changing(which), m=2)
-    text = ["h changes its argument in place", "copy"]
-    check(ModelError, text, system_of, h=changing("x"), p=2, m=1)
-    text = ["rate changes its argument in place"]
-    check(ModelError, text, ode, lambda x: changing("x")(x, None))
+        text = [f"{name} needs 2 arguments", "pass m"]
+        check(ModelError, text, system_of, **{name: lambda x, u: x})
+        text = [f"{name} changes its argument in place", "copy"]
+        check(ModelError, text, system_of, **{name: double}, p=2)
+        check(ModelError, text, system_of, **{name: double}, p=2, m=2)
+    text = ["f takes no argument", "f(x) or f(x, u)"]
+    check(ModelError, text, system_of, lambda: np.ones(2), m=1)
+    check(ModelError, ["rate returned shape (3,)", "expected (2,)"], ode, lambda x: np.ones(3))
+    check(ModelError, ["rate changes its argument in place"], ode, double)
 
 
 @pytest.mark.parametrize("name", ["f", "h"])
@@ -270,7 +251,7 @@ def test_functions_without_a_value_at_the_initial_state(name):
 
     start = "initial state [1.0, 2.0]"
     for function, text, at in (
-        (raising, ["raised ZeroDivisionError: no way out", "[1.0, 2.0]"], 1.0),
+        (lambda x: 1 // 0, ["raised ZeroDivisionError: ", "[1.0, 2.0]"], 1.0),
         (lambda x: np.sqrt(x - 1.5), ["[nan, 0.70", start, "finite"], 1.0),
         (lambda x: 1.0 / (x - 1.0), ["[inf, 1.0]", start, "finite"], 1.0),
         (odd, ["returned shape (3,)", "expected (2,)"], 12.0),
