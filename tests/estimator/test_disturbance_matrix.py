@@ -158,19 +158,6 @@ def test_a_roll_out_that_fails_is_named(raises):
     assert not raises or "too low" in estimate.message
 
 
-@pytest.mark.parametrize("kind", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
-def test_kalman_type_observers_keep_a_singular_covariance_of_x_inside_the_set(kind):
-    X, Q = qpmhe.Box([-0.2] * 3, [0.2] * 3), np.diag([0.1, 0.0, 0.0])
-    mhe = estimator(
-        system(None, states=X), kalman(Q, np.diag([1.0, 0.0, 0.5]), kind),
-        cost(Q, qpmhe.ObserverPrior()),
-    )
-    for y in Y:
-        estimate = mhe.update(y)
-        assert X.violation(estimate.trajectory) <= 1e-8
-        assert estimate.cost <= estimate.candidate_cost
-
-
 def test_designed_gains_take_the_matrix():
     start = np.zeros(3)
     full = qpmhe.design_luenberger(system(None), start, disturbance=G @ Q @ G.T, noise=R).gain

@@ -4,6 +4,7 @@ import itertools
 import math
 import re
 import warnings
+from operator import and_
 
 import numpy as np
 import pytest
@@ -51,17 +52,21 @@ def test_parts():
     )
 
 
+def injected(gain):
+    return estimator(observer=qpmhe.Luenberger(gain))
+
+
 def test_gains():
-    for gain, shape in (
-        (0.3, (1, 1)), ([[0.3, 0.1]], (1, 2)), (np.ones((2, 1, 1)), (2, 1, 1)),
+    for gain, kind, text in (
+        (0.3, ShapeError, ["gain has shape (1, 1)", "(n, p) = (2, 1)"]),
+        (np.ones((2, 1, 1)), ShapeError, ["gain has shape (2, 1, 1)", "(n, p) = (2, 1)"]),
+        ([[0.1], [math.inf]], InvalidInputError, ["gain is ", "inf", "finite"]),
+        ("high", InvalidInputError, ["gain is 'high'", "numbers"]),
+        ([[1j], [0.1]], InvalidInputError, ["gain is ", "1j", "numbers"]),
+        ([[0.1], [0.1, 0.2]], InvalidInputError, ["gain is ", "0.2", "numbers"]),
+        (None, InvalidInputError, ["gain is ", "nan", "numbers"]),
     ):
-        text = [f"gain has shape {shape}", "(n, p) = (2, 1)"]
-        check(ShapeError, text, lambda gain=gain: estimator(observer=qpmhe.Luenberger(gain)))
-    for gain, text in (
-        ([[math.nan], [0.1]], "nan"), ([[0.1], [math.inf]], "inf"), ("high", "'high'"),
-        ([[1j], [0.1]], "1j"), ([[0.1], [0.1, 0.2]], "0.2"), (None, "nan"),
-    ):
-        check(InvalidInputError, ["gain is ", text, "numbers"], qpmhe.Luenberger, gain)
+        check(kind, text, injected, gain)
 
 
 INITIAL_STATES = [
@@ -90,22 +95,18 @@ def test_initial_states():
 
 @pytest.mark.parametrize("project", [True, False])
 def test_an_initial_state_outside_of_the_state_set_is_projected(project):
-    box, given = qpmhe.Box([-5.0, -np.inf], [9.0, 9.0]), [2.0, 7.0]
-    for states, nearest in (
-        (qpmhe.Box([-5.0, -5.0], [5.0, 5.0]), [2.0, 5.0]),
-        (qpmhe.Polytope([[1.0, 1.0], [-1.0, -1.0]], [5.0, 5.0]), [0.0, 5.0]),
-        (box & qpmhe.Polytope([[1.0, 1.0]], [5.0]), [0.0, 5.0]),
-    ):
-        system = system_of(states=states)
+    box, rows = qpmhe.Box([-5.0, -np.inf], [9.0, 5.0]), qpmhe.Polytope([[1.0, 1.0]], [5.0])
+    for states, nearest in ((box, [2.0, 5.0]), (rows, [0.0, 5.0]), (box & rows, [0.0, 5.0])):
+        system, given = system_of(states=states), [2.0, 7.0]
         words = f"is {given}, outside of the state set {states!r}; the estimator starts at"
         with pytest.warns(ObserverWarning, match=re.escape(words)):
             mhe = estimator(system, initial_state=given, project_observer=project)
-        np.testing.assert_array_equal(mhe.state, mhe.initial_state)
-        np.testing.assert_allclose(mhe.state, nearest, rtol=1e-12, atol=1e-12)
-        mhe.update([1.0])
-        with pytest.warns(ObserverWarning, match=re.escape(words)):
-            mhe.reset(given)
-        np.testing.assert_array_equal(mhe.state, mhe.initial_state)
+        for _ in range(2):
+            np.testing.assert_array_equal(mhe.state, mhe.initial_state)
+            np.testing.assert_allclose(mhe.state, nearest, rtol=1e-12, atol=1e-12)
+            mhe.update([1.0])
+            with pytest.warns(ObserverWarning, match=re.escape(words)):
+                mhe.reset(given)
         mhe.update([1.0])
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -155,63 +156,52 @@ def test_weights_of_other_sizes(build):
     )
 
 
-def test_boxes():
-    for lower, upper, kind, text in (
-        ([0.0, 0.0], [1.0], SetError, ["(2,)", "(1,)", "equal length"]),
-        ([[0.0]], [[1.0]], SetError, ["(1, 1)", "vectors"]),
-        ([0.0, math.nan], [1.0, 1.0], SetError, ["nan", "-inf or inf"]),
-        ([0.0, 2.0], [1.0, 1.0], SetError, ["component 1", "lower 2.0", "upper 1.0"]),
-        ([math.inf], [math.inf], SetError, ["component 0", "lower inf", "lower <= upper"]),
-        ([-math.inf], [-math.inf], SetError, ["component 0", "upper -inf", "lower <= upper"]),
-        (["a"], [1.0], InvalidInputError, ["lower is ['a']", *NO_NUMBERS]),
+def test_sets():
+    Box, Polytope, empty = qpmhe.Box, qpmhe.Polytope, ["the set is empty", "no point satisfies all"]
+    quarter = Polytope([[1.0, 0.0]], [0.0]) & Polytope([[0.0, -1.0]], [0.0])
+    for build, one, other, kind, text in (
+        (Box, [0.0, 0.0], [1.0], SetError, ["(2,)", "(1,)", "equal length"]),
+        (Box, [[0.0]], [[1.0]], SetError, ["(1, 1)", "vectors"]),
+        (Box, [0.0, math.nan], [1.0, 1.0], SetError, ["nan", "-inf or inf"]),
+        (Box, [0.0, 2.0], [1.0, 1.0], SetError, ["component 1", "lower 2.0", "upper 1.0"]),
+        (Box, [math.inf], [math.inf], SetError, ["component 0", "lower inf", "lower <= upper"]),
+        (Box, [-math.inf], [-math.inf], SetError, ["component 0", "upper -inf"]),
+        (Box, ["a"], [1.0], InvalidInputError, ["lower is ['a']", *NO_NUMBERS]),
+        (Polytope, np.eye(2), [1.0], SetError, ["shape (2, 2)", "bound (1,)", "(r, d) and (r,)"]),
+        (Polytope, [1.0, 2.0], [1.0, 2.0], SetError, ["matrix has shape (1, 2)", "bound (2,)"]),
+        (Polytope, np.ones((2, 0)), [1.0] * 2, SetError, ["matrix has shape (2, 0)", "(r, d)"]),
+        (Polytope, np.diag([1.0, 0.0]), [1.0] * 2, SetError, ["row 1 of matrix is zero", "leave"]),
+        (Polytope, [[1.0, math.nan]], [1.0], InvalidInputError, ["matrix is [[1.0, nan]]"]),
+        (Polytope, [[1.0, 0.0]], [math.inf], InvalidInputError, ["bound is [inf]", "finite"]),
+        (Polytope, [[1.0, 0.0]], [1j], InvalidInputError, ["bound is [1j]", *NO_NUMBERS]),
+        (Polytope, [[1.0], [-1.0]], [0.0, -1.0], SetError, [*empty, "Polytope(", "2 rows"]),
+        (Polytope, [[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [-1.0, 0.0, 0.0], SetError, empty),
+        (and_, Box([0.0], [1.0]), Box([2.0], [3.0]), SetError, empty),
+        (and_, Box([0.0] * 2, [1.0] * 2), Polytope([[-1.0, -1.0]], [-2.1]), SetError, empty),
+        (and_, Polytope([[-1.0, -1.0]], [-2.1]), Box([0.0] * 2, [1.0] * 2), SetError, empty),
+        (and_, quarter, Polytope([[-1.0, 1.0]], [-1.0]), SetError, empty),
+        (and_, quarter, Polytope([[1.0] * 3], [1.0]), SetError, ["dimensions 2 and 3", "equal"]),
     ):
-        check(kind, text, qpmhe.Box, lower, upper)
-
-
-def test_polytopes():
-    empty = ["the set is empty", "no point satisfies all"]
-    for matrix, bound, kind, text in (
-        (np.eye(2), [1.0], SetError, ["matrix has shape (2, 2)", "bound (1,)", "(r, d) and (r,)"]),
-        ([1.0, 2.0], [1.0, 2.0], SetError, ["matrix has shape (1, 2)", "bound (2,)"]),
-        (np.ones((2, 0)), [1.0, 1.0], SetError, ["matrix has shape (2, 0)", "(r, d)"]),
-        ([[1.0, 0.0], [0.0, 0.0]], [1.0, 1.0], SetError, ["row 1 of matrix is zero", "leave out"]),
-        ([[1.0, math.nan]], [1.0], InvalidInputError, ["matrix is [[1.0, nan]]", "finite"]),
-        ([[1.0, 0.0]], [math.inf], InvalidInputError, ["bound is [inf]", "finite"]),
-        ([[1.0, 0.0]], [1j], InvalidInputError, ["bound is [1j]", *NO_NUMBERS]),
-        ([[1.0], [-1.0]], [0.0, -1.0], SetError, [*empty[:1], "Polytope(", "2 rows"]),
-        ([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [-1.0, 0.0, 0.0], SetError, empty),
-    ):
-        check(kind, text, qpmhe.Polytope, matrix, bound)
-    quarter = qpmhe.Polytope([[1.0, 0.0]], [0.0]) & qpmhe.Polytope([[0.0, -1.0]], [0.0])
-    for one, other in (
-        (qpmhe.Box([0.0], [1.0]), qpmhe.Box([2.0], [3.0])),
-        (qpmhe.Box([0.0, 0.0], [1.0, 1.0]), qpmhe.Polytope([[-1.0, -1.0]], [-2.1])),
-        (qpmhe.Polytope([[1.0, 1.0]], [0.0]), qpmhe.Polytope([[-1.0, -1.0]], [-0.5])),
-        (quarter, qpmhe.Polytope([[-1.0, 1.0]], [-1.0])),
-    ):
-        check(SetError, empty, one.__and__, other)
-        check(SetError, empty, other.__and__, one)
-    text = ["dimensions 2 and 3", "expected equal dimensions"]
-    check(SetError, text, quarter.__and__, qpmhe.Polytope([[1.0, 1.0, 1.0]], [1.0]))
-    for other in (None, 1.0, ([0.0], [1.0])):
+        check(kind, text, build, one, other)
+    for value in (None, 1.0, ([0.0], [1.0])):
         with pytest.raises(TypeError, match="unsupported operand"):
-            qpmhe.Box([0.0], [1.0]) & other
+            quarter & value
 
 
 def ode(rate=lambda x: -x, h=lambda x: x[..., :1], **options):
     return qpmhe.System.from_ode(rate, h, **{"n": 2, "p": 1, "dt": 0.1} | options)
 
 
-@pytest.mark.parametrize("make", [system_of, ode])
-def test_sets_of_a_system(make):
+def test_sets_of_a_system():
+    large, rows = qpmhe.Box([0.0] * 3, [1.0] * 3), qpmhe.Polytope(np.ones((1, 4)), [1.0])
     for name, right in (("states", 2), ("disturbances", 2), ("noises", 1)):
-        for value, size in (
-            (qpmhe.Box([0.0] * 3, [1.0] * 3), 3), (qpmhe.Polytope(np.ones((1, 4)), [1.0]), 4)
+        for value, text in (
+            (large, [f"{name} has dimension 3", f"expected {right}"]),
+            (rows, [f"{name} has dimension 4", f"expected {right}"]),
+            ((0.0, 1.0), [f"{name} is (0.0, 1.0)", "qpmhe.Box", "qpmhe.Polytope"]),
         ):
-            text = [f"{name} has dimension {size}", f"expected {right}"]
-            check(SetError, text, make, **{name: value})
-        text = [f"{name} is (0.0, 1.0)", "qpmhe.Box", "qpmhe.Polytope"]
-        check(SetError, text, make, **{name: (0.0, 1.0)})
+            check(SetError, text, system_of, **{name: value})
+            check(SetError, text, ode, **{name: value})
 
 
 def test_sizes_and_options_of_a_system():
@@ -226,45 +216,30 @@ def test_sizes_and_options_of_a_system():
             check(OptionError, [f"{name} is {value!r}", expected], make, **{name: value})
 
 
-def changing(which):
-    def f(x, u):
-        (x if which == "x" else u)[...] *= 2.0
-        return x
-
-    return f
-
-
-def raising(x):
-    raise ZeroDivisionError("no way out")
+def double(x, u=None):
+    (x if u is None else u)[...] *= 2.0
+    return x
 
 
 def test_functions_of_a_system():
-    for name in ("f", "h"):
+    for name, size in (("f", "n"), ("h", "p")):
         for value in (A, "f", 3.0):
             functions = {"f": lambda x: x, "h": lambda x: x[..., :1], name: value}
             text = [f"{name} is {value!r}", "expected a function"]
             check(ModelError, text, qpmhe.System, **functions, n=2, p=1)
-        text = [f"{name} needs 2 arguments", "pass m"]
-        check(ModelError, text, system_of, **{name: lambda x, u: x})
-    check(
-        ModelError, ["f takes no argument", "f(x) or f(x, u)"],
-        system_of, lambda: np.ones(2), m=1,
-    )
-    for shape, right in (((2, 1), 2), ((1, 2), 2), ((), 2), ((1,), 2), ((2,), 1)):
-        for name, size in (("f", "n"), ("h", "p")):
+        for shape, right in (((2, 1), 2), ((1, 2), 2), ((), 2), ((1,), 2), ((2,), 1)):
             made = {name: lambda x, shape=shape: np.ones(shape), size: right}
             text = [f"{name} returned shape {shape} at x = ", f"expected ({right},)", "Check n, p"]
             check(ModelError, text, system_of, **made)
-    check(
-        ModelError, ["rate returned shape (3,)", "expected (2,)"], ode, lambda x: np.ones(3)
-    )
-    for which in "xu":
-        text = ["f changes its argument in place", "copy"]
-        check(ModelError, text, system_of, changing(which), m=2)
-    text = ["h changes its argument in place", "copy"]
-    check(ModelError, text, system_of, h=changing("x"), p=2, m=1)
-    text = ["rate changes its argument in place"]
-    check(ModelError, text, ode, lambda x: changing("x")(x, None))
+        text = [f"{name} needs 2 arguments", "pass m"]
+        check(ModelError, text, system_of, **{name: lambda x, u: x})
+        text = [f"{name} changes its argument in place", "copy"]
+        check(ModelError, text, system_of, **{name: double}, p=2)
+        check(ModelError, text, system_of, **{name: double}, p=2, m=2)
+    text = ["f takes no argument", "f(x) or f(x, u)"]
+    check(ModelError, text, system_of, lambda: np.ones(2), m=1)
+    check(ModelError, ["rate returned shape (3,)", "expected (2,)"], ode, lambda x: np.ones(3))
+    check(ModelError, ["rate changes its argument in place"], ode, double)
 
 
 @pytest.mark.parametrize("name", ["f", "h"])
@@ -276,7 +251,7 @@ def test_functions_without_a_value_at_the_initial_state(name):
 
     start = "initial state [1.0, 2.0]"
     for function, text, at in (
-        (raising, ["raised ZeroDivisionError: no way out", "[1.0, 2.0]"], 1.0),
+        (lambda x: 1 // 0, ["raised ZeroDivisionError: ", "[1.0, 2.0]"], 1.0),
         (lambda x: np.sqrt(x - 1.5), ["[nan, 0.70", start, "finite"], 1.0),
         (lambda x: 1.0 / (x - 1.0), ["[inf, 1.0]", start, "finite"], 1.0),
         (odd, ["returned shape (3,)", "expected (2,)"], 12.0),

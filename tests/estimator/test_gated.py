@@ -12,6 +12,7 @@ from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError, OptionError
 
+from .plain import differences
 from .spoil import check
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
@@ -28,18 +29,6 @@ def f(x):
 
 def h(x):
     return np.array([np.sin(x[0]), x[1] + 0.1 * x[0] ** 2, x[1], x[0] + x[2]])
-
-
-def f_slope(x):
-    return np.array([
-        [1.0, DT, 0.0], [-DT * np.cos(x[0]), 1.0 - 0.02 * x[2], -0.02 * x[1]], [0.0, 0.0, 1.0],
-    ])
-
-
-def h_slope(x):
-    return np.array([
-        [np.cos(x[0]), 0.0, 0.0], [0.2 * x[0], 1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0],
-    ])
 
 
 P0 = np.diag([0.02, 0.05, 0.01])
@@ -102,7 +91,7 @@ def plain_gated(z, Y, sensors, reopen):
     """States z(0..T) and rejections of a gated extended Kalman filter, one sample at a time."""
     P, counts, states, rejected = P0, [0] * len(sensors), [z], []
     for y in Y:
-        A, C = f_slope(z), h_slope(z)
+        A, C = differences(f, z), differences(h, z)
         v = y - h(z)
         seen = [[j for j in sensor if np.isfinite(y[j])] for sensor in sensors]
         S = C @ P @ C.T + R
@@ -228,7 +217,7 @@ def test_all_sensors_gated(make):
 @pytest.mark.parametrize("make", FILTERS)
 def test_huber_by_hand(make):
     """Each output's innovation in its own deviation; the noise grows by what its weight says."""
-    C = h_slope(START)
+    C = differences(h, START)
     system = qpmhe.System(f, lambda x: C @ x, n=3, p=4)
     mhe = estimator(system, watching(qpmhe.HuberInnovation(1.2), make), START)
     estimate = mhe.update(C @ START + np.array([0.1, -2.0, np.nan, 0.9]))
@@ -242,7 +231,7 @@ def test_huber_by_hand(make):
     K = P0 @ C.T @ np.linalg.inv(C @ P0 @ C.T + softened)
     np.testing.assert_allclose(estimate.filtered, START + K @ v, rtol=0, atol=1e-12)
     if make is qpmhe.ExtendedKalman:
-        expected = f(START) + f_slope(START) @ K @ v
+        expected = f(START) + differences(f, START) @ K @ v
         np.testing.assert_allclose(mhe.observer_state, expected, rtol=0, atol=1e-12)
     assert estimate.rejected_sensors == ()
     assert not estimate.status & (Status.SENSORS_REJECTED | Status.ALL_REJECTED)
@@ -305,8 +294,8 @@ def test_corrections_vanish_with_the_error_and_are_bounded_by_it(make, innovatio
     for _ in range(60):
         z, root = rng.standard_normal(3), rng.standard_normal((3, 3))
         sample = qpmhe.Sample(
-            system, np.zeros(0), f_slope(z), h_slope(z), covariance=root @ root.T * rng.uniform(),
-            rejections=rng.integers(0, 15, 4),
+            system, np.zeros(0), differences(f, z), differences(h, z),
+            covariance=root @ root.T * rng.uniform(), rejections=rng.integers(0, 15, 4),
         )
         assert (observer.correct(z, np.zeros(4), sample)[0] == 0.0).all()
         v = rng.standard_normal(4) * 10.0 ** rng.uniform(-3, 8)

@@ -196,9 +196,13 @@ def dense_hold(mhe, candidate, u, y, prior):
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
-@pytest.mark.parametrize("seed", range(20))
-def test_promise_and_formulas_on_random_problems(seed):
-    draw = np.random.default_rng(seed)
+@pytest.mark.parametrize("first", [0, 5, 10, 15])
+def test_promise_and_formulas_on_random_problems(first):
+    for seed in range(first, first + 5):
+        check_random_problem(np.random.default_rng(seed))
+
+
+def check_random_problem(draw):
     mhe, prior = random_problem(draw)
     system, horizon = mhe.system, mhe.horizon
     parameters = 3 * draw.normal(size=system.n)
@@ -268,24 +272,6 @@ def test_snapshots_of_other_holds_and_damaged_ones_are_refused():
         else:
             state["memory"].view(mhe._engine._memory.dtype)["trusted"] = np.nan
         check(InvalidInputError, ["damaged"], mhe.load_state_dict, state)
-
-
-def test_an_interrupted_step_leaves_the_trusted_value():
-    (y, u, _), mhe, other = record(3), estimator(0.1), estimator(0.1)
-    mhe.run(y[:30], u[:30])
-    other.run(y[:30], u[:30])
-    watch, note = mhe._engine._watch, mhe._engine._watch.note
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    watch.note = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        mhe.update(y[30] + 1.0, u[30])
-    watch.note = note
-    expected = other.run(y[30:40], u[30:40])
-    np.testing.assert_array_equal(mhe.run(y[30:40], u[30:40]).costs, expected.costs)
-    np.testing.assert_array_equal(mhe.hold.target, other.hold.target)
 
 
 @pytest.mark.parametrize("exponents", [(9, -14, 4), (-20, 7, -3)])

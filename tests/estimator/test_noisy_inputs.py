@@ -12,7 +12,7 @@ from .plain import spd
 
 
 class Plant:
-    """A random linear system whose inputs, some of them measured with noise, act on y as well."""
+    """A random linear system with inputs, some of them measured with noise, and a record."""
 
     def __init__(self, seed, n=3, p=2, m=2, noisy=(0, 1), steps=40):
         rng = np.random.default_rng(seed)
@@ -22,12 +22,7 @@ class Plant:
         self.P, self.Q, self.R = spd(rng, n), 0.1 * spd(rng, n), spd(rng, p)
         self.noisy, self.Qu = list(noisy), spd(rng, len(noisy))
         self.start, self.U = rng.standard_normal(n), rng.standard_normal((steps, m))
-        x, self.Y = self.start + rng.standard_normal(n), []
-        for u in self.U:
-            acting = u.copy()
-            acting[self.noisy] += np.linalg.cholesky(self.Qu) @ rng.standard_normal(len(noisy))
-            self.Y.append(self.C @ x + np.linalg.cholesky(self.R) @ rng.standard_normal(p))
-            x = self.A @ x + self.B @ acting + np.linalg.cholesky(self.Q) @ rng.standard_normal(n)
+        self.Y = 3.0 * rng.standard_normal((steps, p))
 
     def kalman(self):
         """Predicted and filtered states with the process noise Q + B Qu B'."""
@@ -41,7 +36,7 @@ class Plant:
             predicted.append((z, S))
         return predicted, np.array(filtered)
 
-    def estimator(self, horizon, **options):
+    def estimator(self, horizon):
         A, B, C, k = self.A, self.B, self.C, len(self.noisy)
         plant = qpmhe.System(
             lambda x, u: x @ A.T + u @ B.T, lambda x: x @ C.T, n=len(A), p=len(C), m=B.shape[1]
@@ -51,7 +46,7 @@ class Plant:
             qpmhe.noisy_inputs(plant, self.noisy),
             qpmhe.ExtendedKalman(prior=block_diag(self.P, self.Qu), **covariances),
             qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(), **covariances),
-            horizon=horizon, initial_state=[*self.start, *np.zeros(k)], **options,
+            horizon=horizon, initial_state=[*self.start, *np.zeros(k)],
         )
 
 

@@ -194,13 +194,13 @@ def test_unscented_moments():
 def test_sigma_points_stay_within_the_bounds():
     # A model that ends where the bounds do. Torricelli: the tank's outflow is a root.
     def f(x):
-        return x - 0.05 * np.sqrt(x) + 0.04
+        return x - 0.05 * np.sqrt(x - 1.0) + 0.04
 
     observer = UnscentedKalman(prior=[[1.0]], disturbance=[[1e-3]], noise=[[0.1]])
-    Y = 0.5 + 0.3 * np.random.default_rng(1).standard_normal(60)
-    for states, fails in ((qpmhe.Box([0.0], [np.inf]), False), (None, True)):
+    Y = 1.5 + 0.3 * np.random.default_rng(1).standard_normal(60)
+    for states, fails in ((qpmhe.Box([1.0], [np.inf]), False), (None, True)):
         system = qpmhe.System(f, lambda x: x, n=1, p=1, states=states)
-        run = estimator(system, observer, [0.1]).run(Y)
+        run = estimator(system, observer, [1.1]).run(Y)
         assert (run.share(Status.MODEL_FAILED) > 0) == fails
     # On a linear system they change nothing.
     plant, v = Plant(32, n=2, p=1), np.array([0.7])

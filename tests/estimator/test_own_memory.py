@@ -47,7 +47,9 @@ def system_of(engine, sets=None):
     )
 
 
-def estimator(engine, sets=None, discount=1.0, robust=False, kalman=False, system=None, **options):
+def estimator(
+    engine, sets=None, discount=1.0, robust=False, kalman=False, system=None, held=None, **options
+):
     gain, weights = np.array([[0.3], [0.4]]), [np.eye(2), 10.0 * np.eye(2), np.eye(1)]
     start = np.array([0.5, 0.0])
     given = dict(zip(("prior", "disturbance", "noise"), weights, strict=True))
@@ -56,8 +58,11 @@ def estimator(engine, sets=None, discount=1.0, robust=False, kalman=False, syste
         cost = qpmhe.RobustCost(**given | {"noise": qpmhe.Huber(weights[2])}, discount=discount)
     observer = qpmhe.ExtendedKalman(**given) if kalman else qpmhe.Luenberger(gain)
     own = engine if engine == "compiled" else "python"
+    system = system or system_of(engine, sets)
+    if held:  # as `augment_parameters` does
+        system.held = held
     mhe = qpmhe.MovingHorizonEstimator(
-        system or system_of(engine, sets), observer, cost,
+        system, observer, cost,
         **{"horizon": HORIZON, "initial_state": start, "engine": own} | options,
     )
     for array in (gain, start, *weights):
