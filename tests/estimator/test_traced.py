@@ -2,13 +2,11 @@
 
 import contextlib
 import ctypes
-import functools
 import math
 import threading
 import time
 
 import numpy as np
-import pytest
 
 from qpmhe.model.tracing import traced
 
@@ -119,21 +117,20 @@ def points(sizes, count=60):
         yield [scale * generator.uniform(-1.0 if k % 2 else 0.0, 1.0, size) for size in sizes]
 
 
-@pytest.mark.parametrize("way", STRAIGHT)
-def test_a_traced_function_gives_the_same_numbers(way):
-    function = STRAIGHT[way]
-    found = traced(function, (2,))
-    assert found.function is not None, found.reason
-    with np.errstate(all="ignore"):
+def test_a_traced_function_gives_the_same_numbers():
+    for way, function in STRAIGHT.items():
+        found = traced(function, (2,))
+        assert found.function is not None, (way, found.reason)
         for (x,) in points((2,)):
-            mine = np.array(found.function(x)).reshape(found.shape)
-            try:
-                expected = np.asarray(function(x.copy()), float)
-            except ValueError:  # math raises where NumPy returns NaN
-                assert not np.isfinite(mine).all()
-                continue
+            with np.errstate(all="ignore"):
+                mine = np.array(found.function(x)).reshape(found.shape)
+                try:
+                    expected = np.asarray(function(x.copy()), float)
+                except ValueError:  # math raises where NumPy returns NaN
+                    assert not np.isfinite(mine).all()
+                    continue
             assert expected.shape == found.shape
-            np.testing.assert_allclose(mine, expected, rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(mine, expected, rtol=1e-12, atol=1e-13, err_msg=way)
 
 
 class Stateful:
@@ -170,6 +167,13 @@ def swallowed_in_an_array(x):
     return np.array([x[0], x[1]], dtype=float)
 
 
+def into_memory(x):
+    out = np.zeros(2)
+    (ctypes.c_double * 2).from_buffer(out)
+    out[:] = x
+    return out
+
+
 def until_it_converges(x):
     y = x
     while np.abs(y - np.cos(y)).max() > 1e-9:
@@ -187,103 +191,53 @@ def changed(x):
     return x
 
 
-def into_memory(x):
-    out = np.zeros(2)
-    (ctypes.c_double * 2).from_buffer(out)
-    out[:] = x
-    return out
-
-
-def bisected(x):
-    from scipy.optimize import brentq
-
-    return np.array([brentq(lambda s: s**3 + s - x[0], -1e9, 1e9), x[1]])
-
-
-def interpolated(x):
-    from scipy.interpolate import CubicSpline
-
-    return CubicSpline(np.arange(5.0), np.arange(5.0) ** 3)(x)
-
-
 # The function, and a word of the reason why it is not traced.
 BAD = {
     "a branch": (lambda x: x if x[0] > 12.0 else 2.0 * x, "branch"),
-    "the builtin max": (lambda x: max(x[0], 0.0), "branch"),
     "a caught refusal": (swallowed, "branch"),
     "a caught refusal before an array": (swallowed_in_an_array, "float()"),
+    "memory of numbers": (into_memory, "float()"),
     "float()": (lambda x: float(x[0]) * x, "float()"),
     "int()": (lambda x: int(x[0]) * x, "int()"),
-    "a look-up": (lambda x: np.arange(9.0)[int(abs(x[0])) % 9] * x, "int()"),
-    "an index": (lambda x: np.arange(9.0)[x[0]], "index"),
     "a hash": (lambda x: {0.3: 1.0}.get(x[0], 2.0) * x, "hash"),
     "a text": (lambda x: x if str(x[0]).startswith("-") else -x, "text"),
     "a type": (lambda x: x if type(x[0]) is np.float64 else -x, "same expression"),
     "an attribute": (lambda x: x if x[0].is_integer() else -x, "attribute is_integer"),
-    "integers": (lambda x: x.astype(int) * 1.0, "int64"),
     "single precision": (lambda x: x.astype(np.float32) * 1.0, "float32"),
     "sorting": (np.sort, "branch"),
-    "the largest": (lambda x: x[np.argmax(x)], "branch"),
     "a mask": (lambda x: x[x > 0.0].sum(), "mask"),
     "a loop until it converges": (until_it_converges, "branch"),
     "a counter": (Stateful().counted, "again"),
     "what it was called with": (Stateful().remembered, "same expression"),
     "a global counter": (Late(), "again"),
     "random numbers": (lambda x: x + np.random.default_rng().normal(), "again"),
-    "numpy's global random numbers": (lambda x: x * np.random.rand(), "again"),  # noqa: NPY002
     "the time": (lambda x: x * math.sin(1e6 * time.perf_counter()), "again"),
     "a buffer from outside": (into_a_global_buffer, "float()"),
     "a change of its argument": (changed, "a change of its argument"),
-    "a root": (bisected, __file__),
-    "a spline": (interpolated, __file__),
     "a special function": (lambda x: __import__("scipy.special").special.gamma(x), "gamma"),
     "nothing": (lambda x: None, "NoneType"),
     "an exception": (lambda x: 1 / 0, "ZeroDivisionError"),
-    "an address": (lambda x: x * (x.ctypes.data % 7), "bytes"),
     "bytes": (lambda x: x if x.tobytes()[0] else -x, "bytes"),
-    "memory of numbers": (into_memory, "float()"),
-    "a comparison by text": (lambda x: x if f"{x[0]:.1f}" > "0" else -x, "text"),
-    "a cache": (functools.lru_cache(lambda x: x), ""),
-    "a set": (lambda x: x if x[0] not in {0.3} else -x, "hash"),
     "equality": (lambda x: x if x[0] == 0.3 else -x, "branch"),
     "rounding": (lambda x: x * round(x[0]), "round()"),
-    "a search": (lambda x: x * np.searchsorted([0.0, 1.0], x[0]), "branch"),
     "what is not a number": (lambda x: np.nan_to_num(x), "isnan"),
-    "a histogram": (lambda x: np.histogram(x, 2)[0] * 1.0, ""),
-    "unique values": (lambda x: np.unique(x), "branch"),
-    "a range": (lambda x: x * len(range(int(x[0] + 9.0))), "int()"),
     "complex numbers": (lambda x: np.abs(x + 1j * x), "complex"),
 }
 
 
-@pytest.mark.parametrize("way", BAD)
-def test_a_function_that_asks_for_more_is_not_traced(way):
-    function, word = BAD[way]
-    found = traced(function, (2,))
-    assert found.function is None
-    assert word in found.reason
-
-
-def test_the_reason_names_file_and_line():
+def test_a_function_that_asks_for_more_is_not_traced():
+    for way, (function, word) in BAD.items():
+        found = traced(function, (2,))
+        assert found.function is None, way
+        assert word in found.reason, way
     line = swallowed.__code__.co_firstlineno + 2
     assert f"{__file__}:{line} asks for" in traced(swallowed, (2,)).reason
-    found = traced(lambda x: np.frompyfunc(lambda s: s if s > 0 else 0.0, 1, 1)(x), (1,))
-    assert __file__ in found.reason
 
 
-def test_numpy_and_math_are_themselves_again_after_a_trace():
+def test_numpy_is_itself_after_a_trace_and_in_other_threads():
     before = np.zeros, np.array, math.sin
-    inside = []
-    traced(lambda x: inside.append(np.zeros) or x, (1,))
     traced(swallowed, (2,))
     assert (np.zeros, np.array, math.sin) == before
-    assert inside[0] is not np.zeros
-    made = inside[0](2)
-    assert type(made) is np.ndarray
-    assert made.dtype == np.float64
-
-
-def test_other_threads_see_numpy_while_one_traces():
     kinds, go, done = [], threading.Event(), threading.Event()
 
     def other():
