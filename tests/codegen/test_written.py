@@ -28,7 +28,10 @@ from .driver import (
     wild,
 )
 
-pytestmark = pytest.mark.skipif(CC is None, reason="there is no C compiler")
+pytestmark = [
+    pytest.mark.skipif(CC is None, reason="there is no C compiler"),
+    pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
+]
 LEVELS = (("-O0",), ("-O1",), *compiler._LEVELS)
 FEW = ("reactor with gaps", "inputs converged", "mixed losses", "narrow conditions")
 COMPILERS = [one for one in ("cc", "gcc", "clang") if shutil.which(one)]
