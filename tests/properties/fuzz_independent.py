@@ -317,7 +317,7 @@ class Case:
                     raise WrongStepError(f"the hold's {name} is {told}, truly {own}")
             hold.target = mhe.hold.target.copy()
         if estimate.improved:
-            hold.learn(estimate.trajectory[int(K == self.options["horizon"])])
+            hold.learn(estimate.trajectory[int(self.options["horizon"] == K)])
 
     def _check(self, estimate, t, K, samples, z, P, history):
         status, price = estimate.status, self.price

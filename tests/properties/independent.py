@@ -562,7 +562,7 @@ class Price:
 
 
 class Held:
-    """States that are held at trusted values where a window does not see them, by dense inverses."""
+    """States held at trusted values where a window does not see them, by dense inverses."""
 
     def __init__(self, rng, model, price, watcher, fixed):
         n = model.n

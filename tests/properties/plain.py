@@ -1,6 +1,8 @@
-"""J of a trajectory and the observer's path, by loops that share nothing with the library."""
+"""J, the promise and the observer's path, by loops that share nothing with the library."""
 
 import numpy as np
+
+from qpmhe import Status
 
 
 def there(y):
@@ -43,3 +45,42 @@ def observer_path(f, h, gain, z, Y):
         z = f(z) + gain @ v
         path.append(z)
     return np.array(path)
+
+
+def keeps_promise(f, h, estimate, Y, weights, sets=(None, None, None)):
+    """Hold an estimate to the promise; Y are the measurements of its window."""
+    status, trajectory, seen = estimate.status, estimate.trajectory, there(Y)
+    assert estimate.cost <= estimate.candidate_cost
+    assert (Status.IMPROVED in status) != (Status.CANDIDATE in status)
+    assert trajectory.shape == estimate.candidate.shape == (len(Y) + 1, estimate.state.size)
+    for array in (trajectory, estimate.candidate, estimate.disturbances, estimate.noises[seen]):
+        assert np.isfinite(array).all()
+    assert np.isnan(estimate.noises[~seen]).all()
+    assert (Status.MISSING in status) == (not seen[-1].all())
+    assert status.explain()
+    if Status.IMPROVED in status:
+        # Within the sets at the same cost is better, too.
+        outside = Status.CANDIDATE_OUTSIDE in status
+        assert estimate.cost < estimate.candidate_cost or outside
+    else:
+        assert estimate.cost == estimate.candidate_cost
+        assert trajectory.tolist() == estimate.candidate.tolist()
+    if np.isfinite(estimate.cost):
+        true, slack = true_cost(f, h, trajectory, estimate.candidate[0], Y, weights)
+        assert abs(estimate.cost - true) <= 1e-9 * true + slack
+        if not estimate.dropped and (estimate.improved or Status.CANDIDATE_OUTSIDE not in status):
+            within(sets, estimate, seen)
+
+
+def within(sets, estimate, seen):
+    """Hold an estimate to boxes for x, w and v."""
+    # An estimate is clipped into X, a candidate is believed to be on its boundary; a difference
+    # of large states is no better than their rounding.
+    rounding = 4e-15 * np.abs(estimate.trajectory[1:]).max(axis=1, keepdims=True)
+    for box, points, slack in zip(
+        sets, (estimate.trajectory, estimate.disturbances, np.where(seen, estimate.noises, np.nan)),
+        (0.0 if estimate.improved else 1e-9, 1e-8 + rounding, 1e-8), strict=True,
+    ):
+        if box is not None:
+            assert not (points < box.lower - slack).any()
+            assert not (points > box.upper + slack).any()

@@ -1,4 +1,4 @@
-"""Models that break, measurements missing or absurd: survived, told and recovered from."""
+"""Models that break, measurements missing or absurd: survived, reported and recovered from."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,9 @@ from scipy.optimize import least_squares
 import qpmhe
 from qpmhe import Status
 
-from .plain import observer_path, true_cost
+from .plain import keeps_promise, observer_path
 
-A = np.array([[1.0, 0.1], [-0.1, 0.95]])
+A, C = np.array([[1.0, 0.1], [-0.1, 0.95]]), np.array([[1.0, 0.0]])
 GAIN = np.array([[0.3], [0.2]])
 WEIGHTS = (1e3 * np.eye(2), 1e4 * np.eye(2), 2500.0 * np.eye(1))
 GOOD = 0.1  # what the error of a healthy estimator stays below on these records
@@ -27,8 +27,8 @@ def h(x):
     return x[..., :1]
 
 
-def record(steps=40, seed=0):
-    rng = np.random.default_rng(seed)
+def record(steps=40):
+    rng = np.random.default_rng(0)
     X, Y = [np.array([1.0, 0.5])], []
     for _ in range(steps):
         Y.append(h(X[-1]) + 0.02 * rng.standard_normal(1))
@@ -36,34 +36,27 @@ def record(steps=40, seed=0):
     return np.array(X), np.array(Y)
 
 
-def estimator(f=f, h=h, *, observer=None, prior=WEIGHTS[0], f_jacobian=None, h_jacobian=None,
-              noises=None, **options):
+def estimator(f=f, h=h, observer=None, f_jacobian=None, h_jacobian=None, m=0, **options):
     # As they are written: of a trace, nothing breaks.
     system = qpmhe.System(
-        untraced(f), untraced(h), n=2, p=1, f_jacobian=f_jacobian, h_jacobian=h_jacobian,
-        noises=noises,
+        untraced(f), untraced(h), n=2, p=1, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian
     )
-    cost = qpmhe.QuadraticCost(prior=prior, disturbance=WEIGHTS[1], noise=WEIGHTS[2])
-    options = {"horizon": HORIZON, "initial_state": Z0, **options}
+    prior, disturbance, noise = WEIGHTS
     return qpmhe.MovingHorizonEstimator(
-        system, observer or qpmhe.Luenberger(GAIN), cost, **options
+        system, observer or qpmhe.Luenberger(GAIN),
+        qpmhe.QuadraticCost(prior=prior, disturbance=disturbance, noise=noise),
+        horizon=HORIZON, initial_state=Z0, **options,
     )
 
 
-def step(mhe, y, Y):
-    """One update held to the promise; Y are the measurements up to this one."""
-    estimate = mhe.update(y)
-    assert estimate.time == len(Y) - 1
-    assert mhe.time == len(Y)
-    assert estimate.cost <= estimate.candidate_cost
-    assert np.isfinite(estimate.trajectory).all()
-    assert np.isfinite(estimate.candidate).all()
-    assert estimate.trajectory.shape == (min(len(Y), HORIZON) + 1, 2)
-    if np.isfinite(estimate.cost):
-        prior = estimate.candidate[0]
-        true, slack = true_cost(f, h, estimate.trajectory, prior, Y[-HORIZON:], WEIGHTS)
-        assert abs(estimate.cost - true) <= 1e-9 * true + slack
-    return estimate
+def steps(mhe, Y, before=lambda t: None, given=None):
+    """Every estimate of a record, held to the promise; ``given`` is it as it came."""
+    for t, y in enumerate(Y if given is None else given):
+        before(t)
+        estimate = mhe.update(y)
+        assert (estimate.time, mhe.time) == (t, t + 1)
+        keeps_promise(f, h, estimate, Y[max(0, t + 1 - HORIZON) : t + 1], WEIGHTS)
+        yield estimate
 
 
 def minimum(prior, Y):
@@ -84,21 +77,17 @@ class Fragile:
         self.function, self.how, self.broken = function, how, False
 
     def __call__(self, x):
-        return BREAKAGES[self.how](self.function(x)) if self.broken else self.function(x)
-
-
-def _raise(error):
-    def broken(value):
-        raise error
-
-    return broken
+        value = self.function(x)
+        if self.broken and isinstance(self.how, Exception):
+            raise self.how
+        return self.how(value) if self.broken else value
 
 
 BREAKAGES = {
-    "ValueError": _raise(ValueError("outside of the domain")),
-    "ZeroDivisionError": _raise(ZeroDivisionError("division by zero")),
-    "OverflowError": _raise(OverflowError("math range error")),
-    "a solver's KeyError": _raise(KeyError("x")),
+    "ValueError": ValueError("outside of the domain"),
+    "ZeroDivisionError": ZeroDivisionError("division by zero"),
+    "OverflowError": OverflowError("math range error"),
+    "a solver's KeyError": KeyError("x"),
     "nan": lambda value: value * np.nan,
     "inf": lambda value: value + np.inf,
     "overflow": lambda value: (value + 1.0) * 1e306 * 1e6,
@@ -113,122 +102,106 @@ BREAKAGES = {
 @pytest.mark.parametrize("max_qps", [0, 1, None])
 @pytest.mark.parametrize("part", ["f", "h"])
 @pytest.mark.parametrize("how", BREAKAGES)
-def test_a_model_that_breaks_for_a_while(how, part, max_qps):
-    X, Y = record()
+@pytest.mark.parametrize("broken", [(10, 11, 20), range(10, 30)], ids=["briefly", "for long"])
+def test_a_model_that_breaks_for_a_while(how, part, max_qps, broken):
+    X, Y = record(60)
     functions = {"f": f, "h": h}
-    functions[part] = fragile = Fragile(functions[part], how)
+    functions[part] = fragile = Fragile(functions[part], BREAKAGES[how])
     mhe = estimator(**functions, max_qps=max_qps)
-    for t in range(40):
-        fragile.broken = t in (10, 11, 20)
-        estimate = step(mhe, Y[t], Y[: t + 1])
-        assert (Status.MODEL_FAILED in estimate.status) == fragile.broken
-        assert Status.MISSING not in estimate.status
-        spoilt = 10 <= t < 11 + HORIZON or 20 <= t < 20 + HORIZON
-        assert spoilt or np.isfinite(estimate.candidate_cost)
-        if fragile.broken:
+
+    def spoil(t):
+        fragile.broken = t in broken
+
+    for t, estimate in enumerate(steps(mhe, Y, spoil)):
+        assert (Status.MODEL_FAILED in estimate.status) == (t in broken)
+        window = range(max(0, t + 1 - HORIZON), t + 1)
+        assert set(window) & set(broken) or np.isfinite(estimate.candidate_cost)
+        if t in broken:
             assert Status.CANDIDATE in estimate.status
-        elif max_qps != 0:
+            assert np.isfinite(estimate.cost) or Status.CONVERGED not in estimate.status
+        elif max_qps != 0 and len(broken) == 3:
             # The measurement of a failed step has stayed: the estimate fits it like the others.
             assert np.isfinite(estimate.cost)
-            fit = Y[max(0, t + 1 - HORIZON) : t + 1] - h(estimate.trajectory[:-1])
+            fit = Y[window] - h(estimate.trajectory[:-1])
             np.testing.assert_allclose(estimate.noises, fit, atol=1e-12)
-    assert np.abs(estimate.state - X[-1]).max() < GOOD
-
-
-@pytest.mark.parametrize("how", ["ValueError", "nan"])
-def test_convergence_does_not_suffer_from_a_failed_stage(how):
-    _, Y = record()
-    fragile = Fragile(f, how)
-    mhe = estimator(fragile, max_qps=None)
-    for t in range(25):
-        fragile.broken = t == 10
-        estimate = step(mhe, Y[t], Y[: t + 1])
-        if not fragile.broken:
-            best = minimum(estimate.candidate[0], Y[max(0, t + 1 - HORIZON) : t + 1])
+        if max_qps is None and t in {12, 22, 40} - set(broken):
+            best = minimum(estimate.candidate[0], Y[window])
             assert estimate.cost == pytest.approx(best, rel=1e-6)
-
-
-def test_no_claim_of_convergence_without_a_finite_cost():
-    _, Y = record()
-    fragile = Fragile(f, "nan")
-    mhe = estimator(fragile, max_qps=2)
-    for t in range(20):
-        fragile.broken = t >= 10
-        estimate = step(mhe, Y[t], Y[: t + 1])
-        assert np.isfinite(estimate.cost) == (t < 10)
-        if fragile.broken:
-            assert Status.CONVERGED not in estimate.status
-
-
-def test_a_model_broken_for_longer_than_the_window_comes_back():
-    X, Y = record(120)
-    fragile = Fragile(f, "ValueError")
-    mhe = estimator(fragile, max_qps=2)
-    for t in range(120):
-        fragile.broken = 5 <= t < 90
-        estimate = step(mhe, Y[t], Y[: t + 1])
-    assert np.isfinite(estimate.candidate_cost)
     assert np.abs(estimate.state - X[-1]).max() < GOOD
+
+
+def narrow(how, limit):
+    def model(x):
+        inside = np.abs(x).max() < limit
+        if how == "raises" and not inside:
+            raise ValueError("outside of the domain")
+        return f(x) if inside else f(x) * np.nan
+
+    return model
 
 
 @pytest.mark.parametrize("how", ["raises", "nan"])
 def test_a_trial_outside_of_the_model_domain_is_dropped_or_shortened(how):
     # The candidate stays inside |x| < 1.5; measurements draw every QP far out of it.
-    def narrow(x):
-        inside = np.abs(x).max() < 1.5
-        if how == "raises" and not inside:
-            raise ValueError("outside of the domain")
-        return f(x) if inside else f(x) * np.nan
-
-    mhe = estimator(narrow, observer=qpmhe.Luenberger([0.0, 0.0]), max_qps=3)
-    Y = np.full((12, 1), 30.0)
-    for t in range(12):
-        estimate = step(mhe, Y[t], Y[: t + 1])
+    mhe = estimator(narrow(how, 1.5), observer=qpmhe.Luenberger([0.0, 0.0]), max_qps=3)
+    for estimate in steps(mhe, np.full((12, 1), 30.0)):
         assert np.isfinite(estimate.cost)
         assert np.abs(estimate.trajectory[:-1]).max() < 1.5
         assert Status.MODEL_FAILED not in estimate.status
         assert estimate.improved  # a shorter step stays inside and helps
 
 
-@pytest.mark.parametrize("max_qps", [0, 1, None])
-@pytest.mark.parametrize("how", ["raises", "nan"])
-def test_an_observer_thrown_out_of_the_model_domain_comes_back(how, max_qps):
-    def narrow(x):
-        inside = np.abs(x).max() < 10.0
-        if how == "raises" and not inside:
-            raise ValueError("outside of the domain")
-        return f(x) if inside else f(x) * np.nan
+GAPS = {
+    "first": np.arange(60) == 0,
+    "half": np.random.default_rng(1).random(60) < 0.5,
+    "stretch": (np.arange(60) >= 20) & (np.arange(60) < 20 + 2 * HORIZON),
+}
+# The model, where the measurements are spoilt, and by what.
+SPOILT = {
+    **{f"an outlier, outside it {how}": (narrow(how, 10.0), np.arange(60) == 10, 100.0)
+       for how in ("raises", "nan")},
+    **{f"missing, {name}, as {gap}": (f, mask, gap)
+       for (name, mask), gap in zip(GAPS.items(), (np.nan, np.inf, None), strict=True)},
+    **{f"an outlier of {value}": (f, np.isin(np.arange(60), (10, 30)), value)
+       for value in (1e155, -1e200, 1.7e308)},
+}
 
-    X, Y = record(80)
-    Y[10] = 100.0  # one outlier, which the observer follows
-    mhe = estimator(narrow, max_qps=max_qps)
-    for t in range(80):
-        estimate = step(mhe, Y[t], Y[: t + 1])
-    assert np.isfinite(estimate.cost)
+
+@pytest.mark.parametrize("max_qps", [0, 1, None])
+@pytest.mark.parametrize("name", SPOILT)
+def test_measurements_that_are_missing_or_absurd_are_left_behind(name, max_qps):
+    (model, mask, value), (X, Y) = SPOILT[name], record(60)
+    Y[mask] = np.nan if value is None else value
+    given = [[value] if spoilt else y for y, spoilt in zip(Y, mask, strict=True)]
+    for t, estimate in enumerate(steps(estimator(model, max_qps=max_qps), Y, given=given)):
+        if value != 100.0:
+            reported = estimate.status & (Status.MODEL_FAILED | Status.MISSING)
+            assert bool(reported) == mask[t]
+            window = mask[max(0, t + 1 - HORIZON) : t + 1]
+            assert np.isnan(estimate.noises[:, 0]).tolist() == window.tolist()
+    assert np.isfinite(estimate.candidate_cost)
     assert Status.MODEL_FAILED not in estimate.status
     assert np.abs(estimate.state - X[-1]).max() < GOOD
 
 
 @pytest.mark.parametrize("max_qps", [1, 2, None])
-@pytest.mark.parametrize("how", ["raises", "nan", "inf"])
+@pytest.mark.parametrize("how", [ValueError("no derivative here"), np.nan, np.inf], ids=repr)
 @pytest.mark.parametrize("part", ["f_jacobian", "h_jacobian"])
 def test_an_observer_without_jacobians_does_not_mind_theirs_breaking(part, how, max_qps):
     # For x_1 < 0 there is no Jacobian. A Luenberger observer does not read it: the candidate
     # is the observer all the same, and its cost is known.
-    def jacobian(x, matrix):
+    def jacobian(x):
+        matrix = {"f_jacobian": A, "h_jacobian": C}[part]
         value = np.broadcast_to(matrix, (*x.shape[:-1], *matrix.shape)).copy()
-        if how == "raises" and (x[..., 0] < 0.0).any():
-            raise ValueError("no derivative here")
-        value[x[..., 0] < 0.0] = np.nan if how == "nan" else np.inf
+        if isinstance(how, Exception) and (x[..., 0] < 0.0).any():
+            raise how
+        value[x[..., 0] < 0.0] = 0.0 if isinstance(how, Exception) else how
         return value
 
     X, Y = record(80)
-    given = {"f_jacobian": A, "h_jacobian": np.array([[1.0, 0.0]])}
-    mhe = estimator(**{part: lambda x: jacobian(x, given[part])}, max_qps=max_qps)
     path, failures = observer_path(f, h, GAIN, Z0, Y), 0
     assert (path[:, 0] < 0.0).any()
-    for t in range(80):
-        estimate = step(mhe, Y[t], Y[: t + 1])
+    for t, estimate in enumerate(steps(estimator(**{part: jacobian}, max_qps=max_qps), Y)):
         failures += Status.MODEL_FAILED in estimate.status
         assert estimate.candidate.tolist() == path[max(0, t + 1 - HORIZON) : t + 2].tolist()
         assert np.isfinite(estimate.candidate_cost)
@@ -238,83 +211,15 @@ def test_an_observer_without_jacobians_does_not_mind_theirs_breaking(part, how, 
 
 def test_an_observer_with_jacobians_survives_theirs_breaking():
     X, Y = record(60)
-    broken = Fragile(lambda x: np.broadcast_to(A, (*x.shape[:-1], 2, 2)), "ValueError")
-    observer = qpmhe.ExtendedKalman(
-        prior=np.eye(2), disturbance=1e-4 * np.eye(2), noise=4e-4
-    )
-    mhe = estimator(f_jacobian=broken, observer=observer, max_qps=2)
-    for t in range(60):
-        broken.broken = t in (10, 30, 31)
-        estimate = step(mhe, Y[t], Y[: t + 1])
-        assert (Status.MODEL_FAILED in estimate.status) == broken.broken
-    assert np.abs(estimate.state - X[-1]).max() < GOOD
+    fragile = Fragile(lambda x: np.broadcast_to(A, (*x.shape[:-1], 2, 2)), ValueError("here"))
+    observer = qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=1e-4 * np.eye(2), noise=4e-4)
 
+    def spoil(t):
+        fragile.broken = t in (10, 30, 31)
 
-@pytest.mark.parametrize("max_qps", [0, 1, None])
-def test_all_samples_missing_is_open_loop(max_qps):
-    mhe, z, Y = estimator(max_qps=max_qps), Z0, np.full((12, 1), np.nan)
-    for t in range(12):
-        estimate = step(mhe, Y[t], Y[: t + 1])
-        z = f(z)
-        assert Status.MISSING in estimate.status
-        assert estimate.cost == 0.0
-        assert estimate.state.tolist() == z.tolist()
-        assert np.isnan(estimate.noises).all()
-        assert not estimate.disturbances.any()
-
-
-@pytest.mark.parametrize("gap", [np.nan, np.inf, -np.inf, None])
-@pytest.mark.parametrize("lost", ["first", "half", "stretch"])
-def test_missing_samples(lost, gap):
-    X, Y = record(60)
-    mask = {
-        "first": np.arange(60) == 0,
-        "half": np.random.default_rng(1).random(60) < 0.5,
-        "stretch": (np.arange(60) >= 20) & (np.arange(60) < 20 + 2 * HORIZON),
-    }[lost]
-    Y[mask] = np.nan
-    mhe = estimator(max_qps=None)
-    for t in range(60):
-        estimate = step(mhe, [gap] if mask[t] else Y[t], Y[: t + 1])
-        assert (Status.MISSING in estimate.status) == mask[t]
-        assert Status.MODEL_FAILED not in estimate.status
-        window = mask[max(0, t + 1 - HORIZON) : t + 1]
-        assert np.isnan(estimate.noises[:, 0]).tolist() == window.tolist()
-    assert np.abs(estimate.state - X[-1]).max() < GOOD
-
-
-def test_a_missing_sample_is_not_held_to_the_noise_set():
-    # Nothing was measured, so there is no noise that could be outside of V, although the
-    # output itself is.
-    offset = np.array([9.0, 0.0])
-
-    def shifted(x):
-        return f(x - offset) + offset
-
-    Y = record(40)[1] + 9.0
-    Y[::2] = np.nan
-
-    def run(noises):
-        mhe = estimator(shifted, initial_state=Z0 + offset, noises=noises, max_qps=None)
-        return mhe.run(Y)
-
-    free, boxed = run(None), run(qpmhe.Box(-5.0, 5.0))
-    assert free.costs[-1] < 0.9 * free.candidate_costs[-1]
-    np.testing.assert_allclose(boxed.costs, free.costs, rtol=1e-6)
-    np.testing.assert_allclose(boxed.states, free.states, rtol=1e-6)
-
-
-@pytest.mark.parametrize("max_qps", [0, 1, None])
-@pytest.mark.parametrize("value", [1e155, -1e200, 1.7e308])
-def test_an_outlier_whose_square_overflows_is_left_behind(value, max_qps):
-    X, Y = record(60)
-    Y[[10, 30]] = value
-    mhe = estimator(max_qps=max_qps)
-    for t in range(60):
-        estimate = step(mhe, Y[t], Y[: t + 1])
-        told = Status.MODEL_FAILED in estimate.status or Status.MISSING in estimate.status
-        assert told == (t in (10, 30))
-    assert np.isfinite(estimate.candidate_cost)
+    mhe = estimator(f_jacobian=fragile, observer=observer, max_qps=2)
+    for estimate in steps(mhe, Y, spoil):
+        assert (Status.MODEL_FAILED in estimate.status) == fragile.broken
     assert np.abs(estimate.state - X[-1]).max() < GOOD
 
 
@@ -325,17 +230,12 @@ def test_no_outlier_raises_with_any_backend(backend, value):
     Y[3] = value
     mhe = estimator(backend=backend, max_qps=2, max_solver_iterations=10)
     with np.errstate(all="ignore"):
-        for t in range(9):
-            step(mhe, Y[t], Y[: t + 1])
+        assert len(list(steps(mhe, Y))) == 9
 
 
 def test_an_input_that_is_not_finite_spoils_its_step_only():
     X, Y = record(40)
-    system = qpmhe.System(lambda x, u: f(x) + (u - 1.0), lambda x, u: h(x), n=2, p=1, m=1)
-    cost = qpmhe.QuadraticCost(prior=WEIGHTS[0], disturbance=WEIGHTS[1], noise=WEIGHTS[2])
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(GAIN), cost, horizon=HORIZON, initial_state=Z0
-    )
+    mhe = estimator(lambda x, u: f(x) + (u - 1.0), lambda x, u: h(x), m=1)
     for t in range(40):
         estimate = mhe.update(Y[t], [np.nan if t == 10 else 1.0])
         assert (Status.MODEL_FAILED in estimate.status) == (t == 10)
@@ -347,7 +247,7 @@ def test_an_input_that_is_not_finite_spoils_its_step_only():
 def test_floating_point_errors_that_the_caller_made_exceptions_stay_inside():
     _, Y = record(20)
     Y[[3, 4, 5]] = [[1e200], [np.nan], [1e150]]
-    fragile = Fragile(f, "overflow")
+    fragile = Fragile(f, BREAKAGES["overflow"])
     mhe = estimator(fragile, max_qps=None)
     with np.errstate(all="raise"):
         for t, y in enumerate(Y):
@@ -360,52 +260,19 @@ def test_refused_input_leaves_the_estimator_as_it_was():
     _, Y = record(20)
     mhe, spared = estimator(max_qps=2), estimator(max_qps=2)
     for y in Y:
-        for refused in ([1.0, 2.0], [[1.0]], "y", 1j, {"y": 1.0}, 10**400):
+        refusals = [(one,) for one in ([1.0, 2.0], [[1.0]], "y", 1j, {"y": 1.0}, 10**400)]
+        for refused in [*refusals, (y, [1.0])]:
             with pytest.raises(qpmhe.errors.InvalidInputError):
-                mhe.update(refused)
-        with pytest.raises(qpmhe.errors.InvalidInputError):
-            mhe.update(y, [1.0])
+                mhe.update(*refused)
         assert mhe.update(y).trajectory.tolist() == spared.update(y).trajectory.tolist()
 
 
 def test_a_reset_after_a_failure_forgets_it():
     _, Y = record(20)
-    fragile = Fragile(f, "nan")
+    fragile = Fragile(f, BREAKAGES["nan"])
     mhe = estimator(fragile)
     fragile.broken = True
-    for y in Y[:7]:
-        mhe.update(y)
+    mhe.run(Y[:7])
     fragile.broken = False
     mhe.reset()
-    assert mhe.time == 0
     assert mhe.run(Y).states.tolist() == estimator().run(Y).states.tolist()
-
-
-def test_a_model_may_return_the_same_array_every_time():
-    # As wrappers of compiled code do: the array is overwritten by the next call.
-    memory = np.empty(2)
-
-    def reusing(x):
-        if x.ndim > 1:
-            raise TypeError("one state at a time")
-        memory[...] = A @ x
-        return memory
-
-    _, Y = record(20)
-    mhe, path = estimator(reusing, max_qps=2), observer_path(f, h, GAIN, Z0, Y)
-    for t in range(20):
-        estimate = step(mhe, Y[t], Y[: t + 1])
-        expected = path[max(0, t + 1 - HORIZON) : t + 2]
-        np.testing.assert_allclose(estimate.candidate, expected, rtol=1e-12)
-
-
-def test_what_the_caller_does_to_an_estimate_does_not_come_back():
-    _, Y = record(20)
-    mhe, spared = estimator(max_qps=2), estimator(max_qps=2)
-    for y in Y:
-        measurement = y.copy()
-        estimate, expected = mhe.update(measurement), spared.update(y)
-        assert estimate.trajectory.tolist() == expected.trajectory.tolist()
-        for array in (measurement, estimate.trajectory, estimate.candidate):
-            array[...] = np.nan
-        estimate.disturbances[...] = np.nan
