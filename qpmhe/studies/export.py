@@ -95,7 +95,9 @@ def with_error(mean: float, error: float) -> str:
     if not math.isfinite(mean):
         return "--"
     size = max(abs(mean), error if math.isfinite(error) else 0.0)
-    exponent = math.floor(math.log10(size)) if size else 0
+    if size == 0.0:
+        return "$0$"
+    exponent = math.floor(math.log10(size))
     if not -3 <= exponent < 5:
         inner = with_error(mean / 10.0**exponent, error / 10.0**exponent).strip("$")
         return rf"$({inner}) \cdot 10^{{{exponent}}}$"
