@@ -36,18 +36,6 @@ def test_linear_systems_have_the_known_constants(A, C, eta, sharp):
     assert sharp < found.c_v < max(sharp * (1 + 1e-4), 1e-2)
 
 
-@pytest.mark.parametrize("eta", [0.9, 0.95])
-def test_reactor_is_detectable(eta):
-    found = certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=eta)
-    assert (found.evidence, found.eta, found.cells) == (Evidence.PROVED, eta, 1)
-    assert 1.0 <= found.c_p < 1.1
-    A = np.array(
-        [np.eye(2) + 0.1 * np.array([[-0.64 * x, 1.28], [0.32 * x, -0.64]]) for x in (0.1, 9.0)]
-    )
-    slack = eta**2 * found.P + found.V.sum() * np.ones((2, 2)) - A.swapaxes(1, 2) @ found.P @ A
-    assert np.linalg.eigvalsh(slack).min() > 0.0
-
-
 SYSTEMS = {
     "batch_reactor": (REACTOR, None),
     "pendulum": (PENDULUM, None),
@@ -62,7 +50,7 @@ def test_pairs_of_trajectories_keep_to_the_bound(name):
     system = getattr(qpmhe.models, name)()[0]
     found = certify_detectability(system, box, eta=0.9, inputs=inputs)
     assert found.evidence is Evidence.PROVED
-    assert attack_detectability(
+    assert 0.1 < attack_detectability(
         system, found.region, found.sums, trials=100, steps=15, polish=4
     ) <= 1.0 + RELATIVE
 
@@ -128,10 +116,7 @@ def test_what_intervals_cannot_run_is_sampled_with_the_reason():
 
 def test_too_many_cells_are_sampled(monkeypatch):
     full = search_module.cover
-    monkeypatch.setattr(
-        search_module, "cover",
-        lambda model, region, form, cells, seconds: full(model, region, form, 3, seconds),
-    )
+    monkeypatch.setattr(search_module, "cover", lambda *most: full(*most[:3], 3, most[4]))
     found = certify_detectability(qpmhe.models.pendulum()[0], PENDULUM, eta=0.9)
     assert found.evidence is Evidence.SAMPLED
     assert "given up" in found.notes[0]
