@@ -13,8 +13,7 @@ from qpmhe.certificates.properties import ObserverStability
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.errors import OptionError, QpmheError
 
-from .attacks import RELATIVE, attack_observer
-from .helpers import PENDULUM, REACTOR, TANKS, linear, two_tanks, unit_box
+from .helpers import REACTOR, linear, unit_box
 
 A, C, L = np.array([[0.9, 0.4], [-0.3, 0.8]]), np.array([[1.0, 0.0]]), np.array([[0.5], [0.1]])
 INTEGRATOR = linear([[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]])
@@ -44,25 +43,8 @@ def test_paper_observer_contracts(rho):
     system, observer, _, _ = qpmhe.models.batch_reactor()
     found = certify_observer(system, observer, REACTOR, rho=rho)
     assert found.evidence is Evidence.PROVED
-    assert found.C_p < 2.0
+    assert (found.C_p < 2.0, found.cells) == (True, 1)
     np.testing.assert_allclose(found.kappa, np.sqrt(2) * 0.05)
-
-
-@pytest.mark.parametrize("name", ["batch_reactor", "tanks", "pendulum"])
-def test_errors_keep_to_the_bound(name):
-    box = {"batch_reactor": REACTOR, "tanks": TANKS, "pendulum": PENDULUM}[name]
-    if name == "tanks":
-        system = two_tanks()
-        observer = synthesise_gain(system, box, rho=0.95).observer
-    else:
-        system, observer, _, _ = getattr(qpmhe.models, name)()
-    found = certify_observer(system, observer, box)
-    assert found.evidence is Evidence.PROVED
-    share, compared = attack_observer(
-        system, found.region, observer.gain, found.sums, trials=200
-    )
-    assert share <= 1.0 + RELATIVE
-    assert compared > 1000
 
 
 @pytest.mark.parametrize("sizes", [(0.3, 0.2), ([0.3], [0.2])])
@@ -75,19 +57,16 @@ def test_limit_of_a_scalar_observer_is_the_true_one(sizes):
     assert limit(found, [0.3], [0.2])[0] >= 2.1 * (1.0 - 1e-9)
 
 
-def test_sum_of_squares_holds_and_is_attained():
-    sizes = [0.1, 0.02], [0.3]
-    system, observer = linear(A, C), qpmhe.Luenberger(L)
-    found = certify_observer(system, observer, unit_box(2), sizes=sizes)
+def test_sum_of_squares_is_attained():
+    found = certify_observer(
+        linear(A, C), qpmhe.Luenberger(L), unit_box(2), sizes=([0.1, 0.02], [0.3])
+    )
     step = np.hstack((A - L @ C, np.eye(2), -L))  # of error, disturbance and noise
     weight = np.zeros((5, 5))
     weight[:2, :2], weight[2:4, 2:4] = found.rho**2 * found.P, found.Q
     weight[4:, 4:] = found.R
     scale = np.linalg.inv(np.linalg.cholesky(weight)).T
-    largest = np.linalg.eigvalsh(scale.T @ step.T @ found.P @ step @ scale)[-1]
-    assert 0.99 < largest <= 1.0
-    other = certify_observer(system, observer, unit_box(2), sizes=([0.1, 0.02], [0.001]))
-    assert np.linalg.norm(limit(found, *sizes)) < 0.95 * np.linalg.norm(limit(other, *sizes))
+    assert 0.99 < np.linalg.eigvalsh(scale.T @ step.T @ found.P @ step @ scale)[-1] <= 1.0
 
 
 def test_disturbances_act_through_their_matrix():
