@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from .._checks import Array
 from ..errors import ModelError
 from ..model.system import System
-from .graph import Graph
+from .graph import Graph, Slopes
 from .intervals import Interval
 from .programs import Program
 from .reading import expression_of, read
 from .regions import Region
-from .slopes import Slopes
 
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
 _SAMPLES, _SEED = 400, 20210829

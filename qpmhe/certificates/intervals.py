@@ -205,20 +205,9 @@ def length(*legs: Interval) -> Interval:
 
 
 def share(x: Interval, y: Interval) -> Interval:
-    """X / length(x, y), which grows with x, and towards zero with the size of y.
-
-    At the origin anything between -1 and 1: the generalised derivatives of the length there.
-    """
-    near, far = abs(y).low, abs(y).high
-    ends = []
-    for end, outer, sign in ((x.low, x.low <= 0.0, -1.0), (x.high, x.high >= 0.0, 1.0)):
-        point = Interval.of(end)
-        found = point / length(point, Interval.of(np.where(outer, near, far)))
-        # Division by a length that may be zero says nothing.
-        nothing = np.where(outer, sign, 0.0)
-        value = found.low if sign < 0.0 else found.high
-        ends.append(np.clip(np.where(np.isnan(value), nothing, value), -1.0, 1.0))
-    return Interval(*ends).where(x.known & y.known)
+    """X / length(x, y); what it may be near by, where both may be zero."""
+    found = x / length(x, y)
+    return Interval(np.fmax(found.low, -1.0), np.fmin(found.high, 1.0)).where(x.known & y.known)
 
 
 def _truth(sure: NDArray[np.bool_], possible: NDArray[np.bool_], *operands: Interval) -> Interval:

@@ -18,7 +18,7 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
 from .evidence import CertificateError
 
-_MOST_CORNERS = 256  # among samples; more add little
+_MOST_CORNERS, _DIRECTIONS = 256, 32  # among samples; in which vertices are sought
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +82,12 @@ class Region:
         corners = np.array(list(itertools.islice(itertools.product(*sides), _MOST_CORNERS)))
         inner = generator.uniform(self.lower, self.upper, (count, self.lower.size))
         points = np.vstack((0.5 * (self.lower + self.upper), corners, inner))
-        if not self.is_box:  # what is outside moves towards the middle of vertices
+        if not self.is_box:  # its vertices, and the rest moved towards their middle
             n, (G, g) = self.n, inequalities(self.states)
-            middle = np.mean([_support(G, g, e)[0] for e in (*np.eye(n), *-np.eye(n))], axis=0)
+            others = np.random.default_rng(0).standard_normal((_DIRECTIONS, n))
+            vertices = np.array([_support(G, g, e)[0] for e in (*np.eye(n), *-np.eye(n), *others)])
+            middle = vertices.mean(axis=0)
+            points[1 : len(vertices) + 1, :n] = vertices[: len(points) - 1]
             away = points[:, :n] - middle
             with np.errstate(all="ignore"):
                 room = (g - G @ middle) / (away @ G.T)

@@ -36,18 +36,6 @@ def test_linear_systems_have_the_known_constants(A, C, eta, sharp):
     assert sharp < found.c_v < max(sharp * (1 + 1e-4), 1e-2)
 
 
-@pytest.mark.parametrize("eta", [0.9, 0.95])
-def test_reactor_is_detectable(eta):
-    found = certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=eta)
-    assert (found.evidence, found.eta, found.cells) == (Evidence.PROVED, eta, 1)
-    assert 1.0 <= found.c_p < 1.1
-    A = np.array(
-        [np.eye(2) + 0.1 * np.array([[-0.64 * x, 1.28], [0.32 * x, -0.64]]) for x in (0.1, 9.0)]
-    )
-    slack = eta**2 * found.P + found.V.sum() * np.ones((2, 2)) - A.swapaxes(1, 2) @ found.P @ A
-    assert np.linalg.eigvalsh(slack).min() > 0.0
-
-
 SYSTEMS = {
     "batch_reactor": (REACTOR, None),
     "pendulum": (PENDULUM, None),
@@ -62,7 +50,7 @@ def test_pairs_of_trajectories_keep_to_the_bound(name):
     system = getattr(qpmhe.models, name)()[0]
     found = certify_detectability(system, box, eta=0.9, inputs=inputs)
     assert found.evidence is Evidence.PROVED
-    assert attack_detectability(
+    assert 0.1 < attack_detectability(
         system, found.region, found.sums, trials=100, steps=15, polish=4
     ) <= 1.0 + RELATIVE
 
@@ -120,18 +108,14 @@ def test_what_intervals_cannot_run_is_sampled_with_the_reason():
     system = scalar(lambda x: np.array([0.5 * math.sin(float(x[0]))]), lambda x: x[:1])
     found = certify_detectability(system, unit_box(1), eta=0.8)
     assert (found.evidence, found.cells) == (Evidence.SAMPLED, 0)
-    assert "cannot be run with intervals" in found.notes[0]
-    assert "float() of a symbol" in found.notes[0]
-    assert "numpy.where in place of branches" in found.notes[0]
-    assert "holds at 4" in found.notes[0]
+    for words in ("cannot be run with intervals", "float() of a symbol",
+                  "numpy.where in place of branches", "holds at 4"):
+        assert words in found.notes[0]
 
 
 def test_too_many_cells_are_sampled(monkeypatch):
     full = search_module.cover
-    monkeypatch.setattr(
-        search_module, "cover",
-        lambda model, region, form, cells, seconds: full(model, region, form, 3, seconds),
-    )
+    monkeypatch.setattr(search_module, "cover", lambda *most: full(*most[:3], 3, most[4]))
     found = certify_detectability(qpmhe.models.pendulum()[0], PENDULUM, eta=0.9)
     assert found.evidence is Evidence.SAMPLED
     assert "given up" in found.notes[0]
@@ -158,11 +142,11 @@ def test_solvers_that_lie_or_stop_early_prove_nothing(monkeypatch, answer):
 ])
 def test_rates_of_linear_systems_are_reproduced(A, C, L):
     closed = np.subtract(A, np.matmul(L, C))
-    true, n = float(np.abs(np.linalg.eigvals(closed)).max()), len(closed)
-    unseen = linear(closed, 0.0 * np.array(C))
+    true, box = float(np.abs(np.linalg.eigvals(closed)).max()), unit_box(len(closed))
+    unseen, observer = linear(closed, 0.0 * np.array(C)), qpmhe.Luenberger(L)
     for ask in (
-        lambda rate: certify_observer(linear(A, C), qpmhe.Luenberger(L), unit_box(n), rho=rate),
-        lambda rate: certify_detectability(unseen, unit_box(n), eta=rate),
+        lambda rate: certify_observer(linear(A, C), observer, box, rho=rate),
+        lambda rate: certify_detectability(unseen, box, eta=rate),
     ):
         assert ask(true * (1.0 + 1e-6)).evidence is Evidence.PROVED
         with pytest.raises(NotCertifiedError):

@@ -75,16 +75,11 @@ def test_radii_are_covered_and_what_is_singular_is_refused():
 
 
 def test_products_hold_exact_products():
-    generator = np.random.default_rng(6)
-    a, b = generator.standard_normal((2, 4, 4))
+    a, b = np.random.default_rng(6).standard_normal((2, 4, 4))
     product = Matrices.exact(a) @ Matrices.exact(b) - Matrices.exact(a)
-    for i in range(4):
-        for j in range(4):
-            exact = sum(
-                Fraction(float(a[i, k])) * Fraction(float(b[k, j])) for k in range(4)
-            ) - Fraction(float(a[i, j]))
-            middle = Fraction(float(product.middle[i, j]))
-            assert abs(exact - middle) <= Fraction(float(product.radius[i, j]))
+    exact = np.vectorize(Fraction)
+    away = np.abs(exact(a) @ exact(b) - exact(a) - exact(product.middle))
+    assert (away <= exact(product.radius)).all()
     assert product.radius.max() < 1e-13
 
 
@@ -103,26 +98,6 @@ def test_eigenvalue_and_norm_bounds_are_outward_and_tight():
         assert np.linalg.norm(basis, 2) <= bound <= np.linalg.norm(basis, 2) * (1 + 1e-8)
     with pytest.raises(CertificateError, match="eigenvalues"):
         eigenvalue_bounds(np.diag([1.0, -1.0]))
-
-
-def test_matrices_are_what_they_say():
-    """Definite exactly where the inequality on (dx, dh) holds: P = 1, scalar numbers."""
-    a, c, eta, r = 1.2, 0.5, 0.8, 4.0
-    J = Matrices.exact(np.array([[[a], [c]]]))
-    one = np.ones((1, 1))
-    for weight in (3.1, 3.3):  # (a^2 - eta^2) / c^2 = 3.2
-        shown = definite(Form(one, eta, weight * one).matrices(J))[0]
-        assert shown == (a * a < eta * eta + c * c * weight)
-    for gain, expected in ((0.9, True), (0.7, False)):  # |a - gain c| < 0.8
-        assert definite(Form(one, eta, gain=gain * one).matrices(J))[0] == expected
-    injected = Form(one, eta, r * one, injection=(-1.0 * one, 0 * one, 0 * one))
-    found = definite(injected.matrices(J))[0]
-    quadratic = np.array([[eta**2 - (a - c) ** 2, -(a - c)], [-(a - c), r - 1.0]])
-    assert found == bool(np.linalg.eigvalsh(quadratic)[0] > 0)
-    # Multipliers alone give what the output weight gives.
-    m = (a * a - eta * eta) / c * 1.02
-    multiplied = Form(one, eta, 1.1 * m / c * one, injection=(0 * one, m * one, 0 * one))
-    assert definite(multiplied.matrices(J))[0]
 
 
 @pytest.mark.parametrize("observes", [False, True])
