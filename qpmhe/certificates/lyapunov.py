@@ -153,8 +153,7 @@ class Design:
         initial_error : (n,) array_like, float or set
             x(0) minus the first guess, a bound on its length, or a set that holds it.
         disturbances, noises : optional
-            w(t) and v(t) as vectors (T, r) and (T, p), or bounds for all times: a number for the
-            length or a set, such as ``qpmhe.Box``. Left out, `sizes`.
+            w(t) and v(t), as in `ObserverBound.along`; left out, `sizes`.
         kind : {"measured", "minimiser"}
             What bounds the estimate's cost: it is known, for any number of QPs; or it is at most
             J(x), as for a global minimiser, which converged QPs do not prove.
