@@ -237,7 +237,8 @@ def test_the_command_prints_the_code_and_reports_it(tmp_path):
     assert content["evidence"] == "proved"
     assert names["mhe"].horizon == content["horizon"] == 20
     assert names["cost"].prior.tolist() == content["prior"]
-    assert content["least_horizon"] < 20  # the search finds its way to rates that this horizon is long enough for
+    # The search finds its way to rates that this horizon is long enough for.
+    assert content["least_horizon"] < 20
 
 
 def test_bad_input_is_refused(double):
