@@ -15,14 +15,13 @@ from .monitor import Monitor, Reading
 from .observer_bound import Band, ObserverBound
 from .properties import Detectability, ObserverStability
 from .regions import Region
-from .report import Report, certify_model
 from .sizes import Sizes
 from .theorem import DecayingSums, TheoremConstants
 
 __all__ = [
     "Assumption", "Band", "Certificate", "CertificateError", "DecayingSums", "Design",
     "Detectability", "Evidence", "MismatchError", "Monitor", "NotCertifiedError",
-    "ObserverBound", "ObserverStability", "OutOfTimeError", "Reading", "Region", "Report", "Sizes",
-    "Synthesis", "TheoremConstants", "certify", "certify_detectability", "certify_model",
+    "ObserverBound", "ObserverStability", "OutOfTimeError", "Reading", "Region", "Sizes",
+    "Synthesis", "TheoremConstants", "certify", "certify_detectability",
     "certify_observer", "design", "synthesise_gain",
 ]

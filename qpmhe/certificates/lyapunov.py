@@ -34,6 +34,7 @@ from .sizes import OUTWARD, Size, Sizes, lengths_of
 
 _SUMS = 1.0 + 1e-9  # covers the rounding of a sum over a horizon, and of roots
 _MOST = 10_000  # samples of a horizon
+_TOO_SHORT = 1e6
 _ROOM = 1.1  # how far the proposed horizon's limit may be above the one of endless horizons
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE  # J is another cost
 
@@ -153,8 +154,7 @@ class Design:
         initial_error : (n,) array_like, float or set
             x(0) minus the first guess, a bound on its length, or a set that holds it.
         disturbances, noises : optional
-            w(t) and v(t) as vectors (T, r) and (T, p), or bounds for all times: a number for the
-            length or a set, such as ``qpmhe.Box``. Left out, `sizes`.
+            w(t) and v(t), as in `ObserverBound.along`; left out, `sizes`.
         kind : {"measured", "minimiser"}
             What bounds the estimate's cost: it is known, for any number of QPs; or it is at most
             J(x), as for a global minimiser, which converged QPs do not prove.
@@ -307,10 +307,13 @@ def design(
         count("horizon", horizon, 1)
     if discount is not None and not 0.0 < discount < 1.0:
         raise OptionError(f"discount is {discount!r}; expected a number in (0, 1).")
-    search = Search(
-        system, place, None, known.extent, seconds=started(seconds),
-        growth=lambda rate: growth(rate * rate, horizon),
-    )
+
+    def measure(rate: float) -> float:
+        found = growth(rate * rate, horizon)
+        # Where the horizon is too short for a rate, the search must find its way to smaller ones.
+        return found if math.isfinite(found) else _TOO_SHORT * growth(rate * rate, None)
+
+    search = Search(system, place, None, known.extent, seconds=started(seconds), growth=measure)
     rate = None if discount is None else math.sqrt(discount) * (1.0 - 1e-12)
     found = search.answer("the root of the discount", rate, (), _undetectable)
     form = found.form

@@ -46,10 +46,8 @@ class Reading:
         What |x(t+1) - x_hat(t+1)| is at most.
     kind : str
         What gives the last: ``observer``, or ``measured`` where the measured cost gives less.
-    lost : int or None
-        The sample after which the bound no longer holds.
-    reason : str
-        Why; empty while it holds.
+    lost, reason : int or None, and str
+        The sample after which the bound no longer holds, and why.
     """
 
     time: int
@@ -91,8 +89,8 @@ class Monitor:
     lost, reason : int or None, and str
         The sample after which the observer's bound no longer holds, and why.
     barred : str
-        Why the theorem's bound does not follow; empty while it does. As it goes back to the first
-        sample, it does not begin again.
+        Why the theorem's bound, which goes back to the first sample, does not follow; empty while
+        it does.
     steps : int
         Samples seen.
 
@@ -167,21 +165,16 @@ class Monitor:
     def check(
         self, estimate: Estimate, u: ArrayLike | None = None, *, dt: float | None = None
     ) -> Reading:
-        """What is known after the estimate that an update, `amend` or `set` returned.
+        """What is known after the next estimate, as an update, `amend` or `set` returned it.
 
         Parameters
         ----------
         estimate : Estimate
-            The next one.
+            An `InvalidInputError` is raised if it is none.
         u : (m,) array_like, optional
-            The system's input of the sample, parameters included.
+            The system's input of the sample, parameters included, or a `ShapeError`.
         dt : float, optional
             Length of its step, if it had one of its own.
-
-        Raises
-        ------
-        InvalidInputError, ShapeError
-            If it is no estimate, or the input does not fit.
         """
         if not isinstance(estimate, Estimate):
             raise InvalidInputError(

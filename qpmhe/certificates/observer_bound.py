@@ -218,17 +218,7 @@ class ObserverBound:
         self, steps: int, initial_error: Size, disturbances: Size | None = None,
         noises: Size | None = None,
     ) -> Array:
-        """b(0), ..., b(T), (T + 1,).
-
-        Parameters
-        ----------
-        steps : int
-            T.
-        initial_error : float, (n,) array_like or set
-            x(0) - z(0), a bound on its length, or a set that holds it.
-        disturbances, noises : optional
-            Vectors (T, n) and (T, p), a length or a set; `sizes` if left out.
-        """
+        """b(0), ..., b(T), (T + 1,), from the arguments of `along`."""
         entering = self.entering(disturbances, noises)
         if entering.ndim > 1 and len(entering) != steps:
             raise ShapeError(
@@ -435,10 +425,7 @@ def bound_observer(
     inputs: Box | None = None, sizes: Sizes | None = None,
     seconds: float | Deadline = PART_SECONDS,
 ) -> ObserverBound:
-    """Certify the observer alone: the first part of `certify`, with the same arguments and errors.
-
-    A `CertificateError` or `NotCertifiedError` says why it has no bound.
-    """
+    """Certify the observer alone: the first part of `certify`, with the same arguments."""
     place, given = bounded_region(system, region, inputs), Sizes.of(sizes, system, cost)
     deadline = Deadline.of(seconds)
     stability = certify_observer(

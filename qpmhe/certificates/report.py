@@ -1,28 +1,23 @@
-"""Everything that can be certified of a model at once."""
+"""What the command certifies of a model: where, for which sizes, with which observer."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..costs import Cost
-from ..errors import InvalidInputError, OptionError, SetError
+from ..errors import OptionError, SetError
 from ..estimation.estimator import MovingHorizonEstimator
-from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..models.scenario import Record, Scenario
 from ..observers import Observer
 from .certificate import Certificate, examined, horizons_of
 from .contraction import certify_observer, synthesise_gain
-from .deadline import DEFAULT_SECONDS, Deadline
-from .evidence import CertificateError, NotCertifiedError, json_ready
-from .lyapunov import Design
-from .observer_bound import Band, ObserverBound
+from .deadline import Deadline
+from .evidence import CertificateError, NotCertifiedError
+from .observer_bound import ObserverBound
 from .properties import ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
@@ -35,100 +30,21 @@ _OBSERVER = 0.6
 _QPS = 2  # a sample, in the run on the simulated record
 
 
-@dataclass(eq=False)
-class Report:
-    """What was certified of a model, what was not, and a run on a simulated record.
+class Report(NamedTuple):
+    """What was certified of a model, and its estimator's error on a simulated record."""
 
-    Made by `certify_model`.
-
-    Parameters
-    ----------
-    name : str
-        The model's.
-    scenario, record : Scenario and Record, or None
-        How the model is simulated, if that is known, and a simulated record.
-    certificate : Certificate
-        What could be certified, with the reasons where something could not; perhaps nothing.
-    run, band : Run and Band, or None
-        Where the observer has a bound: the estimator's run on the record, with the largest
-        horizon and two QPs a sample, and the bound along it.
-    replaced : str
-        Which observer took the place of the model's own, and why; empty if none did.
-    design : Design or None
-        Weights that fit each other, where they were asked for.
-    """
-
-    name: str
-    scenario: Scenario | None
-    record: Record | None
     certificate: Certificate
-    run: Run | None = None
-    band: Band | None = None
-    replaced: str = ""
-    design: Design | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything in types that JSON knows."""
-        certificate = self.certificate
-        return certificate.to_dict() | {
-            "model": self.name, "certified": certificate.holds, "replaced": self.replaced,
-            "simulated": "" if self.band is None else str(self.band),
-            "design": json_ready(self.design),
-        }
-
-    def save(self, path: str | Path) -> None:
-        """Write everything as JSON; an `InvalidInputError` says why that cannot be."""
-        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
-        try:
-            Path(path).write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise InvalidInputError(f"cannot write {path}: {error.strerror}.") from error
+    simulated: str
+    replaced: str  # which observer took the place of the model's own, and why
 
 
 def certify_model(
-    system: System, observer: Observer, cost: Cost, scenario: Scenario | None = None, *,
-    horizon: int | list[int] | None = None, region: ConvexSet | Region | None = None,
-    inputs: Box | None = None, seed: int = 0, seconds: float | Deadline = DEFAULT_SECONDS,
-    name: str = "",
+    system: System, observer: Observer, cost: Cost, scenario: Scenario | None, *,
+    horizon: Any, region: ConvexSet | None, inputs: Box | None, seed: int, seconds: float,
 ) -> Report:
-    """Certify a model as far as possible, and follow its estimator on a simulated record.
-
-    The observer, the assumptions and detectability are each examined, whatever is found of the
-    others.
-
-    Parameters
-    ----------
-    system, observer, cost
-        What the estimator is made of.
-    scenario : Scenario, optional
-        How it is simulated, as `qpmhe.models` return it: ``certify_model(*batch_reactor())``.
-        Bounds are judged for three standard deviations of its noises; without it, of the cost's
-        inverse weights, and no record is simulated.
-    horizon : int or list of int, optional
-        N, or several of them; the scenario's if left out.
-    region : Box, Polytope or Region, optional
-        A bounded set of states; if left out, the system's own if that is bounded, or one
-        around the simulated record.
-    inputs : Box, optional
-        Bounds on the inputs; those of the record if left out.
-    seed : int
-        Seed of the simulated record.
-    seconds : float or Deadline
-        How long the search may take, about; then the report has what was found so far.
-    name : str
-        Name of the model in the report; the scenario's title if left out.
-
-    Raises
-    ------
-    SetError, OptionError, ModelError
-        If an argument does not fit or is missing, or the model raises in the region.
-    """
+    """Certify a model as far as possible, and compare the bound with a simulated record."""
     deadline = started(seconds)
     record = None if scenario is None else scenario.simulate(seed)
-    if horizon is None:
-        if scenario is None:
-            raise OptionError("horizon is missing, and there is no scenario that has one; give N.")
-        horizon = scenario.horizon
     place = region_of(system, scenario, region, inputs, record=record)
     horizons, sizes = horizons_of(horizon), sizes_of(system, cost, scenario)
     observer, stability, replaced = _proved_observer(
@@ -137,17 +53,19 @@ def certify_model(
     certificate = examined(
         system, observer, cost, place, horizons, sizes, deadline, stability=stability
     )
-    title = "" if scenario is None else scenario.title
-    report = Report(name or title, scenario, record, certificate, replaced=replaced)
-    proved = certificate.observer_bound
+    proved, simulated = certificate.observer_bound, ""
     if proved is not None and scenario is not None and record is not None:
-        mhe = MovingHorizonEstimator(
+        run = MovingHorizonEstimator(
             system, observer, cost, horizon=horizons[-1],
             initial_state=scenario.initial_estimate, max_qps=_QPS, engine="python",
+        ).run(record.measurements, record.inputs)
+        band = proved.along(run, initial_error=initial_error(scenario))
+        errors, held = np.linalg.norm(record.states - run.states, axis=1), np.isfinite(band.error)
+        simulated = (
+            f"seed {seed}: the largest |x - x_hat| is {errors[held].max():.3g}, and the largest "
+            f"bound {band.error[held].max():.3g}; {band}"
         )
-        report.run = mhe.run(record.measurements, record.inputs)
-        report.band = proved.along(report.run, initial_error=initial_error(scenario))
-    return report
+    return Report(certificate, simulated, replaced)
 
 
 def _proved_observer(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from rich.table import Table
 from .._checks import make_folder
 from ..certificates.certificate import ASSUMED, Certificate
 from ..certificates.deadline import Deadline
-from ..certificates.evidence import NotCertifiedError
+from ..certificates.evidence import NotCertifiedError, json_ready
 from ..certificates.lyapunov import Design, design
 from ..certificates.regions import Region
 from ..certificates.report import Report, certify_model
@@ -30,7 +31,7 @@ def certify(
     report: Path | None = None, *, input_box: str | None = None, seed: int = 0,
     seconds: float = 60.0, details: bool = False, with_design: bool = False,
 ) -> bool:
-    """Certify a model with `qpmhe.certificates.certify_model`, and show the result."""
+    """Certify a model, and show the result."""
     horizons = _horizons(horizon)
     if report is not None:  # before any work
         if report.suffix != ".json":
@@ -40,20 +41,21 @@ def certify(
         make_folder(report.parent)
     source = find(model)
     (system, observer, cost), options = model_parts(source.name, build(source))
+    scenario = options.get("scenario")
     region = None if box is None else read_box("--box", box, system.n, "states")
     inputs = None if input_box is None else read_box("--input-box", input_box, system.m, "inputs")
     if not horizons and "horizon" not in options:
         raise OptionError(f"model {source.name!r} does not give its horizon; give --horizon.")
     with console.status("looking for matrices, and verifying them"):
         found = certify_model(
-            system, observer, cost, options.get("scenario"),
-            horizon=horizons or options["horizon"], region=region, inputs=inputs, seed=seed,
-            seconds=seconds, name=model,
+            system, observer, cost, scenario, horizon=horizons or options["horizon"],
+            region=region, inputs=inputs, seed=seed, seconds=seconds,
         )
     certificate = found.certificate
     other = "With a gain made for the region: " if found.replaced else ""
     _print(console, f"[bold]{other}{escape(certificate.headline)}[/]")
-    _show(console, _findings(found, seed))
+    title = model if scenario is None or not scenario.title else scenario.title
+    _show(console, [("model", title), *_findings(found)])
     for text in certificate.failures:
         _print(console, f"[bold red]Not certified:[/] {escape(text)}")
     if not certificate.holds:
@@ -67,10 +69,16 @@ def certify(
             _print(console, f"Assumed: {text}.")
     elif certificate.assumptions:
         _print(console, "[dim]The theorem's assumptions and constants: --details[/]")
-    if with_design:
-        found.design = _designed(console, certificate, horizons, seconds)
+    plan = _designed(console, certificate, horizons, seconds) if with_design else None
     if report is not None:
-        found.save(report)
+        content = certificate.to_dict() | {
+            "model": model, "certified": certificate.holds, "replaced": found.replaced,
+            "simulated": found.simulated, "design": json_ready(plan),
+        }
+        try:
+            report.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+        except OSError as error:
+            raise OptionError(f"cannot write --report {report}: {error.strerror}.") from error
         console.print(f"wrote {escape(str(report))}", highlight=False, soft_wrap=True)
     return certificate.holds
 
@@ -89,11 +97,10 @@ def _show(console: Console, rows: Rows, title: str = "") -> None:
     console.print(table, highlight=False)
 
 
-def _findings(found: Report, seed: int) -> Rows:
+def _findings(found: Report) -> Rows:
     """What the bounds are for, what they need, and what they are on the simulated record."""
     certificate, proved = found.certificate, found.certificate.observer_bound
-    title = "" if found.scenario is None else found.scenario.title
-    rows = [("model", title or found.name), ("states", _words(certificate.region))]
+    rows = [("states", _words(certificate.region))]
     if found.replaced:
         rows.append(("observer", found.replaced))
     if proved is not None:
@@ -105,13 +112,8 @@ def _findings(found: Report, seed: int) -> Rows:
                 "certified one, which ends the bound at that sample. Use Luenberger(gain, metric="
                 f"{metric})".replace("\n", "") + " to keep it",
             ))
-    if found.band is not None and found.run is not None and found.record is not None:
-        errors = np.linalg.norm(found.record.states - found.run.states, axis=1)
-        held = np.isfinite(found.band.error)
-        rows.append((
-            "simulated", f"seed {seed}: the largest |x - x_hat| is {errors[held].max():.3g}, and "
-            f"the largest bound {found.band.error[held].max():.3g}; {found.band}",
-        ))
+    if found.simulated:
+        rows.append(("simulated", found.simulated))
     for each, limit in certificate.limits():
         vacuous = ""
         if not limit < certificate.diameter:

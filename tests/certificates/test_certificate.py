@@ -17,6 +17,7 @@ from qpmhe.certificates import (
     MismatchError,
     NotCertifiedError,
     ObserverStability,
+    Sizes,
     TheoremConstants,
     certify,
     certify_detectability,
@@ -32,6 +33,20 @@ from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, S
 from .helpers import REACTOR, box, linear, scalar, unit_box, unit_cost
 
 FOREVER = Deadline(math.inf)
+
+
+@pytest.fixture(scope="module")
+def reactor():
+    """The paper's example, and its certificate at rates known to be feasible."""
+    system, observer, cost, scenario = qpmhe.models.batch_reactor()
+    region = qpmhe.Box([0.1, -1.0], [9.0, 9.0])
+    certificate = certify(
+        system, observer, cost, horizon=(1, 5, 10), region=region,
+        sizes=Sizes(0.3, 0.6),
+        detectability=certify_detectability(system, region, eta=0.9, weights=(0.1, 0.2)),
+        stability=certify_observer(system, observer, region, rho=0.95),
+    )
+    return certificate, scenario
 
 
 def test_the_reactors_constants_are_the_theorems(reactor):
@@ -70,12 +85,18 @@ def test_no_bound_is_below_the_error(reactor, max_qps):
         assert (bound <= paper).all()
 
 
-def test_sizes_that_are_not_stated_come_from_the_cost(linear):
-    assert linear.evidence is Evidence.PROVED
-    np.testing.assert_allclose(linear.sizes.disturbance.upper, [1.5, 1.0])
-    np.testing.assert_allclose(linear.sizes.noise.upper, np.sqrt(3.0))
-    assert "three standard deviations of the cost's inverse weights" in str(linear.sizes)
-    assert linear.of() is linear.of(4)
+def test_sizes_that_are_not_stated_come_from_the_cost():
+    found = certify(
+        linear([[0.9, 0.2], [-0.1, 0.7]], [[1.0, 0.0]], states=unit_box(2)),
+        qpmhe.Luenberger([[0.4], [0.1]]), qpmhe.QuadraticCost(
+            prior=np.eye(2), disturbance=np.diag([4.0, 9.0]), noise=3.0
+        ), horizon=4,
+    )
+    assert found.evidence is Evidence.PROVED
+    np.testing.assert_allclose(found.sizes.disturbance.upper, [1.5, 1.0])
+    np.testing.assert_allclose(found.sizes.noise.upper, np.sqrt(3.0))
+    assert "three standard deviations of the cost's inverse weights" in str(found.sizes)
+    assert found.of() is found.of(4)
 
 
 def test_assumed_constants_give_the_papers_bound_and_say_so():

@@ -8,11 +8,8 @@ import re
 import pytest
 from rich.console import Console
 
-import qpmhe
-from qpmhe.certificates import certify_model
 from qpmhe.cli.certify import certify
 from qpmhe.errors import ModelError, OptionError, QpmheError, SetError
-from qpmhe.models.loading import find, load
 
 MODEL = '''
 import numpy as np
@@ -99,19 +96,12 @@ def test_the_report_holds_what_the_terminal_shows(shown, tmp_path):
     content = json.loads(report.read_text())
     assert (content["certified"], content["failures"]) == (True, [])
     assert content["region"]["lower"] == [-2.0, -2.0]
-    assert content["simulated"] == "the bound holds at all 20 samples"
+    assert content["simulated"].endswith("the bound holds at all 20 samples")
     for each in content["paper"]:
         for value in (*each["C"], each["lam"], each["limit"]):
             assert re.search(rf" {re.escape(f'{value:.4g}')}[ ,\n]", text), (each["horizon"], value)
     for words in ("(eq:kappa)", "e-IOSS", "Assumed:"):
         assert words in text, words
-    # One call does the same.
-    model, region = f"{tmp_path}/two.py:model", qpmhe.Box([-2.0, -2.0], [2.0, 2.0])
-    found = certify_model(
-        *load(find(model)), horizon=[1, 10, 100], region=region, seconds=math.inf, name=model
-    )
-    found.save(tmp_path / "call.json")
-    assert json.loads((tmp_path / "call.json").read_text()) == content
 
 
 def test_an_unstable_observer_is_named_and_another_one_is_made(shown, tmp_path):
@@ -140,8 +130,6 @@ def test_an_undetectable_mode_is_named(shown, tmp_path):
     content = json.loads(report.read_text())
     assert (content["certified"], len(content["failures"])) == (False, 2)
     assert (content["detectability"], content["observer"]) == (None, None)
-    found = certify_model(*load(find(f"{tmp_path}/two.py:model(growth=1.1)")))
-    assert list(found.certificate.errors) == ["the observer", "detectability"]
 
 
 def test_an_estimator_and_parts_are_certified_as_well(shown, tmp_path):

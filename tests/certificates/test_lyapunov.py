@@ -146,14 +146,6 @@ def test_the_growing_window_starts_at_the_first_guess(double):
     assert bound[9] == pytest.approx(factor[4] * bound[5], rel=1e-6)
 
 
-def test_no_measurement_no_bound(double):
-    measurements, mhe = np.zeros((20, 1)), estimator(*double)
-    measurements[6] = np.nan
-    bound = double[0].along(mhe.run(measurements), mhe, initial_error=1.0)
-    assert np.flatnonzero(np.isnan(bound)).tolist() == [7, 8, 9, 10]
-    assert 1.0 < bound[11] / bound[4] < 30.0  # from anywhere in the region, as 0 was from 1 off
-
-
 def test_units_do_not_matter():
     A, plans, scales = np.array([[0.9, 0.2], [-0.1, 0.7]]), [], (np.ones(2), np.array([1e6, 1e-3]))
     for c in scales:
@@ -178,17 +170,15 @@ def test_disturbances_in_fewer_directions():
     plan = design(system, qpmhe.Box([-5.0] * 2, [5.0] * 2), sizes=Sizes(0.1, 0.1))
     assert plan.disturbance.shape == (1, 1)
     mhe = estimator(plan, qpmhe.Luenberger([[0.5], [0.5]]), horizon=plan.horizon)
-    rng, x, states = np.random.default_rng(0), np.array([1.0, 0.5]), [[1.0, 0.5]]
-    v = rng.uniform(-0.1, 0.1, (60, 1))
-    for _ in v:
-        x = A @ x + [0.0, rng.uniform(-0.1, 0.1)]
-        states.append(x)
-    run = mhe.run(np.array(states)[:-1, :1] + v)
+    rng, states = np.random.default_rng(0), [np.array([1.0, 0.5])]
+    for _ in range(60):
+        states.append(A @ states[-1] + [0.0, rng.uniform(-0.1, 0.1)])
+    run = mhe.run(np.array(states)[:-1, :1] + rng.uniform(-0.1, 0.1, (60, 1)))
     error = np.linalg.norm(run.states - states, axis=1)
     assert (error <= plan.length(plan.along(run, mhe, initial_error=[1.0, 0.5]))).all()
 
 
-def test_inputs_outside_of_what_was_certified():
+def test_what_was_not_certified_is_no_bound_for_a_window(double):
     system = qpmhe.System(
         lambda x, u: 0.8 * x + 0.1 * np.sin(x) * u, lambda x, u: x, n=1, p=1, m=1
     )
@@ -200,10 +190,14 @@ def test_inputs_outside_of_what_was_certified():
     mhe = estimator(plan, qpmhe.Luenberger([[0.5]]), horizon=3)
     inputs = np.where(np.arange(20) == 5, 1.5, 0.5)[:, None]
     run = mhe.run(np.zeros((20, 1)), inputs)
-    for kind in ("minimiser", "measured"):
-        bound = plan.along(run, mhe, initial_error=qpmhe.Box([-0.5], [0.25]), kind=kind)
-        assert np.flatnonzero(np.isnan(bound)).tolist() == [6, 7, 8]
-        assert bound[0] == pytest.approx(0.5 * math.sqrt(plan.prior[0, 0]))
+    bound = plan.along(run, mhe, initial_error=qpmhe.Box([-0.5], [0.25]))
+    assert np.flatnonzero(np.isnan(bound)).tolist() == [6, 7, 8]
+    assert bound[0] == pytest.approx(0.5 * math.sqrt(plan.prior[0, 0]))
+    measurements, mhe = np.zeros((20, 1)), estimator(*double)
+    measurements[6] = np.nan
+    bound = double[0].along(mhe.run(measurements), mhe, initial_error=1.0)
+    assert np.flatnonzero(np.isnan(bound)).tolist() == [7, 8, 9, 10]
+    assert 1.0 < bound[11] / bound[4] < 30.0  # from anywhere in the region, as 0 was from 1 off
 
 
 def test_time_up_returns_the_best_weights_found(monkeypatch):
@@ -227,20 +221,6 @@ def test_time_up_returns_the_best_weights_found(monkeypatch):
         design(system, region, sizes=sizes, seconds=1e-9)
 
 
-def test_the_code_is_python(double):
-    plan, observer = double
-    names = {
-        "qpmhe": qpmhe, "system": plan.system, "observer": observer, "initial_state": [0.0, 0.0]
-    }
-    exec(plan.code(), names)
-    mhe = names["mhe"]
-    assert mhe.horizon == plan.horizon
-    plan.along(mhe.run(np.zeros((3, 1))), mhe, initial_error=1.0)  # accepts the very numbers
-    content = json.loads(json.dumps(plan.to_dict(), allow_nan=False))
-    assert content["discount"] == 0.7
-    assert content["least_horizon"] == 4
-
-
 def test_the_command_prints_the_code_and_reports_it(tmp_path):
     # At 70 columns: what is to be pasted must not be broken.
     console, report = Console(file=io.StringIO(), width=70), tmp_path / "certificate.json"
@@ -257,6 +237,8 @@ def test_the_command_prints_the_code_and_reports_it(tmp_path):
     assert content["evidence"] == "proved"
     assert names["mhe"].horizon == content["horizon"] == 20
     assert names["cost"].prior.tolist() == content["prior"]
+    # The search finds its way to rates that this horizon is long enough for.
+    assert content["least_horizon"] < 20
 
 
 def test_bad_input_is_refused(double):

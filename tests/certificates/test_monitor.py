@@ -122,10 +122,10 @@ def test_a_candidate_that_starts_again_has_no_such_bound(certificate):
     assert "starts again at each sample" in reading.reason
     run = estimator(certificate, candidate="reinitialized").run(record()[1])
     band = certificate.observer_bound.along(run, initial_error=START)
-    assert (band.lost, band.reason) == (0, reading.reason) == (reading.lost, band.reason)
+    assert (band.lost, band.reason) == (0, reading.reason)
 
 
-def test_other_weights_do_not_matter_to_the_observer(certificate):
+def test_weights_do_not_matter_to_the_observer_and_wrong_sizes_are_found_out(certificate):
     mhe, other = (estimator(certificate) for _ in range(2))
     watch, same = followed(certificate, mhe), followed(certificate, other)
     for t, y in enumerate(record()[1][:9]):
@@ -134,16 +134,13 @@ def test_other_weights_do_not_matter_to_the_observer(certificate):
         if t == 5:
             reading = watch.check(mhe.set(disturbance_weight=np.eye(2)))
         assert reading.lost is None
-
-
-def test_larger_noises_than_stated_are_found_out(certificate):
     mhe = estimator(certificate)
     watch = followed(certificate, mhe, 0.0, sizes=Sizes(0.0, 0.0))
     assert [watch.check(mhe.update([24.0])).lost for _ in range(4)] == [None, 1, 1, 1]
     assert "larger than stated" in watch.reason
 
 
-def test_model_failures_end_it(certificate):
+def test_model_failures_and_sensors_that_are_not_sampled_end_it(certificate):
     def f(x):
         if np.any(np.abs(x) > 5.0):
             raise ValueError("no")
@@ -156,6 +153,14 @@ def test_model_failures_end_it(certificate):
     lost = [watch.check(mhe.update([y])).lost for y in (0.1, 16.0, 0.1, 0.1)]
     assert lost == [None, None, 2, 2]
     assert "model failed" in watch.reason
+    certificate = certify(
+        qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=2, p=2), qpmhe.Luenberger(0.3 * np.eye(2)),
+        unit_cost(2, 2), horizon=4, region=REGION,
+    )
+    mhe = estimator(certificate)
+    watch = followed(certificate, mhe, 0.5)
+    assert watch.check(mhe.update([0.1, 0.1])).lost is None
+    assert watch.check(mhe.update([0.1], sensors=0)).reason == "not all outputs were sampled"
 
 
 @pytest.fixture(scope="module")
@@ -170,32 +175,25 @@ def with_input():
     )
 
 
-@pytest.mark.parametrize(
-    ("kept", "shown", "words"),
-    [
+def test_steps_and_inputs_that_were_not_certified(with_input):
+    for kept, shown, words in (
         ({}, {"dt": 0.07}, "length 0.07, and 0.1 is certified"),
         ({"dt": 0.07}, {"dt": 0.07}, "length 0.07"),
         ({"dt": 0.07}, {}, "another length"),
         ({"u": 1.5}, {"u": [1.5]}, "input .* outside"),
-    ],
-)
-def test_steps_that_were_not_certified(with_input, kept, shown, words):
-    mhe = estimator(with_input)
-    watch = followed(with_input, mhe, 0.5)
-    for t in range(4):
-        assert watch.check(mhe.update([0.2], [0.3]), [0.3], dt=0.1 if t else None).lost is None
-    u = kept.pop("u", 0.3)
-    reading = watch.check(mhe.update([0.2], [u], **kept), **{"u": [0.3]} | shown)
-    assert reading.lost == 4
-    assert re.search(words, reading.reason)
-
-
-def test_inputs_of_a_run_and_parameters(with_input):
+    ):
+        mhe = estimator(with_input)
+        watch = followed(with_input, mhe, 0.5)
+        for t in range(4):
+            assert watch.check(mhe.update([0.2], [0.3]), [0.3], dt=0.1 if t else None).lost is None
+        u = kept.pop("u", 0.3)
+        reading = watch.check(mhe.update([0.2], [u], **kept), **{"u": [0.3]} | shown)
+        assert reading.lost == 4
+        assert re.search(words, reading.reason)
     us = np.full((9, 1), 0.3)
     us[5] = -1.5
-    band = with_input.observer_bound.along(
-        estimator(with_input).run(np.zeros(9), us), initial_error=0.5
-    )
+    run = estimator(with_input).run(np.zeros(9), us)
+    band = with_input.observer_bound.along(run, initial_error=0.5)
     assert (band.lost, band.reason) == (5, "the input [-1.5] is outside of what was certified")
     mhe = estimator(with_input, parameters=[0.3])
     watch = followed(with_input, mhe, 0.5)
@@ -204,17 +202,6 @@ def test_inputs_of_a_run_and_parameters(with_input):
     assert watch.check(mhe.update([0.2]), [0.6]).lost == 1
     with pytest.raises(ShapeError, match=r"u has shape \(0,\)"):
         watch.check(mhe.update([0.2]))
-
-
-def test_a_sensor_that_is_not_sampled_ends_it():
-    certificate = certify(
-        qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=2, p=2), qpmhe.Luenberger(0.3 * np.eye(2)),
-        unit_cost(2, 2), horizon=2, region=qpmhe.Box([-5.0, -5.0], [5.0, 5.0]),
-    )
-    mhe = estimator(certificate, horizon=2)
-    watch = followed(certificate, mhe, 0.5)
-    assert watch.check(mhe.update([0.1, 0.1])).lost is None
-    assert watch.check(mhe.update([0.1], sensors=0)).reason == "not all outputs were sampled"
 
 
 # Projection onto X
@@ -387,15 +374,14 @@ BARS = {  # the sample 6, and why the theorem's bound ends there; the observer's
 }
 
 
-@pytest.mark.parametrize("event", BARS)
-@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize(("event", "unit"), [
+    *((event, 1.0) for event in BARS), ("cost of less", 1e-9), ("cost of less", 1e9),
+])
 def test_the_theorem_ends_where_a_hypothesis_does(event, unit):
-    what, words = BARS[event]
+    (what, words), weight = BARS[event], unit**-2
     cost = qpmhe.QuadraticCost(
-        prior=np.eye(2) / unit**2, disturbance=100.0 / unit**2 * np.eye(2), noise=25.0 / unit**2
+        prior=weight * np.eye(2), disturbance=100.0 * weight * np.eye(2), noise=25.0 * weight
     )
-    if unit != 1.0 and event in ("weights", "estimate", "candidate"):
-        pytest.skip("the numbers of this event are in units of 1")
     certificate = certify(
         linear(), qpmhe.Luenberger(GAIN), cost, horizon=4, sizes=Sizes(0.2 * unit, 0.2 * unit),
         region=qpmhe.Box([-10.0 * unit] * 2, [10.0 * unit] * 2),
@@ -410,29 +396,25 @@ def test_the_theorem_ends_where_a_hypothesis_does(event, unit):
     assert re.search(f"^from sample 6 on: .*({words})", watch.barred)
     for y in ys[7:20]:  # the window recovers; the bound goes back to the first sample
         watch.check(mhe.update(y))
-    assert watch.barred.startswith("from sample 6 on")
     assert f"The theorem does not apply: {watch.barred}" in watch.summary()
 
 
-@pytest.mark.parametrize(("options", "words"), [
-    ({"arrival": "smoothed"}, "smoothed"), ({"candidate": "reinitialized"}, "reinitialized"),
-    ({"horizon": 3}, "horizon 3"), ({"cost": unit_cost(2)}, "another cost"),
-])
-def test_what_the_theorem_does_not_cover_leaves_the_observers_bound(certificate, options, words):
-    mhe = estimator(certificate, **options)
-    watch = Monitor(certificate, mhe, initial_error=START)
-    assert words in watch.barred
-    reading = watch.check(mhe.update(record()[1][0]))
-    assert (reading.lost is None) == ("candidate" not in options)
-
-
-def test_a_prior_from_the_observer_has_its_lower_bound():
+def test_what_the_theorem_does_not_cover_leaves_the_observers_bound(certificate):
+    for options, words in (
+        ({"arrival": "smoothed"}, "smoothed"), ({"candidate": "reinitialized"}, "reinitialized"),
+        ({"horizon": 3}, "horizon 3"), ({"cost": unit_cost(2)}, "another cost"),
+    ):
+        mhe = estimator(certificate, **options)
+        watch = Monitor(certificate, mhe, initial_error=START)
+        assert words in watch.barred
+        reading = watch.check(mhe.update(record()[1][0]))
+        assert (reading.lost is None) == ("candidate" not in options)
     system = scalar(lambda x: 0.8 * x)
-    observer = qpmhe.SteadyStateKalman(system, [0.0], disturbance=0.5, noise=1.0)
-    prior = qpmhe.ObserverPrior(minimum=0.1, maximum=10.0)
-    certificate = certify(
-        system, observer, qpmhe.QuadraticCost(prior=prior, disturbance=2.0, noise=1.0), horizon=4,
-        region=box(-10.0, 10.0),
+    certificate = certify(  # a prior from the observer has its lower bound
+        system, qpmhe.SteadyStateKalman(system, [0.0], disturbance=0.5, noise=1.0),
+        qpmhe.QuadraticCost(
+            prior=qpmhe.ObserverPrior(minimum=0.1, maximum=10.0), disturbance=2.0, noise=1.0
+        ), horizon=4, region=box(-10.0, 10.0),
     )
     mhe = estimator(certificate)
     watch = Monitor(certificate, mhe, initial_error=1.0)
