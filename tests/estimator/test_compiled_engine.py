@@ -125,7 +125,7 @@ def steady():
 LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"}
 
 
-@pytest.mark.parametrize(("remedy", "given"), [
+WITHOUT_FORM = [
     ("from_casadi", {"system": lambda: qpmhe.System(
         lambda x: x if x[0] > 12.0 else 0.9 * x, lambda x: x, n=1, p=1)}),
     ("OwnGain has no C form; take an observer of qpmhe", {"observer": lambda: OwnGain([0.3])}),
@@ -145,10 +145,13 @@ LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"
      {"cost": lambda: qpmhe.QuadraticCost(**(ONES | {"prior": qpmhe.ObserverPrior()})),
       "observer": steady}),
     ("not by 'osqp'; take backend='auto'", {"backend": "osqp"}),
-])
-def test_what_has_no_c_form_is_an_error_with_a_remedy(remedy, given):
-    with pytest.raises(OptionError, match=f"no C code for this estimator: .*{remedy}"):
-        estimator(**given)
+]
+
+
+def test_what_has_no_c_form_is_an_error_with_a_remedy():
+    for remedy, given in WITHOUT_FORM:
+        with pytest.raises(OptionError, match=f"no C code for this estimator: .*{remedy}"):
+            estimator(**given)
 
 
 def test_one_library_serves_other_losses():
