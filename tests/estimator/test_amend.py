@@ -1,5 +1,7 @@
 """A late measurement: afterwards all is as if it had been there from the start."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -76,18 +78,24 @@ def same(one, other, tolerance=0.0):
     np.testing.assert_array_equal(np.isnan(one.noises), np.isnan(other.noises))
 
 
-def compare(times, after, record=None, first=NAN, hidden=(0, 1, 2), tolerance=0.0, **options):
-    """Samples of these times come, in this order, after that of another one."""
+WHOLE = (slice(None),)
+
+
+def compare(times, after, record=None, first=NAN, parts=WHOLE, tolerance=0.0, **options):
+    """Samples of these times come after another one, in this order, in these parts."""
     make, record = options.pop("make", estimator), record or samples(after + HORIZON + 2)
     late, prompt, estimates = make(**options), make(**options), []
     for t, arguments in enumerate(record):
         y = arguments[0].copy()
-        if t in times:
-            y[list(hidden)] = first
+        for part in parts if t in times else ():
+            y[part] = first
         one, other = feed(late, arguments, y), feed(prompt, arguments)
         if t == after:
-            for when in times:
-                one = late.amend(when, record[when][0])
+            for when, part in itertools.product(times, parts):
+                y = np.full_like(y, NAN)
+                y[part] = record[when][0][part]
+                one = late.amend(when, y)
+                y[:] = 9.0  # what was given is copied
         if not min(times) <= t < after:
             same(one, other, tolerance)
             np.testing.assert_allclose(late.state, prompt.state, rtol=tolerance, atol=tolerance)
@@ -102,7 +110,7 @@ def compare(times, after, record=None, first=NAN, hidden=(0, 1, 2), tolerance=0.
 def test_a_late_measurement_of_any_age_counts_bit_for_bit(observer, cost):
     for age in range(HORIZON):
         compare([6], 6 + age, observer=observer, cost=cost)
-        compare([6], 6 + age, hidden=(1, 2), observer=observer, cost=cost)
+        compare([6], 6 + age, parts=(2, 1), observer=observer, cost=cost)
     # A component that is there already is replaced.
     compare([6], 8, samples(14, missing=0.0), first=5.0, observer=observer, cost=cost)
 
@@ -152,22 +160,6 @@ def test_nothing_new_changes_nothing(hidden):
         np.testing.assert_array_equal(mhe.state, before.state)
 
 
-def test_components_that_come_one_by_one_and_are_copied():
-    record = samples(8, missing=0.0)
-    late, prompt = estimator(), estimator()
-    for t, arguments in enumerate(record):
-        first = feed(late, arguments, np.full(3, NAN) if t == 5 else None)
-        second = feed(prompt, arguments)
-        if t == 6:
-            for j in (2, 0, 1):
-                part = np.full(3, NAN)
-                part[j] = record[5][0][j]
-                first = late.amend(5, part)
-                part[:] = 9.0
-        if t >= 6:
-            same(first, second)
-
-
 def test_the_newest_measurement_is_still_missing_where_an_older_one_came():
     mhe = estimator()
     for arguments in samples(5, missing=0.0):
@@ -193,7 +185,7 @@ def test_the_candidate_is_true_where_a_stage_of_the_window_had_failed():
 
     record = [(np.array([y]), None, {}) for y in (1.0, 0.9, -3.0, *[0.8, 0.9, 0.85] * 3)]
     for age in (0, 1):
-        estimates = compare([5 - age], 5, record, first=0.7, hidden=(0,), make=failing)
+        estimates = compare([5 - age], 5, record, first=0.7, make=failing)
         # The stage that failed is in the window, and older than the newest.
         finite = [np.isfinite(one.candidate_cost) for one in estimates[-7:]]
         assert finite == [False] * 2 + [True] * 5

@@ -511,7 +511,7 @@ def test_residual_functions_that_fail_at_some_calls_are_bad_luck(observer, luck)
 EXPECTED = "expected the same change"
 
 
-@pytest.mark.parametrize(("residual", "error", "text"), [
+RESIDUALS = [
     (5, ModelError, "expected qpmhe.angles"),
     ("angles", ModelError, "expected qpmhe.angles"),
     (lambda a, b: a - b + 0.1, ModelError, r"\[0.1, .* at a = b = .*expected zeros"),
@@ -528,25 +528,29 @@ EXPECTED = "expected the same change"
     (lambda a, b: a[0] - b[0], ModelError, r"shape \(\) for two vectors of .*their difference"),
     (qpmhe.angles([7]), InvalidInputError, "names component 7"),
     (plain(state_residual=turned).state_residual, ShapeError, "is for 3 components; expected 4"),
-])
-def test_residual_functions_that_are_none(residual, error, text):
-    for name in ("output_residual",) if error is ShapeError else ANGLES:
-        with pytest.raises(error, match=text) as caught:
-            plain(**{name: residual})
-        assert name in str(caught.value)
+]
 
 
-@pytest.mark.parametrize(("error", "text", "arguments"), [
-    *((InvalidInputError, r"indices is .*expected one or more integers >= 0", (indices,))
-      for indices in ([], [[0, 1]], [-1], [0.5], [True], "x", None, [1, None])),
-    (InvalidInputError, r"\[2, 0, 2\], which names a component twice", ([2, 0, 2],)),
-    *((OptionError, "period", ([0, 1], one)) for one in (0.0, -1.0, INF, np.nan, [1.0, -2.0])),
-    (ShapeError, "period", ([0, 1], [1.0, 2.0, 3.0])),
-    (InvalidInputError, "period", ([0, 1], "a")),
-])
-def test_angles_that_are_none(error, text, arguments):
-    with pytest.raises(error, match=text):
-        qpmhe.angles(*arguments)
+def test_residual_functions_that_are_none():
+    for residual, error, text in RESIDUALS:
+        for name in ("output_residual",) if error is ShapeError else ANGLES:
+            with pytest.raises(error, match=text) as caught:
+                plain(**{name: residual})
+            assert name in str(caught.value)
+
+
+def test_angles_that_are_none():
+    indices = r"indices is .*expected one or more integers >= 0"
+    for error, text, *arguments in (
+        *((InvalidInputError, indices, one)
+          for one in ([], [[0, 1]], [-1], [0.5], [True], "x", None, [1, None])),
+        (InvalidInputError, r"\[2, 0, 2\], which names a component twice", [2, 0, 2]),
+        *((OptionError, "period", [0, 1], one) for one in (0.0, -1.0, INF, np.nan, [1.0, -2.0])),
+        (ShapeError, "period", [0, 1], [1.0, 2.0, 3.0]),
+        (InvalidInputError, "period", [0, 1], "a"),
+    ):
+        with pytest.raises(error, match=text):
+            qpmhe.angles(*arguments)
 
 
 @pytest.mark.parametrize("residual", [qpmhe.angles([2]), turned])

@@ -242,7 +242,7 @@ def test_without_a_compiler_it_is_a_loop_and_says_so_once(monkeypatch):
     assert batch.mode == "looped"
 
 
-@pytest.mark.parametrize(("error", "fragments", "options"), [
+NOT_MADE = [
     (OptionError, ["members is 0", ">= 1"], {"members": 0}),
     (OptionError, ["members is 2.5", "integer"], {"members": 2.5}),
     (OptionError, ["members is True", "integer"], {"members": True}),
@@ -267,21 +267,24 @@ def test_without_a_compiler_it_is_a_loop_and_says_so_once(monkeypatch):
     (QpmheError, ["initial_states[1]", "f_jacobian[0, 0]"],
      {"f_jacobian": lambda x: A * (1.0 + (np.abs(x[..., :1, None]) > 50.0)),
       "starts": [[0.5, 0.0], [60.0, 0.1], [1.0, 0.0]]}),
-])
-def test_what_cannot_be_made(error, fragments, options):
-    one = parts(**{key: options[key] for key in ("f", "f_jacobian") if key in options})
-    options = {key: value for key, value in options.items() if key not in ("f", "f_jacobian")}
-    with pytest.raises(error) as caught:
-        batch_of(one, **options)
-    for fragment in fragments:
-        assert fragment in str(caught.value)
-    if "starts" in options:
-        good = batch_of(one, starts=[0.5, 0.1])
-        states = good.update([0.5, 0.4, 0.6]).states
-        with pytest.raises(error):
-            good.reset(options["starts"])
-        assert good.time == 1
-        np.testing.assert_array_equal(good.states, states)
+]
+
+
+def test_what_cannot_be_made():
+    for error, fragments, given in NOT_MADE:
+        functions = {key: given[key] for key in ("f", "f_jacobian") if key in given}
+        options = {key: value for key, value in given.items() if key not in functions}
+        with pytest.raises(error) as caught:
+            batch_of(parts(**functions), **options)
+        for fragment in fragments:
+            assert fragment in str(caught.value)
+        if "starts" in options:
+            good = batch_of(parts(**functions), starts=[0.5, 0.1])
+            states = good.update([0.5, 0.4, 0.6]).states
+            with pytest.raises(error):
+                good.reset(options["starts"])
+            assert good.time == 1
+            np.testing.assert_array_equal(good.states, states)
 
 
 def test_parts_that_are_none_and_more_memory_than_there_is(monkeypatch):

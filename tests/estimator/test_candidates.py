@@ -163,20 +163,6 @@ def test_the_promise_holds_in_sets(infeasible, options):
     assert improved > 20
 
 
-@pytest.mark.parametrize("backend", qpmhe.solvers.available())
-def test_the_best_start_with_a_backend_that_may_fail(backend):
-    """Stopped after one iteration, most solvers bring little: the start is the estimate then."""
-    mhe = estimator(warm_start=True, backend=backend, max_solver_iterations=1)
-    kept = Plain()
-    for y in record(8):
-        estimate = mhe.update(y)
-        kept.take(y)
-        assert estimate.cost <= estimate.candidate_cost
-        if kept.before is not None:
-            assert estimate.cost <= kept.cost(kept.shifted()) * (1 + 1e-9) + 1e-12
-        kept.before = estimate.trajectory
-
-
 @pytest.mark.parametrize("root", [lambda x: np.sqrt(x) - 0.3, lambda x: [math.sqrt(x[0]) - 0.3]],
                          ids=["NaN", "raises"])
 def test_a_start_that_the_model_does_not_reach(root):

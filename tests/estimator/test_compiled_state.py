@@ -105,6 +105,14 @@ def test_damaged_snapshots_are_refused_whole():
         [300] * memory.size,
     ))]
     damaged += [{key: value for key, value in good.items() if key != left} for left in good]
+    for name, value in (
+        ("history", NAN), ("z_end", NAN), ("last_good", np.inf), ("trajectory", NAN),
+        ("is_observed", 2), ("is_complete", 0), ("step", -1.0), ("first", 9), ("far", -1),
+    ):
+        changed = memory.copy()
+        record = changed.view(mhe._engine._memory.dtype)
+        (record if name in record.dtype.names else record["stages"])[name].flat[0] = value
+        damaged.append({**good, "memory": changed})
     for state in damaged:
         with pytest.raises(InvalidInputError):
             mhe._engine.load_state_dict(state)

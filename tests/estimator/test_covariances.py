@@ -124,28 +124,6 @@ def test_noise_free_components_follow_the_model(free):
         case.check(case.kept.hessian(estimate.trajectory), basis)
 
 
-@pytest.mark.parametrize("horizon", [1, 4])
-def test_with_the_prior_of_a_kalman_observer_the_last_is_the_filters(horizon):
-    generator = np.random.default_rng(5)
-    a, c = np.array([[1.0, 0.1], [-0.2, 0.9]]), np.array([[1.0, 0.5]])
-    covariance, q, r = spd(generator, 2), 0.1 * spd(generator, 2), np.array([[0.5]])
-    mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=2, p=1),
-        qpmhe.ExtendedKalman(prior=covariance, disturbance=q, noise=r),
-        qpmhe.QuadraticCost.from_covariances(
-            prior=qpmhe.ObserverPrior(), disturbance=q, noise=r
-        ),
-        horizon=horizon, initial_state=[0.0, 0.0],
-    )
-    for seen in generator.random(15) < 0.8:
-        mhe.update(generator.standard_normal(1) if seen else None)
-        if seen:
-            gain = covariance @ c.T @ np.linalg.inv(c @ covariance @ c.T + r)
-            covariance = covariance - gain @ c @ covariance
-        covariance = a @ covariance @ a.T + q
-        np.testing.assert_allclose(mhe.covariances()[-1], covariance, rtol=1e-8, atol=1e-10)
-
-
 def root(f=np.sqrt, gain=0.9, start=1.0, **options):
     return qpmhe.MovingHorizonEstimator(
         qpmhe.System(f, lambda x: x, n=1, p=1, **options), qpmhe.Luenberger([gain]),

@@ -107,16 +107,15 @@ NOT_COMPLEX = {
 }
 
 
-@pytest.mark.parametrize("case", NOT_COMPLEX)
-def test_functions_that_break_the_complex_step(case):
-    f, jacobian = NOT_COMPLEX[case]
-    system = system_of(f)
-    assert system.f_jacobian.method == DIFFERENCES
+def test_functions_that_break_the_complex_step():
     generator = np.random.default_rng(2)
     points = generator.uniform(0.2, 3.0, (10, 2)) * generator.choice([-1.0, 1.0], (10, 2))
-    expected = np.array([jacobian(*x) for x in points])
-    size = np.abs(expected).max(initial=1.0)
-    check(system.f_jacobian, points, expected, rtol=1e-6, atol=1e-6 * min(size, 1e3))
+    for case, (f, jacobian) in NOT_COMPLEX.items():
+        system = system_of(f)
+        assert system.f_jacobian.method == DIFFERENCES, case
+        expected = np.array([jacobian(*x) for x in points])
+        size = np.abs(expected).max(initial=1.0)
+        check(system.f_jacobian, points, expected, rtol=1e-6, atol=1e-6 * min(size, 1e3))
 
 
 def test_branches():
@@ -133,39 +132,38 @@ def test_branches():
         check(system_of(f).f_jacobian, points, expected, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(("f", "at", "expected", "methods"), [
-    # A reaction rate is flat at one kelvin, and steep at the temperatures of use.
-    (lambda x: [x[0] - 0.1 * x[0] * math.exp(10.0 - 3500.0 / x[1]), x[1]], [2.0, 350.0],
-     [[0.9, -0.2 * 3500.0 / 350.0**2], [0.0, 1.0]], [DIFFERENCES]),
-    (lambda x: np.sqrt(x - 10.0), [12.0, 14.0], np.diag([0.5 / 2**0.5, 0.25]),
-     [DIFFERENCES, COMPLEX]),  # no value at the probes
-    # Real functions of real arguments above a threshold that no probe reaches.
-    (lambda x: [math.exp(float(x[0]) - 100.0) if x[0].real > 90.0 else x[0] ** 2, x[1]],
-     [100.0, 1.0], np.eye(2), [COMPLEX, DIFFERENCES]),
-])
-def test_functions_that_are_others_at_the_probes_than_where_they_are_used(
-    f, at, expected, methods
-):
-    system, x = system_of(f), np.array(at)
-    assert len(methods) == 1 or system.f_jacobian.method == methods[0]
-    system.check(x, NONE)
-    assert system.f_jacobian.method == methods[-1]
-    np.testing.assert_allclose(system.f_jacobian(x, NONE), expected, rtol=1e-6, atol=1e-8)
+def test_functions_that_are_others_at_the_probes_than_where_they_are_used():
+    for f, at, expected, *methods in (
+        # A reaction rate is flat at one kelvin, and steep at the temperatures of use.
+        (lambda x: [x[0] - 0.1 * x[0] * math.exp(10.0 - 3500.0 / x[1]), x[1]], [2.0, 350.0],
+         [[0.9, -0.2 * 3500.0 / 350.0**2], [0.0, 1.0]], DIFFERENCES),
+        (lambda x: np.sqrt(x - 10.0), [12.0, 14.0], np.diag([0.5 / 2**0.5, 0.25]),
+         DIFFERENCES, COMPLEX),  # no value at the probes
+        # Real functions of real arguments above a threshold that no probe reaches.
+        (lambda x: [math.exp(float(x[0]) - 100.0) if x[0].real > 90.0 else x[0] ** 2, x[1]],
+         [100.0, 1.0], np.eye(2), COMPLEX, DIFFERENCES),
+    ):
+        system, x = system_of(f), np.array(at)
+        assert len(methods) == 1 or system.f_jacobian.method == methods[0]
+        system.check(x, NONE)
+        assert system.f_jacobian.method == methods[-1]
+        np.testing.assert_allclose(system.f_jacobian(x, NONE), expected, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize(("f", "exact"), [
-    (lambda x: LINEAR @ x, True), (lambda x: x @ LINEAR.T, True),
-    (lambda x: (LINEAR @ x.T).T, True), (lambda x: np.inner(LINEAR, x), True),
-    (lambda x: [row @ x for row in LINEAR], True),
-    (lambda x: np.stack([row @ x.T for row in LINEAR], axis=-1), True),
-    (lambda x: [float(row @ x) for row in LINEAR], False),
-])
-def test_the_jacobian_of_a_linear_map_is_its_matrix(f, exact):
-    system = system_of(f)
-    assert (system.f_jacobian.method == COMPLEX) == exact
+def test_the_jacobian_of_a_linear_map_is_its_matrix():
     states = np.random.default_rng(4).standard_normal((3, 2))
-    for count in (1, 2, 3):  # as many as components, and others
-        check(system.f_jacobian, states[:count], [LINEAR] * count, rtol=1e-14 if exact else 1e-8)
+    for f in (
+        lambda x: LINEAR @ x, lambda x: x @ LINEAR.T, lambda x: (LINEAR @ x.T).T,
+        lambda x: np.inner(LINEAR, x), lambda x: [row @ x for row in LINEAR],
+        lambda x: np.stack([row @ x.T for row in LINEAR], axis=-1),
+        lambda x: [float(row @ x) for row in LINEAR],
+    ):
+        jacobian = system_of(f).f_jacobian
+        rtol = 1e-14 if jacobian.method == COMPLEX else 1e-8
+        for count in (1, 2, 3):  # as many as components, and others
+            check(jacobian, states[:count], [LINEAR] * count, rtol=rtol)
+    assert jacobian.method == DIFFERENCES  # of the last alone
+    assert system_of(lambda x: [x[1], -x[0]]).f_jacobian.method == COMPLEX
 
 
 def test_jacobians_of_a_single_output_and_of_one_state():

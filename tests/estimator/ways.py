@@ -14,35 +14,32 @@ def check_values(function, plain, n, m=0):
     for lead in LEADS:
         x = generator.uniform(0.3, 2.0, (*lead, n))
         u = generator.uniform(0.3, 2.0, (*lead, m))
-        expected = np.array(
-            [plain(xi, ui) for xi, ui in zip(x.reshape(-1, n), u.reshape(-1, m), strict=True)]
-            if m
-            else [plain(xi, NONE) for xi in x.reshape(-1, n)]
-        ).reshape(*lead, -1)
+        pairs = zip(x.reshape(-1, n), u.reshape(math.prod(lead), m), strict=True)
+        expected = np.array([plain(*pair) for pair in pairs]).reshape(*lead, -1)
         found = np.asarray(function.batch(x, u)) if lead else np.asarray(function(x, u))
         assert found.shape == expected.shape, lead
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14, err_msg=str(lead))
 
 
+def parts(x, sin=np.sin):
+    return [x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * sin(x[0])]
+
+
 def pendulum(x, u):
-    return np.array([x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * math.sin(x[0])])
+    return np.array(parts(x, math.sin))
 
 
-def write_pendulum_branching(x):
-    push = -0.2 * np.sin(x[0])
-    if x[0] < -100.0:
-        push = 0.0
-    return np.array([x[0] + 0.1 * x[1], 0.9 * x[1] + push])
+def branching(x):
+    return np.array(parts(x, np.sin if x[0] > -100.0 else np.zeros_like))
 
 
-def write_pendulum_into_zeros(x):
+def into_zeros(x):
     value = np.zeros(2)
-    value[0] = x[0] + 0.1 * x[1]
-    value[1] = 0.9 * x[1] - 0.2 * np.sin(x[0])
+    value[0], value[1] = parts(x)
     return value
 
 
-def write_pendulum_ellipsis(x):
+def ellipsis(x):
     value = np.empty_like(x)
     value[..., 0] = x[..., 0] + 0.1 * x[..., 1]
     value[..., 1] = 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])
@@ -50,21 +47,13 @@ def write_pendulum_ellipsis(x):
 
 
 PENDULUMS = {
-    "ellipsis": (write_pendulum_ellipsis, "batched"),
-    "stacked": (
-        lambda x: np.stack(
-            [x[..., 0] + 0.1 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
-        ),
-        "batched",
-    ),
-    "array of components": (
-        lambda x: np.array([x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * np.sin(x[0])]),
-        "columns",
-    ),
-    "list": (lambda x: [x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * np.sin(x[0])], "columns"),
-    "tuple": (lambda x: (x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * np.sin(x[0])), "columns"),
-    "math": (lambda x: np.array([x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * math.sin(x[0])]), "looped"),
-    "list of math": (lambda x: [x[0] + 0.1 * x[1], 0.9 * x[1] - 0.2 * math.sin(x[0])], "looped"),
-    "branch": (write_pendulum_branching, "looped"),
-    "into zeros": (write_pendulum_into_zeros, "looped"),
+    "ellipsis": (ellipsis, "batched"),
+    "stacked": (lambda x: np.stack(parts(np.moveaxis(x, -1, 0)), axis=-1), "batched"),
+    "array of components": (lambda x: np.array(parts(x)), "columns"),
+    "list": (lambda x: parts(x), "columns"),
+    "tuple": (lambda x: tuple(parts(x)), "columns"),
+    "math": (lambda x: np.array(parts(x, math.sin)), "looped"),
+    "list of math": (lambda x: parts(x, math.sin), "looped"),
+    "branch": (branching, "looped"),
+    "into zeros": (into_zeros, "looped"),
 }
