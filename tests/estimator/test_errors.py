@@ -129,9 +129,8 @@ BAD_MATRICES = [
 ]
 
 
-@pytest.mark.parametrize("name", TERMS)
-def test_weights_and_covariances(name):
-    for value, kind, text in BAD_MATRICES:
+def test_weights_and_covariances():
+    for name, (value, kind, text) in itertools.product(TERMS, BAD_MATRICES):
         check(kind, [f"{name} ", *text], cost_of, 2, 2, **{name: value})
         covariances = dict.fromkeys(TERMS, np.eye(2)) | {name: value}
         for build in (qpmhe.QuadraticCost.from_covariances, qpmhe.ExtendedKalman):
