@@ -206,23 +206,6 @@ def test_every_way_of_writing_gives_the_same_values():
             np.testing.assert_allclose(system.f(z[0], u[0]), expected[0], rtol=1e-14)
 
 
-def test_one_parameter_vector_for_all_states_does_not_pass_for_batched():
-    """``theta[0]`` is one state's parameter, or all parameters of the first of many states."""
-    calls = []
-
-    def f(x, theta):
-        calls.append(np.shape(x))
-        return theta[0] * x
-
-    system = augment_parameters(f, lambda x, theta: x, n=1, p=1, nominal=[0.5])
-    calls.clear()
-    z = np.array([[1.0, 2.0], [1.0, 3.0], [1.0, 4.0]])
-    np.testing.assert_array_equal(
-        system.f.batch(z, np.zeros((3, 0))), [[2.0, 2.0], [3.0, 3.0], [4.0, 4.0]]
-    )
-    assert calls == [(1, 3)]  # by columns, not state by state
-
-
 @pytest.mark.parametrize(
     ("states", "bounds"),
     [
@@ -313,38 +296,38 @@ def careless(x, theta):
     return x
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "words"),
-    [
-        ({"nominal": []}, "ShapeError", r"shape \(0,\); expected \(k,\)"),
-        ({"nominal": [None, 1.0]}, "InvalidInputError",
-         r"nominal\[0\] is nan: a parameter without a prior value"),
-        ({"nominal": [2.0]}, "ModelError", r"IndexError.*theta = \[2.0\].*Check nominal"),
-        ({"estimated": [-1]}, "InvalidInputError", "names parameter -1; expected .* 0 to 1"),
-        ({"estimated": [1, 1]}, "InvalidInputError", r"\[1, 1\], which names one parameter twice"),
-        ({"estimated": [0.0]}, "InvalidInputError", r"\[0.0\]; expected indices"),
-        ({"estimated": [True]}, "ShapeError", r"mask of shape \(1,\); expected \(2,\)"),
-        ({"disturbances": Box([0.0], [1.0])}, "SetError",
-         "disturbances has dimension 1; expected 2, the dimension of x alone"),
-        ({"parameter_bounds": Box([0.0], [9.0])}, "SetError",
-         "parameter_bounds has dimension 1; expected 2"),
-        ({"parameter_bounds": Box([0.0, 1.0], [9.0, 9.0])}, "SetError",
-         r"nominal is \[2.0, 0.8\].*outside of parameter_bounds"),
-        ({"parameter_bounds": Box([0.0] * 2, [9.0] * 2).soften(linear=1.0)}, "SetError",
-         "is soft; an augmented model takes hard ones only"),
-        ({"parameter_bounds": Box([0.0], [9.0]), "estimated": []}, "SetError",
-         "parameter_bounds was given, but no parameter is estimated"),
-        ({"f": lambda x: x}, "ModelError", r"cannot be called as f\(x, theta\).*no inputs"),
-        ({"m": 1}, "ModelError", r"f\(x, theta\) cannot be called as f\(x, u, theta\).*1 inputs"),
-        ({"h": lambda x, theta: x}, "ModelError", r"h returned shape \(2,\).*expected \(1,\)"),
-        ({"f": careless}, "ModelError", "changes its argument in place"),
-        ({"method": "rk4"}, "OptionError", "method is 'rk4', but dt is missing"),
-        ({"drifting": "yes"}, "OptionError", "drifting is 'yes'; expected True or False"),
-    ],
-)
-def test_wrong_arguments_are_named(changes, error, words):
-    with pytest.raises(getattr(qpmhe.errors, error), match=words):
-        build(**changes)
+WRONG = [
+    ({"nominal": []}, "ShapeError", r"shape \(0,\); expected \(k,\)"),
+    ({"nominal": [None, 1.0]}, "InvalidInputError",
+     r"nominal\[0\] is nan: a parameter without a prior value"),
+    ({"nominal": [2.0]}, "ModelError", r"IndexError.*theta = \[2.0\].*Check nominal"),
+    ({"estimated": [-1]}, "InvalidInputError", "names parameter -1; expected .* 0 to 1"),
+    ({"estimated": [1, 1]}, "InvalidInputError", r"\[1, 1\], which names one parameter twice"),
+    ({"estimated": [0.0]}, "InvalidInputError", r"\[0.0\]; expected indices"),
+    ({"estimated": [True]}, "ShapeError", r"mask of shape \(1,\); expected \(2,\)"),
+    ({"disturbances": Box([0.0], [1.0])}, "SetError",
+     "disturbances has dimension 1; expected 2, the dimension of x alone"),
+    ({"parameter_bounds": Box([0.0], [9.0])}, "SetError",
+     "parameter_bounds has dimension 1; expected 2"),
+    ({"parameter_bounds": Box([0.0, 1.0], [9.0, 9.0])}, "SetError",
+     r"nominal is \[2.0, 0.8\].*outside of parameter_bounds"),
+    ({"parameter_bounds": Box([0.0] * 2, [9.0] * 2).soften(linear=1.0)}, "SetError",
+     "is soft; an augmented model takes hard ones only"),
+    ({"parameter_bounds": Box([0.0], [9.0]), "estimated": []}, "SetError",
+     "parameter_bounds was given, but no parameter is estimated"),
+    ({"f": lambda x: x}, "ModelError", r"cannot be called as f\(x, theta\).*no inputs"),
+    ({"m": 1}, "ModelError", r"f\(x, theta\) cannot be called as f\(x, u, theta\).*1 inputs"),
+    ({"h": lambda x, theta: x}, "ModelError", r"h returned shape \(2,\).*expected \(1,\)"),
+    ({"f": careless}, "ModelError", "changes its argument in place"),
+    ({"method": "rk4"}, "OptionError", "method is 'rk4', but dt is missing"),
+    ({"drifting": "yes"}, "OptionError", "drifting is 'yes'; expected True or False"),
+]
+
+
+def test_wrong_arguments_are_named():
+    for changes, error, words in WRONG:
+        with pytest.raises(getattr(qpmhe.errors, error), match=words):
+            build(**changes)
 
 def test_functions_are_tried_within_the_bounds():
     def narrow(x, theta):

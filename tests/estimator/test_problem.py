@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe import Status
-from qpmhe.estimation.window import Window
 
 from .plain import Record, assembled, differences, spd
 
@@ -321,62 +319,3 @@ def test_there_is_no_qp_where_there_is_no_jacobian(jacobian):
             trial = problem.evaluate(trajectory)
             assert np.isfinite(trial.cost)
             assert subproblem.at(problem, trial) is None
-
-
-@pytest.mark.parametrize("kalman", [False, True])
-@pytest.mark.parametrize("root", [root_or_nan, root_or_raise])
-@pytest.mark.parametrize("where", ["f", "h"])
-def test_a_failed_stage_steps_back_and_costs_infinitely(where, root, kalman):
-    functions = {"f": lambda x: 0.5 * x, "h": lambda x: x, where: root}
-    slope = {f"{name}_jacobian": lambda x: np.full((*np.shape(x), 1), 0.5) for name in "fh"}
-    slope[f"{where}_jacobian"] = lambda x: 0.5 / np.sqrt(x)[..., None]
-    if where == "f":
-        slope["h_jacobian"] = lambda x: np.ones((*np.shape(x), 1))
-    system = qpmhe.System(**functions, n=1, p=1, **slope)
-    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=3.0)
-    observer = qpmhe.Luenberger([1.0])
-    if kalman:
-        observer = qpmhe.ExtendedKalman(prior=1.0, disturbance=1.0, noise=0.1)
-    window = Window(system, observer, cost, 3, np.array([4.0]), True, True)
-    with np.errstate(invalid="ignore"):
-        for y in (4.0, -500.0):
-            window.push(np.array([y]), NONE)
-            assert window.events == 0
-        below = window.candidate[-1].copy()
-        assert below[0] < 0.0
-        assert math.isfinite(window.candidate_cost)
-        window.push(np.array([1.0]), NONE)
-        assert window.newest_failed
-        assert window.events == Status.MODEL_FAILED.value
-        # From there on, the observer goes on where the model last worked.
-        np.testing.assert_array_equal(window.candidate[-2:], [below, window.candidate[1]])
-        assert (window.candidate_cost, window.time, window.length) == (math.inf, 3, 3)
-        window.restart(np.array([4.0]))
-        for left in (True, True, False):
-            window.push(np.array([4.0]), NONE)
-            assert window.events == 0
-            assert (window.candidate_cost == math.inf) is left
-    kept = slice(window.start, window.start + 3)
-    assert np.isfinite(window.terms.panel[kept]).all()
-
-
-def test_a_stage_without_jacobian_keeps_its_residual_and_cost():
-    system = qpmhe.System(
-        lambda x: np.sqrt(x), lambda x: x, n=1, p=1,
-        f_jacobian=lambda x: 0.5 / np.sqrt(x)[..., None], h_jacobian=lambda x: np.eye(1),
-    )
-    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=3.0)
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.5]), cost, horizon=4, initial_state=[0.0]
-    )
-    ys = [1.0, 1.2, 1.1]
-    for t, y in enumerate(ys):
-        estimate = mhe.update([y])
-        assert (Status.MODEL_FAILED in estimate.status) or t
-        z = estimate.candidate[:, 0]
-        true = sum(
-            2.0 * (z[i + 1] - math.sqrt(z[i])) ** 2 + 3.0 * (ys[i] - z[i]) ** 2
-            for i in range(t + 1)
-        )
-        assert estimate.candidate_cost == pytest.approx(true, rel=1e-12)
-        assert estimate.cost <= true * (1 + 1e-12)

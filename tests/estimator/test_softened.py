@@ -145,20 +145,16 @@ def test_a_large_linear_penalty_of_a_ball_is_exact_from_its_centre(seed):
             assert other.cost <= one.cost * (1.0 + 1e-5)
 
 
-@pytest.mark.parametrize("missing", [False, True])
-def test_hard_constraints_hold_or_are_named(missing):
+def test_hard_constraints_hold_or_are_named():
     ys, named = record(), 0
-    if missing:  # rows on missing outputs do not count
-        ys[5:12, 1] = np.nan
+    ys[5:12, 1] = np.nan  # rows on missing outputs do not count
     for estimate in estimates(HARD, ys, max_qps=3):
         first = estimate.time + 1 - len(estimate.disturbances)
         missed = set()
         for i, x in enumerate(estimate.trajectory):
             values = [ball(x)]
-            if i < len(estimate.disturbances):
+            if i < len(estimate.disturbances) and np.isfinite(estimate.noises[i]).all():
                 values += within(estimate.disturbances[i], estimate.noises[i]).tolist()
-                if missing and np.isnan(estimate.noises[i]).any():
-                    values = values[:1]  # of those on w and v, none
             missed |= {(j, first + i) for j, value in enumerate(values) if value > 1e-6}
         if estimate.improved:
             assert missed == {(row.row, row.time) for row in estimate.dropped}
@@ -321,7 +317,7 @@ def test_functions_are_evaluated_however_they_are_written(write):
         assert not found[-1].any()
 
 
-@pytest.mark.parametrize(("make_it", "error", "text"), [
+WRONG = [
     (lambda: BOX.soften(), SetError, "row 0 of the soft set has no penalty"),
     (lambda: BOX.soften(linear=0.0), SetError, "pass linear > 0 or quadratic > 0"),
     (lambda: BOX.soften(linear=-1.0), SetError, "linear is -1.0; expected finite numbers >= 0"),
@@ -350,7 +346,10 @@ def test_functions_are_evaluated_however_they_are_written(write):
     (lambda: make({"noises": 3}), SetError, "noises is 3"),
     (lambda: make({"state_residual": qpmhe.angles([0]), "states": SOFT["states"]}), SetError,
      "bounds an angle"),
-])  # fmt: skip
-def test_bad_input_is_refused(make_it, error, text):
-    with np.errstate(all="ignore"), pytest.raises(error, match=re.escape(text)):
-        make_it()
+]  # fmt: skip
+
+
+def test_bad_input_is_refused():
+    for make_it, error, text in WRONG:
+        with np.errstate(all="ignore"), pytest.raises(error, match=re.escape(text)):
+            make_it()

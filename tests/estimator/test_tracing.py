@@ -114,28 +114,14 @@ def filled(x):
     return out
 
 
-def in_place(x):
-    y = 0.5 * x
-    y += np.sin(x)
-    y[..., 0] *= 2.0
-    return y
-
-
 STRAIGHT = {
-    "list": ("columns", lambda x: np.array([x[1], -np.sin(x[0])])),
     "stack": ("batched", lambda x: np.stack((x[..., 1], np.exp(-x[..., 0] ** 2)), axis=-1)),
     "where": ("batched", lambda x: np.where((x > 0.0) & (x < 9.0), x, 2.0 * x)),
     "maximum": ("batched", lambda x: np.maximum(x, 0.0) + np.minimum(x, 1.0)),
-    "abs and sign": ("batched", lambda x: np.abs(x) ** 0.5 * np.sign(x)),
-    "clip": ("batched", lambda x: np.clip(x, None, 2.0)),
     "select": ("batched", lambda x: np.select([x < 0.0, x > 3.0], [x, 3.0 + 0.0 * x], 1.0)),
     "interp": ("batched", lambda x: np.interp(x, np.arange(4.0), [0.0, 1.0, 4.0, 9.0])),
-    "norm": ("batched", lambda x: x / (1.0 + np.linalg.norm(x, axis=-1, keepdims=True))),
     "sum": ("batched", lambda x: x + x.sum(axis=-1, keepdims=True)),
-    "arctan2": ("columns", lambda x: [np.arctan2(x[1], x[0]), np.hypot(x[0], x[1])]),
-    "concatenate": ("batched", lambda x: np.concatenate((x[..., 1:], x[..., :1]), axis=-1)),
     "filled": ("batched", filled),
-    "in place": ("batched", in_place),
     "asarray": ("batched", lambda x: np.asarray(x) * 2.0 + 1.0),
 }
 
@@ -348,12 +334,7 @@ def test_parts_that_fail_make_a_step_fall_back(failure):
 # What leaves a model
 
 RETURNS = {
-    "None": lambda _: None,
-    "a short array": lambda _: np.zeros(0),
-    "a text": lambda _: "far out",
     "an object": lambda _: object(),
-    "complex numbers": lambda x: x * (1.0 + 1.0j),
-    "an exception": raised(ZeroDivisionError("far out")),
     "SystemExit": lambda _: sys.exit(7),
     "GeneratorExit": raised(GeneratorExit()),
 }
@@ -362,20 +343,18 @@ RETURNS = {
 @pytest.mark.parametrize("where", ["f", "h"])
 @pytest.mark.parametrize("what", RETURNS)
 def test_what_a_model_returns_far_out_never_leaves_update(what, where):
+    """What properties/test_bad_luck.py does not try."""
     def bent(x):
         return RETURNS[what](x) if x[0] > 12.0 else 1.1 * x
 
-    for options in ({}, {"warm_start": True}, {"candidate": "reinitialized"}):
-        functions = {"f": lambda x: 1.1 * x, "h": lambda x: 1.0 * x} | {where: bent}
-        mhe = estimator(
-            qpmhe.System(**functions, n=1, p=1), observer=qpmhe.Luenberger([0.3]),
-            initial_state=[9.0], **options,
-        )
-        for t in range(12):
-            estimate = mhe.update(10.0 * 1.1**t)
-            assert estimate.cost <= estimate.candidate_cost
-        assert mhe.time == 12
-        assert estimate.status & (Status.MODEL_FAILED | Status.FAILED_STAGE)
+    functions = {"f": lambda x: 1.1 * x, "h": lambda x: 1.0 * x} | {where: bent}
+    system, gain = qpmhe.System(**functions, n=1, p=1), qpmhe.Luenberger([0.3])
+    mhe = estimator(system, observer=gain, initial_state=[9.0], candidate="reinitialized")
+    for t in range(12):
+        estimate = mhe.update(10.0 * 1.1**t)
+        assert estimate.cost <= estimate.candidate_cost
+    assert mhe.time == 12
+    assert estimate.status & (Status.MODEL_FAILED | Status.FAILED_STAGE)
 
 
 def test_a_model_that_wants_arrays_that_it_could_write_to_has_them():
