@@ -91,7 +91,7 @@ int main(void)
     double number;
     if (fread(x0, sizeof x0, 1, stdin) != 1) return 2;
     mhe_reset(e, &mhe_default_settings, x0);
-    while (fread(&kind, sizeof kind, 1, stdin) == 1 && fread(&number, sizeof number, 1, stdin) == 1) {
+    while (fread(&kind, sizeof kind, 1, stdin) && fread(&number, sizeof number, 1, stdin)) {
         memset(k, 0xbe, sizeof *k);
         if (kind == 0) {
             mhe_sample s;

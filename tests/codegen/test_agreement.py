@@ -71,7 +71,7 @@ def test_the_same_estimates(name, monkeypatch):
             state = compiled.state_dict()
             compiled = one.estimator("compiled")
             compiled.load_state_dict(state)
-        if t % 8 == 2 and t < STEPS or t == len(one.samples) - 1:
+        if (t % 8 == 2 and t < STEPS) or t == len(one.samples) - 1:
             same_covariances(reference, compiled)
     time = len(one.samples) - min(2, one.options["horizon"])
     late = np.resize(one.samples[time]["y"], one.system.p) + 0.1

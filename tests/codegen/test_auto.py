@@ -3,8 +3,6 @@
 import os
 import pickle
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 import warnings
@@ -20,50 +18,35 @@ from qpmhe.estimation.settings import Settings
 from qpmhe.estimation.snapshot import read, written
 
 from .cases import CASES, case
+from .scripts import RIGHT, Script, at_once, needed
 
 casadi = pytest.importorskip("casadi")
-CC = shutil.which("cc")
-RIGHT = f'exec "{CC}" "$@"'
-needed = pytest.mark.skipif(
-    CC is None or os.name != "posix", reason="there is no C compiler, or none that is a script"
-)
+pytestmark = needed
 
 
 @pytest.fixture(scope="module")
-def script(tmp_path_factory):
-    """A compiler whose body is in the environment: the same one for the cache, whatever it does."""
-    path = tmp_path_factory.mktemp("compiler") / "cc"
-    path.write_text('#!/bin/sh\necho "$*" >> "$COMPILER_LOG"\neval "$COMPILER_BODY"\n')
-    path.chmod(0o755)
-    return path
+def folder(tmp_path_factory):
+    """Of a compiler that is the same one for all tests, and of a library."""
+    return tmp_path_factory.mktemp("compiler")
 
 
 @pytest.fixture(autouse=True)
-def calls(script, tmp_path, monkeypatch):
+def script(folder, tmp_path, monkeypatch):
     """An empty cache, the usual "auto", and a compiler that counts its calls."""
-    log = tmp_path / "calls"
-    for name, value in {
-        "QPMHE_CACHE_DIR": tmp_path / "cache", "CC": script, "COMPILER_LOG": log,
-        "COMPILER_BODY": RIGHT,
-    }.items():
-        monkeypatch.setenv(name, str(value))
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    return lambda: len(log.read_text().splitlines()) if log.exists() else 0
-
-
-@pytest.fixture(scope="module")
-def library_folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("library")
+    return Script(folder, monkeypatch)
 
 
 @pytest.fixture
-def filled(library_folder, tmp_path, calls, monkeypatch):
+def filled(folder, tmp_path, script, monkeypatch):
     """The cache with the estimator's library, which is made once for all tests."""
     with monkeypatch.context() as patch:
-        patch.setenv("QPMHE_CACHE_DIR", str(library_folder))
+        patch.setenv("QPMHE_CACHE_DIR", str(folder / "library"))
         name = compile_it().path.name
-    shutil.copytree(library_folder, tmp_path / "cache")
+    shutil.copytree(folder / "library", tmp_path / "cache")
+    script.log.unlink(missing_ok=True)
     return tmp_path / "cache" / name
 
 
@@ -79,11 +62,10 @@ def arguments(weight=1.0, horizon=3, **options):
     return parts, {"horizon": horizon, "initial_state": np.zeros(2)}
 
 
-def estimator(weight=1.0, horizon=3, **options):
-    parts, shared = arguments(weight, horizon)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        return qpmhe.MovingHorizonEstimator(*parts, **shared | options)
+def estimator(weight=1.0, horizon=3, parts=None, **options):
+    usual, shared = arguments(weight, horizon)
+    with warnings.catch_warnings(action="error"):
+        return qpmhe.MovingHorizonEstimator(*(parts or usual), **shared | options)
 
 
 def compile_it(**options):
@@ -91,43 +73,40 @@ def compile_it(**options):
     return qpmhe.compile(*parts, **shared)
 
 
-def test_an_empty_cache_is_the_python_step_without_generating_anything(calls, monkeypatch):
+def test_an_empty_cache_is_the_python_step_without_generating_anything(script, monkeypatch):
     monkeypatch.setattr(library, "estimator_files", None)
     mhe = estimator()
     assert mhe.settings.engine == "auto"
     assert (mhe.engine, mhe.update([1.0]).engine, mhe.run([1.0]).engine) == ("python",) * 3
-    assert not calls()
+    assert not script.calls
 
 
-@needed
-def test_what_was_compiled_is_taken_without_generating_it_again(calls, monkeypatch):
+def test_what_was_compiled_is_taken_without_generating_it_again(script, monkeypatch):
+    before = estimator()
     made = compile_it()
     assert made.is_new
     assert made.path.is_file()
     assert made.engine == "compiled"
     assert made.seconds > 0.0
-    before = calls()
+    before.update([1.0])  # an estimator that exists keeps its engine
+    before.reset()
+    assert before.update([1.0]).engine == "python"
+    calls = script.calls
     monkeypatch.setattr(library, "estimator_files", None)
-    for mhe in (estimator(), estimator(weight=2.0, max_qps=3), estimator(warm_start=True)):
+    for mhe in (
+        estimator(), estimator(weight=2.0, max_qps=3), estimator(warm_start=True, backend="banded"),
+    ):
         assert (mhe.engine, mhe.update([1.0]).engine, mhe.run([1.0]).engine) == ("compiled",) * 3
-    assert estimator(engine="python").engine == "python"
-    assert estimator(horizon=4).engine == "python"
+    for options in (
+        {"engine": "python"}, {"horizon": 4}, {"backend": "osqp"}, {"isolated": True},
+        {"backend": qpmhe.solvers.create("osqp")},
+    ):
+        assert estimator(**options).engine == "python"
     again = qpmhe.compile(estimator())
     assert (again.is_new, again.path) == (False, made.path)
-    assert calls() == before
+    assert script.calls == calls
 
 
-@needed
-def test_an_estimator_that_exists_keeps_its_engine():
-    mhe = estimator()
-    qpmhe.compile(mhe)
-    mhe.update([1.0])
-    mhe.reset()
-    assert mhe.update([1.0]).engine == "python"
-    assert estimator().engine == "compiled"
-
-
-@needed
 def test_a_batch_has_one_engine():
     def batch():
         parts, shared = arguments()
@@ -145,45 +124,20 @@ def test_a_batch_has_one_engine():
     assert pickle.loads(pickle.dumps(two)).engine == "compiled"
 
 
-@needed
-def test_the_python_step_where_the_user_asks_for_a_solver(filled):
-    solver = qpmhe.solvers.create("osqp")
-    for options in ({"backend": "osqp"}, {"backend": solver}, {"isolated": True}):
-        assert estimator(**options).engine == "python"
-    assert estimator(backend="banded").engine == "compiled"
+def test_no_option_and_no_part_is_refused(filled):
+    (_, observer, cost), _ = arguments()
+    plain = qpmhe.System(lambda x: [0.9 * x[0], 0.8 * float(x[1])], lambda x: x[:1], n=2, p=1)
+    kalman = qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]])
+    huber = qpmhe.RobustCost(prior=np.eye(2), disturbance=np.eye(2), noise=qpmhe.Huber([[1.0]]))
+    boxed = system(states=qpmhe.Box([-5.0, -5.0], [5.0, 5.0]))
+    for options in (
+        {"time_budget": 1.0}, {"arrival": "smoothed"}, {"candidate": "reinitialized"}, {"delay": 2},
+        {"parts": (system(), kalman, cost)}, {"parts": (system(), observer, huber)},
+        {"parts": (boxed, observer, cost)}, {"parts": (plain, observer, cost)},
+    ):
+        assert np.isfinite(estimator(**options).update([1.0]).cost)
 
 
-@needed
-@pytest.mark.parametrize("options", [
-    {"time_budget": 1.0}, {"arrival": "smoothed"}, {"candidate": "reinitialized"}, {"delay": 2},
-], ids=str)
-def test_no_option_is_refused(filled, options):
-    mhe = estimator(**options)
-    assert np.isfinite(mhe.update([1.0]).cost)
-
-
-@needed
-@pytest.mark.parametrize("part", [
-    {"observer": qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]])},
-    {"cost": qpmhe.RobustCost(
-        prior=np.eye(2), disturbance=np.eye(2), noise=qpmhe.Huber([[1.0]]))},
-    {"states": qpmhe.Box([-5.0, -5.0], [5.0, 5.0])},
-    {"plain": True},
-], ids=lambda part: next(iter(part)))
-def test_no_part_is_refused(filled, part):
-    (model, observer, cost), shared = arguments()
-    if "states" in part:
-        model = system(**part)
-    if "plain" in part:
-        model = qpmhe.System(lambda x: [0.9 * x[0], 0.8 * float(x[1])], lambda x: x[:1], n=2, p=1)
-    parts = model, part.get("observer", observer), part.get("cost", cost)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mhe = qpmhe.MovingHorizonEstimator(*parts, **shared)
-        assert np.isfinite(mhe.update([1.0]).cost)
-
-
-@needed
 def test_the_environment_can_ask_for_python(filled, monkeypatch):
     assert estimator().engine == "compiled"
     monkeypatch.setenv("QPMHE_ENGINE", "python")
@@ -196,7 +150,6 @@ def test_the_environment_can_ask_for_python(filled, monkeypatch):
 # Bad luck: no compiler, one that is broken or hangs, a cache that cannot be written.
 
 
-@needed
 def test_without_a_compiler(filled, monkeypatch):
     monkeypatch.setenv("CC", "/nowhere/cc")
     assert estimator().engine == "python"
@@ -204,30 +157,23 @@ def test_without_a_compiler(filled, monkeypatch):
         compile_it()
 
 
-@needed
-def test_a_compiler_that_fails(monkeypatch):
-    monkeypatch.setenv("COMPILER_BODY", "echo 'out of cheese' >&2; exit 1")
-    assert estimator().engine == "python"
-    with pytest.raises(CompilationError, match="out of cheese"):
-        compile_it()
-    assert estimator().engine == "python"
-
-
-@needed
-def test_a_compiler_that_hangs_is_given_up(calls, monkeypatch):
+def test_a_compiler_that_fails_or_hangs(script, monkeypatch):
     monkeypatch.setattr(compiler, "_PATIENCE", 0.2)
-    monkeypatch.setenv("COMPILER_BODY", "exec sleep 600")
-    assert estimator().engine == "python"
-    began = time.monotonic()
-    with pytest.raises(CompilationError, match=r"did not end within 0\.2 s"):
-        compile_it()
-    assert time.monotonic() - began < 60.0
-    assert calls() == 1
+    for body, words, calls in (
+        ("echo 'out of cheese' >&2; exit 1", "out of cheese", 3),
+        ("exec sleep 600", r"did not end within 0\.2 s", 4),
+    ):
+        script.does(body)
+        began = time.monotonic()
+        with pytest.raises(CompilationError, match=words):
+            compile_it()
+        assert time.monotonic() - began < 60.0
+        assert estimator().engine == "python"
+        assert len(script.calls) == calls
 
 
-@needed
-def test_a_compiler_that_reads_standard_input(monkeypatch):
-    monkeypatch.setenv("COMPILER_BODY", f"cat > /dev/null; {RIGHT}")
+def test_a_compiler_that_reads_standard_input(script):
+    script.does(f"cat > /dev/null; {RIGHT}")
     before = os.dup(0)
     reading, writing = os.pipe()  # nobody ever writes to it
     try:
@@ -239,17 +185,14 @@ def test_a_compiler_that_reads_standard_input(monkeypatch):
             os.close(one)
 
 
-@needed
-def test_wrong_code_is_not_used_and_not_compiled_again(filled, calls, monkeypatch):
-    before = calls()
+def test_wrong_code_is_not_used_and_not_compiled_again(filled, script, monkeypatch):
     compiler._checked.clear()
     monkeypatch.setattr(compiler, "_checked_by", lambda: "another release")
     monkeypatch.setattr(rehearsal, "estimator_fault", lambda *_: "J of the estimate is 2")
     assert estimator().engine == "python"
-    assert calls() == before
+    assert not script.calls
 
 
-@needed
 @pytest.mark.parametrize("error", [RuntimeError, OSError, MemoryError, ValueError])
 def test_no_error_of_the_compiled_step_is_raised(error, filled, monkeypatch):
     def fail(*_):
@@ -259,7 +202,6 @@ def test_no_error_of_the_compiled_step_is_raised(error, filled, monkeypatch):
     assert estimator().engine == "python"
 
 
-@needed
 def test_damaged_and_foreign_files_in_the_cache(filled, tmp_path):
     filled.with_suffix(".sha256").write_text("nonsense")
     assert estimator().engine == "python"
@@ -270,29 +212,19 @@ def test_damaged_and_foreign_files_in_the_cache(filled, tmp_path):
     assert estimator().engine == "python"
 
 
-def read_only(monkeypatch):
-    """No folder can be written, as os.access reports it: the tests may run as root."""
-    plain = os.access
-    monkeypatch.setattr(
-        os, "access", lambda path, mode: not mode & os.W_OK and plain(path, mode)
-    )
-
-
-@needed
-def test_a_cache_that_cannot_be_written_can_be_read(filled, calls, monkeypatch):
-    before = calls()
+def test_a_cache_that_cannot_be_written_can_be_read(filled, script, monkeypatch):
+    plain = os.access  # as it reports no folder to be writable: the tests may run as root
     with monkeypatch.context() as patch:
-        read_only(patch)
+        patch.setattr(os, "access", lambda path, mode: not mode & os.W_OK and plain(path, mode))
         assert estimator().engine == "compiled"
         assert not compile_it().is_new
         assert estimator(horizon=4).engine == "python"
         with pytest.raises(CompilationError, match="cannot be written; set QPMHE_CACHE_DIR"):
             compile_it(horizon=4)
         assert estimator(engine="compiled").engine == "compiled"
-    assert calls() == before
+    assert not script.calls
 
 
-@needed
 def test_what_lies_beside_a_cache_that_cannot_be_made_is_found(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "file" / "below"))
@@ -318,29 +250,17 @@ print(mhe.engine, mhe.update([1.0]).cost.hex())
 """
 
 
-@needed
-def test_two_processes_that_compile_at_once(calls, monkeypatch):
-    monkeypatch.setenv("COMPILER_BODY", f"sleep 0.3; {RIGHT}")
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(2)
-    ]
-    assert [one.stdout.readline() for one in both] == ["ready\n"] * 2
-    for one in both:
-        one.stdin.write("\n")
-        one.stdin.flush()
-    found = [one.communicate(timeout=120)[0] for one in both]
+def test_two_processes_that_compile_at_once(script):
+    script.does(f"sleep 0.3; {RIGHT}")
+    found = at_once(PROGRAM)
     assert found[0] == found[1]
     assert found[0].startswith("compiled ")
-    before = calls()
+    before = len(script.calls)
     assert before in (1, 2)
     # The same model of another process is in the cache.
     mhe = estimator()
     assert f"{mhe.engine} {mhe.update([1.0]).cost.hex()}\n" == found[0]
-    assert calls() == before
+    assert len(script.calls) == before
 
 
 # The key by which the cache knows a library.
@@ -354,15 +274,13 @@ def models():
     box, rows = qpmhe.Box([-1.0, -1.0], [1.0, 1.0]), qpmhe.Polytope([[1.0, 1.0]], [1.0])
     yield system(), 3
     yield system(), 4
-    yield system(0.8), 3
-    yield system(0.9 + 1e-15), 3
-    yield system(disturbances=box), 3
-    yield system(disturbances=rows), 3
-    yield system(noises=qpmhe.Box([-1.0], [1.0])), 3
-    yield qpmhe.from_casadi(rate, h, dt=0.1, compiled=False), 3
-    yield qpmhe.from_casadi(rate, h, dt=0.2, compiled=False), 3
-    yield qpmhe.from_casadi(rate, h, dt=0.1, method="euler", compiled=False), 3
-    yield qpmhe.from_casadi(rate, h, compiled=False), 3
+    for one in (
+        system(0.8), system(0.9 + 1e-15), system(disturbances=box), system(disturbances=rows),
+        system(noises=qpmhe.Box([-1.0], [1.0])),
+    ):
+        yield one, 3
+    for options in ({"dt": 0.1}, {"dt": 0.2}, {"dt": 0.1, "method": "euler"}, {}):
+        yield qpmhe.from_casadi(rate, h, compiled=False, **options), 3
     f = casadi.Function("f", [x, u], [0.9 * x + u])
     yield qpmhe.from_casadi(f, h, compiled=False), 3
     inner = casadi.Function("inner", [ax], [casadi.cos(ax)])
@@ -390,10 +308,11 @@ def key_and_source(parts, settings, monkeypatch):
     return key, files["mhe.h"] + code
 
 
-def test_keys_differ_where_the_source_does(monkeypatch):
+@pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.slow)])
+def test_keys_differ_where_the_source_does(step, monkeypatch):
     (_, observer, cost), _ = arguments()
     estimators = [((model, observer, cost), Settings(horizon)) for model, horizon in models()]
-    for name in CASES:
+    for name in list(CASES)[::step]:
         one = case(name).estimator("python")
         estimators.append(((one.system, one.observer, one.cost), one.settings))
     found = [key_and_source(*one, monkeypatch) for one in estimators]
@@ -422,7 +341,6 @@ def test_keys_change_with_the_generator(name, tmp_path, monkeypatch):
         fingerprint._generator.cache_clear()
 
 
-@needed
 def test_a_model_without_a_key_is_compiled_and_left_to_python_by_auto(monkeypatch):
     monkeypatch.setattr(library, "source_key", lambda *_: None)
     assert estimator(engine="compiled").engine == "compiled"
@@ -434,42 +352,41 @@ def test_a_model_without_a_key_is_compiled_and_left_to_python_by_auto(monkeypatc
 # Snapshots go on with the engine that they were taken with.
 
 
-@needed
-def test_a_snapshot_pins_the_python_step():
-    mhe = estimator()
+def snapshot_of(mhe):
+    """A snapshot in a record's middle, the estimator pickled there, and what comes next."""
     for y in (1.0, 2.0, np.nan, 1.5):
         mhe.update([y])
-    snapshot = mhe.state_dict()
+    return mhe.state_dict(), pickle.dumps(mhe), mhe.update([1.0])
+
+
+def goes_on(one, wanted, engine):
+    found = one.update([1.0])
+    assert (one.engine, found.engine) == (engine, engine)
+    np.testing.assert_array_equal(found.trajectory, wanted.trajectory)
+
+
+def test_a_snapshot_pins_the_python_step():
+    mhe = estimator()
+    snapshot, kept, wanted = snapshot_of(mhe)
     assert read(snapshot)["engine"] == "python"
     compile_it()
-    other = estimator()
+    other, copy = estimator(), pickle.loads(kept)
     assert other.engine == "compiled"
+    assert copy.settings == mhe.settings
     other.load_state_dict(snapshot)
-    copy = pickle.loads(pickle.dumps(mhe))
-    assert (other.engine, copy.engine, copy.settings) == ("python", "python", mhe.settings)
-    wanted = mhe.update([1.0])
     for one in (other, copy):
-        found = one.update([1.0])
-        assert found.engine == "python"
-        np.testing.assert_array_equal(found.trajectory, wanted.trajectory)
+        goes_on(one, wanted, "python")
     with pytest.raises(InvalidInputError, match="engine='python'; expected 'compiled'"):
         estimator(engine="compiled").load_state_dict(snapshot)
 
 
-@needed
 def test_a_snapshot_pins_the_compiled_step(filled, tmp_path, monkeypatch):
-    mhe = estimator()
-    for y in (1.0, 2.0, np.nan, 1.5):
-        mhe.update([y])
-    snapshot, kept = mhe.state_dict(), pickle.dumps(mhe)
-    wanted = mhe.update([1.0])
+    snapshot, kept, wanted = snapshot_of(estimator())
     monkeypatch.setenv("QPMHE_ENGINE", "python")
-    others = [estimator(), pickle.loads(kept)]
-    others[0].load_state_dict(snapshot)
-    for one in others:
-        found = one.update([1.0])
-        assert found.engine == "compiled"
-        np.testing.assert_array_equal(found.trajectory, wanted.trajectory)
+    other = estimator()
+    other.load_state_dict(snapshot)
+    for one in (other, pickle.loads(kept)):
+        goes_on(one, wanted, "compiled")
     # Without its library the snapshot is refused, and the estimator stays as it was.
     monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "empty"))
     mhe = estimator()
@@ -489,16 +406,14 @@ def test_a_snapshot_pins_the_compiled_step(filled, tmp_path, monkeypatch):
 
 def test_compile_validates_its_arguments():
     parts, shared = arguments()
-    with pytest.raises(InvalidInputError, match="leave them out"):
-        qpmhe.compile(estimator(), horizon=3)
-    with pytest.raises(OptionError, match="horizn"):
-        qpmhe.compile(*parts, horizn=3, **shared)
-    with pytest.raises(InvalidInputError, match="observer is None"):
-        qpmhe.compile(parts[0], **shared)
-    with pytest.raises(OptionError, match="solves its QPs itself"):
-        qpmhe.compile(*parts, backend="osqp", **shared)
-    with pytest.raises(OptionError, match="isolated is True"):
-        qpmhe.compile(*parts, isolated=True, **shared)
     plain = qpmhe.System(lambda x: [0.9 * x[0], 0.8 * float(x[1])], lambda x: x[:1], n=2, p=1)
-    with pytest.raises(OptionError, match="no C code for this estimator"):
-        qpmhe.compile(plain, *parts[1:], **shared)
+    for given, options, error, words in (
+        ((estimator(),), {"horizon": 3}, InvalidInputError, "leave them out"),
+        (parts, {"horizn": 3, **shared}, OptionError, "horizn"),
+        (parts[:1], shared, InvalidInputError, "observer is None"),
+        (parts, {"backend": "osqp", **shared}, OptionError, "solves its QPs itself"),
+        (parts, {"isolated": True, **shared}, OptionError, "isolated is True"),
+        ((plain, *parts[1:]), shared, OptionError, "no C code for this estimator"),
+    ):
+        with pytest.raises(error, match=words):
+            qpmhe.compile(*given, **options)

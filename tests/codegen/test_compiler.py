@@ -17,50 +17,43 @@ from qpmhe.codegen import compiler
 from qpmhe.codegen.compiler import cache_directory, compiled_library, find_compiler
 from qpmhe.errors import CompilationError, EngineWarning
 
-CC = shutil.which("cc")
-pytestmark = [
-    pytest.mark.skipif(CC is None, reason="there is no C compiler"),
-    pytest.mark.skipif(os.name != "posix", reason="the compilers here are shell scripts"),
-]
+from .scripts import CC, RIGHT, Script, at_once, needed
+
+ca = pytest.importorskip("casadi")
+pytestmark = needed
 ANSWER = {
     "a.c": '#include "a.h"\nint answer(void) { return NUMBER; }\n', "a.h": "#define NUMBER 42\n"
 }
 # In a process of its own: a library that is cut kills the one that maps it.
 PROGRAM = (
-    "from qpmhe.codegen.compiler import compiled_library\n"
-    f"assert compiled_library({ANSWER!r}, 'a.c').answer() == 42\n"
+    "import sys\nfrom qpmhe.codegen.compiler import compiled_library\n"
+    "print('ready', flush=True)\nsys.stdin.readline()\n"
+    f"print(compiled_library({ANSWER!r}, 'a.c').answer())\n"
 )
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.delenv("CC", raising=False)
-
-
 @pytest.fixture
-def wrapped(tmp_path, monkeypatch):
-    """A compiler that counts its calls: a script around cc, set as CC."""
-    def make(body=f'exec "{CC}" "$@"', arguments=""):
-        path, log = tmp_path / "my compiler", tmp_path / "calls"
-        path.write_text(f'#!/bin/sh\necho "$*" >> "{log}"\n{body}\n')
-        path.chmod(0o755)
-        monkeypatch.setenv("CC", f"'{path}' {arguments}".strip())
+def cache(tmp_path):
+    return tmp_path / "cache"
 
-        def calls():
-            return log.read_text().splitlines() if log.exists() else []
 
-        return calls
-
-    return make
+@pytest.fixture(autouse=True)
+def script(tmp_path, cache, monkeypatch):
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(cache))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return Script(tmp_path, monkeypatch, "my compiler")
 
 
 def answer(files=ANSWER, **options):
     return compiled_library(files, "a.c", **options).answer()
 
 
+def elsewhere():
+    """A process that asks for the answer."""
+    subprocess.run([sys.executable, "-c", PROGRAM], check=True, input="\n", text=True)
+
+
 def estimator(factor=0.9, weight=1.0, sets=None, **options):
-    ca = pytest.importorskip("casadi")
     x = ca.SX.sym("x", 2)
     system = qpmhe.from_casadi(
         ca.Function("f", [x], [factor * x]), ca.Function("h", [x], [x[0]]), compiled=False,
@@ -73,77 +66,60 @@ def estimator(factor=0.9, weight=1.0, sets=None, **options):
     )
 
 
-def test_the_cache_is_where_it_was_told(tmp_path, monkeypatch):
-    assert answer() == 42
-    made = {path.suffix for path in (tmp_path / "cache").iterdir()}
-    assert ".so" in made
-    assert not any(path.is_dir() for path in (tmp_path / "cache").iterdir())  # no litter
+def no_litter(cache):
+    return not any(path.is_dir() for path in cache.iterdir())
+
+
+def test_the_cache_is_where_it_is_set(cache, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for place in (str(cache), ".", "below/here", "with space \u00e9"):
+        monkeypatch.setenv("QPMHE_CACHE_DIR", place)
+        assert [answer(), answer()] == [42, 42]
+        assert list(Path(place).glob("*.so"))
+    assert no_litter(cache)
     monkeypatch.delenv("QPMHE_CACHE_DIR")
     assert cache_directory().name == "qpmhe"
 
 
-@pytest.mark.parametrize("place", [".", "below/here", "with space \u00e9"])
-def test_relative_and_unusual_folders(place, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("QPMHE_CACHE_DIR", place)
-    assert answer() == 42
-    assert answer() == 42
-    assert list((tmp_path / place).glob("*.so"))
-
-
-def test_cc_is_honoured_with_its_arguments(wrapped):
-    calls = wrapped(arguments="-DNUMBER_TWO=7 '-DTEXT=a b'")
+def test_what_makes_another_library(script):
+    script.does(RIGHT, "-DNUMBER_TWO=7 '-DTEXT=a b'")
     command = find_compiler()
     assert Path(command[0]).name == "my compiler"
     assert command[1:] == ["-DNUMBER_TWO=7", "-DTEXT=a b"]
     assert answer({"a.c": "int answer(void) { return NUMBER_TWO; }\n"}) == 7
-    assert len(calls()) == 1
-    assert calls()[0].startswith("-DNUMBER_TWO=7 -DTEXT=a b -std=c99")
-
-
-def test_second_use_does_not_compile_again(wrapped):
-    calls = wrapped()
-    assert [answer(), answer()] == [42, 42]
-    assert len(calls()) == 1
-    subprocess.run([sys.executable, "-c", PROGRAM], check=True)
-    assert len(calls()) == 1
-
-
-def test_what_makes_another_library(wrapped):
-    calls = wrapped()
-    assert answer() == 42
-    assert answer({**ANSWER, "a.h": "#define NUMBER 43\n"}) == 43
-    assert answer({**ANSWER, "a.c": ANSWER["a.c"] + "\n"}) == 42
-    assert answer(key="one") == 42
-    assert answer({**ANSWER, "a.h": "#define NUMBER 44\n"}, key="one") == 42  # as the caller says
+    assert script.calls[0].startswith("-DNUMBER_TWO=7 -DTEXT=a b -std=c99")
+    changed = {**ANSWER, "a.h": "#define NUMBER 43\n"}
+    for count, (files, options, expected) in enumerate((
+        (ANSWER, {}, 42), (changed, {}, 43), ({**ANSWER, "a.c": ANSWER["a.c"] + "\n"}, {}, 42),
+        (ANSWER, {"key": "one"}, 42), (ANSWER, {"key": "two"}, 42),
+    ), start=2):
+        assert [answer(files, **options) for _ in range(2)] == [expected] * 2
+        assert len(script.calls) == count
+    assert answer(changed, key="one") == 42  # as the caller says
+    elsewhere()
+    script.does(RIGHT, "-DEXTRA")
     assert answer(key="two") == 42
-    assert len(calls()) == 5
-    wrapped(arguments="-DEXTRA")
+    with script.path.open("a") as file:  # a compiler that was replaced
+        file.write("\n")
     assert answer(key="two") == 42
-    assert len(calls()) == 6
-    wrapped(f'true\nexec "{CC}" "$@"')  # a compiler that was replaced
-    assert answer(key="two") == 42
-    assert len(calls()) == 7
+    assert len(script.calls) == 8
 
 
-def test_model_sizes_and_sets_compile_anew_weights_and_options_do_not(wrapped):
-    calls = wrapped()
-    box = qpmhe.Box([-1.0, -1.0], [1.0, 1.0])
-    estimator()
-    assert len(calls()) == 1
+def test_model_sizes_and_sets_compile_anew_weights_and_options_do_not(script):
     for same in (
-        {"weight": 2.0}, {"max_qps": 5, "infeasible": "keep_candidate", "backend": "banded"},
-        {"warm_start": True, "delay": 1, "candidate": "reinitialized"},
+        {}, {"weight": 2.0},
+        {"max_qps": 5, "infeasible": "keep_candidate", "backend": "banded", "warm_start": True,
+         "delay": 1, "candidate": "reinitialized"},
     ):
         assert estimator(**same).engine == "compiled"
-    assert len(calls()) == 1
-    for count, other in enumerate(
-        ({"factor": 0.8}, {"horizon": 4}, {"sets": box}), start=2
-    ):
+        assert len(script.calls) == 1
+    for count, other in enumerate((
+        {"factor": 0.8}, {"horizon": 4}, {"sets": qpmhe.Box([-1.0, -1.0], [1.0, 1.0])},
+    ), start=2):
         assert estimator(**other).engine == "compiled"
-        assert len(calls()) == count
+        assert len(script.calls) == count
     estimator(sets=qpmhe.Box([-2.0, -np.inf], [2.0, 9.0]))
-    assert len(calls()) == 4
+    assert len(script.calls) == 4
     one, two = estimator(weight=1.0), estimator(weight=3.0)
     assert one.update([1.0]).cost != two.update([1.0]).cost
 
@@ -155,18 +131,16 @@ def python_warns(**options):
     return str(caught[0].message)
 
 
-@pytest.mark.parametrize("named", ["/nowhere/cc", "", "no-such-compiler -O2", "cc 'open"])
-def test_missing_compiler(named, monkeypatch):
-    monkeypatch.setenv("CC", named)
-    with pytest.raises(CompilationError, match=r"no C compiler.*CC"):
-        answer()
-    assert "no C compiler" in python_warns()
-
-
-def test_no_compiler_on_the_path(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
+def test_missing_compiler(monkeypatch, tmp_path):
+    for named in ("/nowhere/cc", "", "no-such-compiler -O2", "cc 'open"):
+        monkeypatch.setenv("CC", named)
+        with pytest.raises(CompilationError, match=r"no C compiler.*CC"):
+            answer()
+        assert "no C compiler" in python_warns()
+    monkeypatch.delenv("CC")
+    assert find_compiler() is not None
+    monkeypatch.setenv("PATH", str(tmp_path / "cache"))
     assert find_compiler() is None
-    ca = pytest.importorskip("casadi")
     x = ca.SX.sym("x", 2)
     f, h = ca.Function("f", [x], [0.9 * x]), ca.Function("h", [x], [x[0]])
     system = qpmhe.from_casadi(f, h)  # CasADi's virtual machine takes its place
@@ -175,61 +149,46 @@ def test_no_compiler_on_the_path(monkeypatch, tmp_path):
         qpmhe.from_casadi(f, h, compiled=True)
 
 
-def test_failing_compiler_is_quoted(wrapped, monkeypatch):
-    calls = wrapped("echo 'out of cheese' >&2\nexit 1")
-    with pytest.raises(CompilationError, match=r"(?s)my compiler.*out of cheese"):
+@pytest.mark.parametrize(("body", "words"), [
+    ("echo 'out of cheese' >&2\nexit 1", "out of cheese"),
+    ("exit 0", ""),  # writes nothing
+    ("printf '\\377\\376 m\\303' >&2; exit 1", ""),  # words in no encoding
+    ("for last; do true; done\nwhile [ $# -gt 1 ]; do [ \"$1\" = -o ] && out=\"$2\"; shift; done\n"
+     "echo nonsense > \"$out\"", ""),  # for another machine
+    ("kill -9 $$", ""),
+], ids=["fails", "no output", "no encoding", "no library", "killed"])
+def test_compilers_of_all_sorts_raise_our_error(body, words, script, cache, monkeypatch):
+    script.does(body)
+    with pytest.raises(CompilationError, match=f"(?s){words and 'my compiler.*'}{words}"):
         answer()
-    assert 1 <= len(calls()) <= 3
-    assert "out of cheese" in python_warns()
+    assert 1 <= len(script.calls) <= 3
+    assert words in python_warns()
+    assert no_litter(cache)
     monkeypatch.setenv("CC", CC)
     with pytest.raises(CompilationError, match="NOT_DECLARED"):
         answer({"a.c": "int answer(void) { return NOT_DECLARED; }\n"})
 
 
-@pytest.mark.parametrize("body", [
-    "exit 0",  # writes nothing
-    "printf '\\377\\376 m\\303' >&2; exit 1",  # words in no encoding
-    "for last; do true; done\nwhile [ $# -gt 1 ]; do [ \"$1\" = -o ] && out=\"$2\"; shift; done\n"
-    "echo nonsense > \"$out\"",  # for another machine
-    "kill -9 $$",
-], ids=["no output", "no encoding", "no library", "killed"])
-def test_compilers_of_all_sorts_raise_our_error(body, wrapped, tmp_path):
-    wrapped(body)
-    with pytest.raises(CompilationError):
-        answer()
-    assert python_warns()
-    assert not any(path.is_dir() for path in (tmp_path / "cache").iterdir())
+def test_a_compiler_without_fast_flags_is_asked_again(script):
+    script.does(f'case "$*" in *march*) exit 1;; esac\n{RIGHT}')
+    assert [answer(), answer()] == [42, 42]
+    assert len(script.calls) == 2
 
 
-def test_a_compiler_without_fast_flags_is_asked_again(wrapped):
-    calls = wrapped(f'case "$*" in *march*) exit 1;; esac\nexec "{CC}" "$@"')
-    assert answer() == 42
-    assert len(calls()) == 2
-    assert answer() == 42
-    assert len(calls()) == 2
+@pytest.mark.parametrize("damage", [
+    lambda data: b"", lambda data: data[: len(data) // 2],
+    lambda data: data.replace(b"answer", b"anxwer"),
+], ids=["empty", "cut", "no symbol"])
+def test_damaged_libraries_are_made_anew(damage, script, cache):
+    elsewhere()
+    path = next(cache.glob("*.so"))
+    path.write_bytes(damage(path.read_bytes()))
+    elsewhere()
+    elsewhere()
+    assert len(script.calls) == 2
 
 
-DAMAGES = {
-    "empty": lambda data: b"",
-    "cut": lambda data: data[: len(data) // 2],
-    "no symbol": lambda data: data.replace(b"answer", b"anxwer"),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_libraries_are_made_anew(damage, wrapped, tmp_path):
-    calls = wrapped()
-    subprocess.run([sys.executable, "-c", PROGRAM], check=True)
-    path = next((tmp_path / "cache").glob("*.so"))
-    path.write_bytes(DAMAGES[damage](path.read_bytes()))
-    for _ in range(2):
-        subprocess.run([sys.executable, "-c", PROGRAM], check=True)
-    assert len(calls()) == 2
-
-
-def test_remains_of_killed_compilations_are_removed(wrapped, tmp_path):
-    wrapped()
-    cache = tmp_path / "cache"
+def test_remains_of_killed_compilations_are_removed(cache):
     names = ["qpmhe-making-old", "qpmhe-making-new", "tmpold"]  # the last may be anyone's
     for name in names:
         (cache / name).mkdir(parents=True)
@@ -241,74 +200,43 @@ def test_remains_of_killed_compilations_are_removed(wrapped, tmp_path):
     assert left == ["qpmhe-making-new", "tmpold"]
 
 
-def test_two_processes_at_once(wrapped, tmp_path):
-    calls = wrapped(f'sleep 0.3\nexec "{CC}" "$@"')
-    program = (
-        "import sys\nfrom qpmhe.codegen.compiler import compiled_library\n"
-        "print('ready', flush=True)\nsys.stdin.readline()\n"
-        f"print(compiled_library({ANSWER!r}, 'a.c').answer())\n"
-    )
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(2)
-    ]
-    assert [one.stdout.readline() for one in both] == ["ready\n"] * 2
-    for one in both:
-        one.stdin.write("\n")
-        one.stdin.flush()
-    assert [one.communicate(timeout=60)[0] for one in both] == ["42\n", "42\n"]
-    before = len(calls())
+def test_two_processes_at_once(script, cache):
+    script.does(f"sleep 0.3\n{RIGHT}")
+    assert at_once(PROGRAM) == ["42\n", "42\n"]
+    before = len(script.calls)
     assert before in (1, 2)
     assert answer() == 42
-    assert len(calls()) == before
-    assert not any(path.is_dir() for path in (tmp_path / "cache").iterdir())
-
-
-@pytest.fixture
-def elsewhere(tmp_path, monkeypatch):
-    """Where the temporary folder is."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    return folder
-
-
-def test_a_folder_that_cannot_be_made(elsewhere, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "file" / "below"))
-    assert answer() == 42
-    assert list(elsewhere.glob("qpmhe-*/*.so"))
+    assert len(script.calls) == before
+    assert no_litter(cache)
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="POSIX only")
-def test_a_folder_of_someone_else(elsewhere, tmp_path, monkeypatch):
-    folder = tmp_path / "cache"
-    folder.mkdir(mode=0o777)
-    if os.geteuid() == 0:
-        os.chown(folder, 12345, 12345)
+def test_folders_that_cannot_be_used(cache, tmp_path, monkeypatch):
+    cache.mkdir(mode=0o777)
+    if os.geteuid() == 0:  # someone else's
+        os.chown(cache, 12345, 12345)
     else:
-        folder.chmod(0o500)
-    assert answer() == 42
-    assert not list(folder.iterdir())
-    private = next(elsewhere.glob("qpmhe-*"))
-    assert list(private.glob("*.so"))
-    assert private.stat().st_mode & 0o077 == 0
-    # And where that one is another's, too.
-    shutil.rmtree(private)
-    private.write_text("")
-    monkeypatch.setattr(compiler, "cache_directory", lambda: folder)
-    with pytest.raises(CompilationError, match="QPMHE_CACHE_DIR"):
-        answer()
+        cache.chmod(0o500)
+    (tmp_path / "file").write_text("")
+    for folder in (cache, tmp_path / "file" / "below"):
+        monkeypatch.setenv("QPMHE_CACHE_DIR", str(folder))
+        assert answer() == 42
+        private = next(tmp_path.glob("qpmhe-*"))
+        assert list(private.glob("*.so"))
+        assert private.stat().st_mode & 0o077 == 0
+        # And where that one is another's, too.
+        shutil.rmtree(private)
+        private.write_text("")
+        with pytest.raises(CompilationError, match="QPMHE_CACHE_DIR"):
+            answer()
+        private.unlink()
+    assert not list(cache.iterdir())
 
 
-def test_a_full_disk(wrapped, tmp_path, monkeypatch):
+def test_a_full_disk(monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    wrapped()
     for place in ((tempfile, "TemporaryDirectory"), (os, "replace"), (Path, "write_text")):
         with monkeypatch.context() as patch:
             patch.setattr(*place, full)
@@ -328,7 +256,18 @@ def test_infinities_and_nans_survive_the_flags():
 
 
 def test_compiling_is_silent(capfd):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert estimator().engine == "compiled"
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("note", ["", "x", "-1\n", "99\nall of it", "1"])
+def test_damaged_notes(note, cache):
+    assert answer() == 42
+    path = next(cache.glob("*.so"))
+    (cache / f"{path.stem[:-2]}.level").write_text(note)
+    if note.startswith("99"):
+        with pytest.raises(compiler.WrongCodeError, match="all of it"):
+            answer()
+    else:
+        assert answer() == 42

@@ -25,8 +25,7 @@ solver_of = functools.cache(lambda shape, real="double": CSolver(*SHAPES[shape],
 def reference(qp, nearest=False):
     """The solution by another solver, in rows of deviations."""
     H, g, rows, low, high, scale = qp.dense()
-    if nearest:
-        g = np.zeros_like(g)
+    g = np.zeros_like(g) if nearest else g
     rows, low, high = rows / scale[:, None], low / scale, high / scale
     solver, equal = piqp.DenseSolver(), low == high
     for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
@@ -47,21 +46,25 @@ def missed(qp, d):
     return np.max(np.maximum(low - rows @ d, rows @ d - high) / scale, initial=0.0)
 
 
-def solves(solver, qp, **options):
+def is_best(qp, status, d, row=1e-9):
     """Check a solution against the reference."""
-    status, d, _ = solver(qp, **options)
-    best = objective(qp, reference(qp))
     assert status == SOLVED
-    assert missed(qp, d) < 1e-9
-    assert objective(qp, d) == pytest.approx(best, rel=1e-7, abs=1e-7)
+    assert missed(qp, d) < row
+    assert objective(qp, d) == pytest.approx(objective(qp, reference(qp)), rel=1e-7, abs=1e-7)
 
 
 @shapes
-@pytest.mark.parametrize("tight", [3.0, 1.0, 0.3, 0.03, 0.001])
-def test_random_qps(shape, tight):
-    rng, solver = np.random.default_rng([7, int(1000 * tight)]), solver_of(shape)
-    for _ in range(20):
-        solves(solver, random_qp(rng, *SHAPES[shape], tight))
+def test_random_qps_with_and_without_a_first_guess(shape):
+    """The active set of another QP, or nonsense, is no worse than none but for its iterations."""
+    solver = solver_of(shape)
+    for tight in (3.0, 1.0, 0.3, 0.03, 0.001):
+        rng = np.random.default_rng([7, int(1000 * tight)])
+        for k in range(10):
+            qp = random_qp(rng, *SHAPES[shape], tight, 0.3 * (k % 3 == 0))
+            is_best(qp, *solver(qp)[:2])
+            share = (0.02, 0.1, 0.5)[k % 3]
+            places = rng.choice([-1, 0, 1], solver.layout.rows, p=[share / 2, 1 - share, share / 2])
+            is_best(qp, *solver(qp, limit=100, places=places.astype(np.int8))[:2])
 
 
 @shapes
@@ -71,60 +74,53 @@ def test_equations_and_repeated_rows(shape):
     for tight in (1.0, 0.3, 0.03):
         for _ in range(10):
             shares = rng.choice([0.0, 0.5]), rng.choice([0.0, 0.5, 0.9])
-            solves(solver, random_qp(rng, *SHAPES[shape], tight, 0.3, *shares))
+            qp = random_qp(rng, *SHAPES[shape], tight, 0.3, *shares)
+            is_best(qp, *solver(qp)[:2])
 
 
 @shapes
 def test_no_unit_matters(shape):
-    rng, solver = np.random.default_rng(12), solver_of(shape)
-    n, p, *_ = SHAPES[shape]
+    rng, (n, p, *_) = np.random.default_rng(12), SHAPES[shape]
     for equal in (0.0, 0.3):
         for _ in range(10):
             qp = random_qp(rng, *SHAPES[shape], 10 ** rng.uniform(-2, 0.5), equal)
             of_x, of_y = (10.0 ** rng.integers(-9, 10, size) for size in (n, p))
-            status, d, _ = solver(qp.in_units(of_x, of_y))
-            d = (d.reshape(-1, n) / of_x).ravel()
-            assert status == SOLVED
-            assert missed(qp, d) < 1e-8
-            best = objective(qp, reference(qp))
-            assert objective(qp, d) == pytest.approx(best, rel=1e-7, abs=1e-7)
+            status, d, _ = solver_of(shape)(qp.in_units(of_x, of_y))
+            is_best(qp, status, (d.reshape(-1, n) / of_x).ravel(), 1e-8)
 
 
 @shapes
 def test_iterations_are_capped_and_counted(shape):
     rng, solver = np.random.default_rng(13), solver_of(shape)
-    for _ in range(20):
+    for _ in range(10):
         qp = random_qp(rng, *SHAPES[shape], 0.1, 0.3)
-        needed = solver(qp)[2]
-        best = objective(qp, reference(qp))
-        statuses = []
+        needed, best = solver(qp)[2], objective(qp, reference(qp))
         for limit in range(needed):
             status, d, iterations = solver(qp, limit=limit)
-            statuses.append(status)
             assert iterations <= limit
             assert np.isfinite(d).all()
+            assert limit or status != SOLVED
             # The iterations behind a solution only take its rounding off.
             if status == SOLVED:
                 assert objective(qp, d) == pytest.approx(best, rel=1e-6, abs=1e-6)
-        assert SOLVED not in statuses[:1]
         assert solver(qp, limit=needed)[::2] == (SOLVED, needed)
 
 
 def test_inactive_rows_cost_no_iteration():
-    rng, solver = np.random.default_rng(14), solver_of("boxes")
-    qp = random_qp(rng, *SHAPES["boxes"], 1e3)
-    status, d, iterations = solver(qp)
+    qp = random_qp(np.random.default_rng(14), *SHAPES["boxes"], 1e3)
+    status, d, iterations = solver_of("boxes")(qp)
     assert (status, iterations) == (SOLVED, 0)
     H, g, *_ = qp.dense()
     np.testing.assert_allclose(H @ d, -g, atol=1e-9)
 
 
-@pytest.mark.parametrize(("shape", "name"), [("all", "disturbances"), ("V", "noises"),
-                                             ("X", "states")])
+@pytest.mark.parametrize(
+    ("shape", "name"), [("all", "disturbances"), ("V", "noises"), ("X", "states")]
+)
 @pytest.mark.parametrize("equal", [0.0, 0.3])
 def test_rows_that_exclude_each_other(shape, name, equal):
     """They end the iterations early, at a finite point."""
-    rng, solver, most = np.random.default_rng(15), solver_of(shape), 0
+    rng, solver = np.random.default_rng(15), solver_of(shape)
     for _ in range(20):
         qp = random_qp(rng, *SHAPES[shape], 0.5, equal)
         matrix, low, high = qp.sets[name]
@@ -134,8 +130,7 @@ def test_rows_that_exclude_each_other(shape, name, equal):
         status, d, iterations = solver(qp, limit=200)
         assert status != SOLVED
         assert np.isfinite(d).all()
-        most = max(most, iterations)
-    assert most <= 60
+        assert iterations <= 60
 
 
 @shapes
@@ -147,8 +142,7 @@ def test_the_nearest_point_in_the_rows(shape):
         status, d, _ = solver(qp, nearest=True)
         assert status == SOLVED
         assert missed(qp, d) < 1e-8
-        H = qp.dense()[0]
-        best = reference(qp, nearest=True)
+        H, best = qp.dense()[0], reference(qp, nearest=True)
         assert d @ H @ d == pytest.approx(best @ H @ best, rel=1e-7, abs=1e-9)
 
 
@@ -162,15 +156,3 @@ def test_single_precision(shape):
         assert status == SOLVED
         assert missed(qp, d) < 1e-4
         assert objective(qp, d) <= objective(qp, best) + 1e-2 * (1.0 + best @ H @ best)
-
-
-@shapes
-def test_any_first_guess(shape):
-    """The active set of another QP, or nonsense, is no worse than none but for its iterations."""
-    rng, solver = np.random.default_rng(18), solver_of(shape)
-    for equal in (0.0, 0.3):
-        for share in (0.02, 0.1, 0.5):
-            for _ in range(5):
-                qp, rows = random_qp(rng, *SHAPES[shape], 0.3, equal), solver.layout.rows
-                places = rng.choice([-1, 0, 1], rows, p=[share / 2, 1 - share, share / 2])
-                solves(solver, qp, limit=100, places=places.astype(np.int8))

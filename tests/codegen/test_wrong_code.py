@@ -1,10 +1,5 @@
 """Compilers that make wrong code: less optimisation, and CasADi's interpreter at last."""
 
-import os
-import shutil
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -12,12 +7,10 @@ import qpmhe
 from qpmhe.codegen import compiler, rehearsal
 from qpmhe.errors import CompilationError, EngineWarning
 
+from .scripts import Script, at_once, needed
+
 ca = pytest.importorskip("casadi")
-CC = shutil.which("cc")
-pytestmark = [
-    pytest.mark.skipif(CC is None, reason="there is no C compiler"),
-    pytest.mark.skipif(os.name != "posix", reason="the compilers here are shell scripts"),
-]
+pytestmark = needed
 FAST, MIDDLE, PLAIN = (" ".join(flags) for flags in compiler._LEVELS)
 A = np.array([[-0.9, 0.2], [-0.1, -0.8]])
 C = np.array([[1.0, 0.3], [0.2, 1.0]])
@@ -45,7 +38,7 @@ STEP_LIES = {
 }
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     folder = tmp_path / "cache"
     monkeypatch.setenv("QPMHE_CACHE_DIR", str(folder))
@@ -54,24 +47,8 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def liar(tmp_path, monkeypatch, cache):
-    """A compiler that compiles another text at some levels; it counts its calls."""
-    def make(edit, levels):
-        path, log = tmp_path / "liar", tmp_path / "calls"
-        cases = "|".join(f"*'{level}'*" for level in levels)
-        path.write_text(
-            f"#!/bin/sh\necho \"$*\" >> '{log}'\n"
-            f"case \"$*\" in {cases})\n"
-            "for source; do case \"$source\" in *.c) break;; esac; done\n"
-            f"cp \"$source\" \"$source.true\"\nsed '{edit}' \"$source.true\" > \"$source\"\n"
-            "cmp -s \"$source\" \"$source.true\" && { echo 'no lie' >&2; exit 1; }\n;; esac\n"
-            f"exec '{CC}' \"$@\"\n"
-        )
-        path.chmod(0o755)
-        monkeypatch.setenv("CC", str(path))
-        return lambda: log.read_text().splitlines() if log.exists() else []
-
-    return make
+def script(tmp_path, monkeypatch):
+    return Script(tmp_path, monkeypatch)
 
 
 def linear(compiled=None, a=A, c=C, dt=0.1):
@@ -83,11 +60,12 @@ def linear(compiled=None, a=A, c=C, dt=0.1):
 
 def estimator(system, engine="compiled"):
     n, p = system.n, system.p
+    cost = qpmhe.QuadraticCost(
+        prior=np.eye(n), disturbance=5 * np.eye(n), noise=2 * np.eye(p) + 0.5
+    )
     return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(0.1 * np.eye(n, p)),
-        qpmhe.QuadraticCost(prior=np.eye(n), disturbance=5 * np.eye(n),
-                            noise=2 * np.eye(p) + 0.5),
-        horizon=6, initial_state=np.ones(n), max_qps=2, engine=engine,
+        system, qpmhe.Luenberger(0.1 * np.eye(n, p)), cost, horizon=6, initial_state=np.ones(n),
+        max_qps=2, engine=engine,
     )
 
 
@@ -116,95 +94,69 @@ def notes(cache):
 
 
 @pytest.mark.parametrize("lie", MODEL_LIES)
-def test_a_wrong_model_is_compiled_with_less_optimisation(lie, liar, cache, monkeypatch):
-    calls = liar(MODEL_LIES[lie], [FAST])
-    is_right(linear())
-    assert [FAST in calls()[0], MIDDLE in calls()[1], len(calls())] == [True, True, 2]
+def test_a_wrong_model_is_compiled_with_less_optimisation(lie, script, cache, monkeypatch):
+    script.lies(MODEL_LIES[lie], [FAST])
+    for _ in range(2):
+        is_right(linear())
+        assert [FAST in call for call in script.calls] == [True, False]
+        assert MIDDLE in script.calls[1]
+        monkeypatch.setattr(compiler, "_checked", set())  # as in another process
     assert notes(cache)[0].startswith("1\n")
     assert "interpreter" in notes(cache)[0]
-    monkeypatch.setattr(compiler, "_checked", set())  # as in another process
-    is_right(linear())
-    assert len(calls()) == 2
 
 
 @pytest.mark.parametrize("lie", STEP_LIES)
-def test_a_wrong_estimator_is_compiled_with_less_optimisation(lie, liar, cache, monkeypatch):
-    calls = liar(STEP_LIES[lie], [FAST, MIDDLE])
+def test_a_wrong_estimator_is_compiled_with_less_optimisation(lie, script, cache, monkeypatch):
+    script.lies(STEP_LIES[lie], [FAST, MIDDLE])
     system = linear(False)
-    mhe = estimator(system)
-    assert mhe.engine == "compiled"
-    costs_are_right(mhe)
-    assert [PLAIN in call for call in calls()] == [False, False, True]
+    for _ in range(2):
+        mhe = estimator(system)
+        assert mhe.engine == "compiled"
+        costs_are_right(mhe)
+        assert [PLAIN in call for call in script.calls] == [False, False, True]
+        monkeypatch.setattr(compiler, "_checked", set())
     assert notes(cache)[0].startswith("2\n")
-    monkeypatch.setattr(compiler, "_checked", set())
-    costs_are_right(estimator(system))
-    assert len(calls()) == 3
 
 
-def test_a_model_that_is_always_wrong_is_interpreted(liar, monkeypatch):
-    calls = liar(MODEL_LIES["residuals"], [FAST, MIDDLE, PLAIN])
+def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypatch):
+    # Of both libraries; the Python step must not use the model's.
+    script.lies(f"{STEP_LIES['noises']};{MODEL_LIES['residuals']}", [FAST, MIDDLE, PLAIN])
     for _ in range(2):
         with pytest.warns(EngineWarning, match=r"virtual machine.*residuals"):
             system = linear()
         is_right(system)
-        assert len(calls()) == 3  # what is known to be wrong is not compiled again
+        assert len(script.calls) == 3  # what is known to be wrong is not compiled again
         monkeypatch.setattr(compiler, "_checked", set())
     with pytest.raises(CompilationError, match="wrong code"):
         linear(compiled=True)
-    assert len(calls()) == 3
-
-
-def test_an_estimator_that_is_always_wrong_is_the_python_step(liar):
-    # Of both libraries; the Python step must not use the model's.
-    calls = liar(f"{STEP_LIES['noises']};{MODEL_LIES['residuals']}", [FAST, MIDDLE, PLAIN])
-    with pytest.warns(EngineWarning, match="virtual machine"):
-        system = linear()
     for _ in range(2):
         with pytest.warns(EngineWarning, match="Python step"):
             mhe = estimator(system)
         assert mhe.engine == "python"
         costs_are_right(mhe)
-        assert len(calls()) == 6
+        assert len(script.calls) == 6
 
 
-def test_processes_at_once_with_a_compiler_that_lies(liar, cache):
-    calls = liar(MODEL_LIES["residuals"], [FAST])
+def test_processes_at_once_with_a_compiler_that_lies(script, cache):
+    script.lies(MODEL_LIES["residuals"], [FAST])
     program = (
-        "import numpy as np, casadi as ca, qpmhe\n"
+        "import sys, numpy as np, casadi as ca, qpmhe\n"
+        "print('ready', flush=True)\nsys.stdin.readline()\n"
         f"s = qpmhe.from_casadi(lambda x: ca.mtimes(ca.DM({A.tolist()}), x), lambda x: x, "
         "n=2, compiled=True)\n"
         "print(s.kernel.residuals(np.ones((3, 2)), 3 * np.ones((2, 2)), np.zeros((2, 0)))[1, 3])\n"
     )
-    both = [
-        subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    assert [one.communicate(timeout=120)[0] for one in both] == ["2.0\n", "2.0\n"]
-    before = len(calls())
+    assert at_once(program) == ["2.0\n", "2.0\n"]
+    before = len(script.calls)
     assert 2 <= before <= 4
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "2.0\n"
-    assert len(calls()) == before
+    assert at_once(program, 1) == ["2.0\n"]
+    assert len(script.calls) == before
     assert not [path for path in cache.iterdir() if path.suffix not in (".so", ".sha256", ".level")]
-
-
-@pytest.mark.parametrize("note", ["", "x", "-1\n", "99\nall of it", "1"])
-def test_damaged_notes(note, cache):
-    linear(compiled=True)
-    path = next(cache.glob("*.so"))
-    (cache / f"{path.stem[:-2]}.level").write_text(note)
-    if note.startswith("99"):
-        with pytest.raises(CompilationError, match="all of it"):
-            linear(compiled=True)
-    else:
-        is_right(linear(compiled=True))
 
 
 @pytest.mark.parametrize("level", range(len(compiler._LEVELS)))
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_linear_models_at_every_level(n, level, cache, monkeypatch):
+def test_linear_models_at_every_level(n, level, monkeypatch):
     """The vectoriser of GCC 12.2 gets these wrong where nothing keeps it from masked loads."""
     monkeypatch.setattr(compiler, "_LEVELS", (compiler._LEVELS[level],))
     rng = np.random.default_rng(n)
@@ -221,8 +173,7 @@ def test_linear_models_at_every_level(n, level, cache, monkeypatch):
         if p == n:
             mhe, other = estimator(system), estimator(linear(False, a, c, None), "python")
             for y in rng.normal(size=(10, p)):
-                one, two = mhe.update(y), other.update(y)
-                assert one.cost == pytest.approx(two.cost, rel=1e-6)
+                assert mhe.update(y).cost == pytest.approx(other.update(y).cost, rel=1e-6)
             assert mhe.engine == "compiled"
 
 
@@ -237,13 +188,13 @@ def test_what_is_not_finite_is_no_fault(h, cache):
     assert not notes(cache)
 
 
-def test_an_estimator_does_not_make_the_model_anew(cache, monkeypatch):
+def test_an_estimator_does_not_make_the_model_anew(monkeypatch):
     system = linear()
     monkeypatch.setattr("qpmhe.adapters.casadi.casadi_model", None)
     assert estimator(system, "python").update([1.0, 2.0]).cost >= 0.0
 
 
-def test_a_library_is_checked_once(cache, monkeypatch):
+def test_a_library_is_checked_once(monkeypatch):
     calls, checked = [], rehearsal.estimator_fault
     monkeypatch.setattr(
         rehearsal, "estimator_fault", lambda *given: calls.append(1) or checked(*given)

@@ -47,15 +47,14 @@ def check_optimal(name, qp, dense, solution):
         assert solution.residuals.gap <= 1e-4 * (1.0 + abs(best))
 
 
-@pytest.mark.parametrize("name", WITH_INEQUALITIES)
-@pytest.mark.parametrize("case", CASES)
-def test_solves_to_optimality(case, name):
-    for seed, options in enumerate((TIGHT, FULL)):
-        qp, dense = make(**CASES[case], seed=seed)
-        check_optimal(name, qp, dense, create(name, options).solve(qp))
-    idle = case in ("no inequality", "only unused rows", "equality rows")
-    expected = SolveStatus.SOLVED if idle else SolveStatus.UNCONSTRAINED
-    assert create("banded").solve(qp).status is expected
+def test_every_backend_solves_to_optimality():
+    for seed, (case, sizes) in enumerate(CASES.items()):
+        qp, dense = make(**sizes, seed=seed)
+        for name in WITH_INEQUALITIES:
+            check_optimal(name, qp, dense, create(name, (TIGHT, FULL)[seed % 2]).solve(qp))
+        idle = case in ("no inequality", "only unused rows", "equality rows")
+        expected = SolveStatus.SOLVED if idle else SolveStatus.UNCONSTRAINED
+        assert create("banded").solve(qp).status is expected
 
 
 @given(
@@ -64,7 +63,7 @@ def test_solves_to_optimality(case, name):
     sides=st.sampled_from(["none", "two", "one", "mixed"]),
     decades=st.sampled_from([0.0, 2.0, 4.0]), seed=st.integers(0, 10**6),
 )
-@settings(max_examples=60, derandomize=True, deadline=None)
+@settings(max_examples=40, derandomize=True, deadline=None)
 def test_backends_agree_on_any_feasible_qp(stages, n, rows, bounds, sides, decades, seed):
     qp, dense = make(stages, n, rows, bounds=bounds, sides=sides, decades=decades, seed=seed)
     for name in {"auto", "clarabel", "daqp", "piqp", "quadprog"} & set(EVERY):

@@ -12,12 +12,9 @@ from qpmhe_solvers import (
     Capabilities,
     RawSolution,
     Solver,
-    SolveStatus,
     check,
-    create,
     measure,
 )
-from qpmhe_solvers.sample_qps import contradiction, sample
 
 from .example_backend import Quadprog, entry
 from .problems import EVERY, registered
@@ -178,25 +175,3 @@ def test_false_words_are_found(flag):
 
 def test_a_backend_without_inequalities_is_capable_of_nothing():
     assert measure("banded") == Capabilities(*[False] * 7)
-
-
-@pytest.mark.parametrize("bounds", ["all", "part"])
-@pytest.mark.parametrize("sides", ["two", "equal", "mixed"])
-def test_samples_have_a_solution_with_active_limits(bounds, sides):
-    for seed in range(3):
-        qp = sample(7, 3, 2, bounds=bounds, sides=sides, seed=seed)
-        assert np.linalg.eigvalsh(qp.dense())[0] > 0
-        solution = create("quadprog").solve(qp)
-        assert solution.status is SolveStatus.SOLVED
-        assert np.count_nonzero(np.abs(solution.bound_duals) > 1e-6) > 2
-
-
-def test_samples_and_the_contradiction_are_what_they_are_called():
-    # Each stage's term couples it to the next one only, and the last stage stands alone.
-    full = sample(3, 2, decades=0.0, seed=4).dense()
-    assert np.count_nonzero(full[:2, 4:]) == 0
-    assert np.count_nonzero(full[:2, 2:4]) == 4
-    np.testing.assert_array_equal(full, full.T)
-    qp = contradiction()
-    assert (qp.row_own[3, 0] == qp.row_own[3, 1]).all()
-    assert qp.row_lower[3, 0] > qp.row_upper[3, 1]

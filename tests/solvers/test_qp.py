@@ -1,7 +1,9 @@
 """A QP's views and products are those of one matrix; its sizes, data and options are validated."""
 
+import copy
 import dataclasses
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -21,7 +23,8 @@ from qpmhe_solvers import (
     SolverOptions,
     band_index,
 )
-from qpmhe_solvers.qp import ARRAYS
+from qpmhe_solvers.layout import Structure
+from qpmhe_solvers.qp import ARRAYS, Places
 
 from .problems import make, overwrite, registered
 
@@ -115,6 +118,53 @@ def test_a_new_qp_has_no_inequality_and_looks_for_some():
     assert not np.shares_memory(qp.band, QP(3, 2, 1).band)
     assert qp.lapack_band.flags.f_contiguous
     assert np.shares_memory(qp.lapack_band, qp.band)
+
+
+def test_faults_of_huge_numbers_are_not_made_up():
+    def fault(gradient=0.0, lower=-np.inf, upper=np.inf):
+        qp = QP(2, 2, 1)
+        qp.gradient[...], qp.row_lower[0], qp.row_upper[0] = gradient, lower, upper
+        with np.errstate(all="ignore"):
+            return qp.fault()
+
+    assert fault(1e200) == ""  # whose squares overflow
+    assert "not finite" in fault(np.inf)
+    assert "not finite" in fault(upper=np.nan)
+    assert fault(upper=-np.inf) == ""
+    assert "a lower bound is above its upper bound" in fault(lower=0.0, upper=-np.inf)
+
+
+def test_all_numbers_of_a_qp_are_in_one_array():
+    qp, _ = make(7, 3, 2, bounds="part", sides="mixed")
+    for one in (qp, qp.copy(), pickle.loads(pickle.dumps(qp)), copy.deepcopy(qp)):
+        one.gradient = np.asfortranarray(one.gradient + 1.0)  # is written, not exchanged
+        one.row_lower -= 0.5
+        places = Places.of(*one.sizes)
+        np.testing.assert_array_equal(one.all_lower, np.append(one.lower, one.row_lower))
+        np.testing.assert_array_equal(one.all_upper, np.append(one.upper, one.row_upper))
+        np.testing.assert_array_equal(one.limits, np.append(one.all_lower, one.all_upper))
+        assert one.numbers[places.one] == 1.0
+        for start, array in (
+            (0, one.band), (places.gradient, one.gradient), (places.own, one.row_own),
+            (places.own + one.row_own.size, one.row_next),
+        ):
+            np.testing.assert_array_equal(one.numbers[start : start + array.size], array.ravel())
+
+
+def test_the_pattern_is_that_of_limits_and_sizes_only():
+    def key(qp):
+        return *qp.sizes, Structure.of(qp, exact=True).key
+
+    qp, seen = QP(2, 1, 1), [key(QP(1, 2, 1)), key(QP(2, 1, 1))]
+    for name, value in (
+        ("lower", 0.0), ("upper", 0.0), ("row_lower", 1.0), ("row_upper", 2.0), ("row_upper", 1.0),
+    ):
+        getattr(qp, name)[1, 0] = value
+        seen.append(key(qp))
+    assert len(set(seen)) == len(seen)
+    for name in ARRAYS:
+        getattr(qp, name)[...] += 0.5
+    assert key(qp) == seen[-1]
 
 
 @pytest.mark.parametrize(
