@@ -13,7 +13,18 @@ from qpmhe.records.checkpoints import load
 
 from .oscillator import lines
 from .tools import (
-    CONTINUOUS, DISCRETE, FUSED, STEPS, cut_off, estimate, finish, get, pipe, put, rows, start,
+    CONTINUOUS,
+    DISCRETE,
+    FUSED,
+    STEPS,
+    cut_off,
+    estimate,
+    finish,
+    get,
+    pipe,
+    put,
+    rows,
+    start,
     talk,
 )
 
