@@ -1,10 +1,4 @@
-from pathlib import Path
-
 import pytest
-
-CONTINUOUS = f"{Path(__file__).with_name('oscillator.py')}:continuous"
-DISCRETE = f"{Path(__file__).with_name('oscillator.py')}:discrete"
-FUSED = f"{Path(__file__).with_name('oscillator.py')}:fused"
 
 
 @pytest.fixture

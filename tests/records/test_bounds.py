@@ -12,9 +12,12 @@ import qpmhe
 from qpmhe.certificates import NotCertifiedError
 from qpmhe.cli.estimate import estimate
 from qpmhe.errors import OptionError
-from qpmhe.records import CheckpointError, RecordError, estimate_record
+from qpmhe.records import CheckpointError
 from qpmhe.records.bounds import BoundOptions
 from qpmhe.records.checkpoints import load, save
+
+from .tools import cut_off, get, put
+from .tools import estimate as by_hand
 
 MODEL = """
 import numpy as np
@@ -37,27 +40,24 @@ def make(gain=0.4, scenario=True, states=True, inputs=False):
         disturbance_covariance=1e-3 * np.eye(2), noise_covariance=4e-3 * np.eye(1), dt=1.0,
         horizon=4, steps=60, labels=("a", "b"))
 """
-OPTIONS = {"step_time": False, "checkpoint_every": 10, "checkpoint_seconds": 0.0}
+OPTIONS = {"checkpoint_every": 10, "checkpoint_seconds": 0.0}
+
+
+def estimated(model="two.py:make", **options):
+    return by_hand(model, **{"bound": True} | OPTIONS | options)
 
 
 @pytest.fixture
-def made(tmp_path, monkeypatch):
-    """The model, and a record of it whose noises are as small as stated; its states."""
-    monkeypatch.chdir(tmp_path)
+def made(here):
+    """The model, and a record of it whose noises are as small as stated: states and lines."""
     Path("two.py").write_text(MODEL)
-    rng, x, ys = np.random.default_rng(0), [np.array([1.0, -1.0])], []
+    rng, x, text = np.random.default_rng(0), [np.array([1.0, -1.0])], ["time,y"]
     A = np.array([[0.9, 0.2], [-0.1, 0.7]])
-    for _ in range(60):
-        ys.append(x[-1][0] + rng.uniform(-0.18, 0.18))
+    for t in range(60):
+        text.append(f"{t},{x[-1][0] + rng.uniform(-0.18, 0.18)}")
         x.append(A @ x[-1] + rng.uniform(-0.09, 0.09, 2))
-    write(ys)
-    return np.array(x), ys
-
-
-def write(ys, path="record.csv", times=None):
-    times = range(len(ys)) if times is None else times
-    lines = [f"{t},{y}" for t, y in zip(times, ys, strict=True)]
-    Path(path).write_text("\n".join(["time,y", *lines, ""]))
+    put("record.csv", text)
+    return np.array(x), text
 
 
 def columns(path):
@@ -80,8 +80,7 @@ def inside(found, states):
 def test_the_truth_is_in_the_columns(made):
     states, _ = made
     warned = []
-    summary = estimate_record("two.py:make", "record.csv", "out.csv", bound=True,
-                              report=warned.append, **OPTIONS)
+    summary = estimated(report=warned.append)
     wide = inside(columns("out.csv"), states)
     note = next(each for each in summary.notes if "z1" in each)
     assert "(proved while x stays in the region)" in note
@@ -90,29 +89,24 @@ def test_the_truth_is_in_the_columns(made):
     given = BoundOptions(
         qpmhe.Box([-9.0, -9.0], [9.0, 9.0]), None, [1.0, 1.0], [0.09, 0.09], 0.18
     )
-    estimate_record("two.py:make", "record.csv", "own.csv", bound=given, **OPTIONS)
+    estimated(out="own.csv", bound=given)
     narrow = inside(columns("own.csv"), states)
     assert narrow[0].max() < wide[0].max() + 2.0  # of the same size
     assert not np.array_equal(narrow, wide)
-
-
-def test_without_the_option_there_are_no_such_columns(made):
-    estimate_record("two.py:make", "record.csv", "out.csv", **OPTIONS)
-    assert "bound" not in Path("out.csv").read_text().splitlines()[0]
+    by_hand("two.py:make", out="without.csv")
+    assert b"bound" not in get("without.csv").splitlines()[0]
 
 
 @pytest.mark.parametrize("what", ["missing", "gap"])
 def test_what_ends_it_is_reported_once_and_leaves_blanks(made, what):
-    _, ys = made
-    times = list(range(60))
+    _, text = made
     if what == "missing":
-        ys[20] = ""
+        text[21] = "20,"
     else:
-        times[20:] = range(21, 61)
-    write(ys, times=times)
+        text[21:] = [f"{t + 1},{line.partition(',')[2]}" for t, line in enumerate(text[21:], 20)]
+    put("record.csv", text)
     warned = []
-    summary = estimate_record("two.py:make", "record.csv", "out.csv", bound=True,
-                              report=warned.append, **OPTIONS)
+    summary = estimated(report=warned.append)
     found = columns("out.csv")
     for name in ("bound_predicted", "lower_predicted_a", "upper_predicted_b"):
         assert np.isfinite(found[name][:20]).all()
@@ -125,38 +119,29 @@ def test_what_ends_it_is_reported_once_and_leaves_blanks(made, what):
 
 
 def test_a_run_that_resumes_writes_the_same_bytes(made):
-    estimate_record("two.py:make", "record.csv", "whole.csv", bound=True, **OPTIONS)
-    text = Path("record.csv").read_text().splitlines(keepends=True)
-    Path("record.csv").write_text("".join([*text[:38], "x\n"]))
-    with pytest.raises(RecordError):
-        estimate_record("two.py:make", "record.csv", "out.csv", bound=True, **OPTIONS)
-    Path("record.csv").write_text("".join(text))
+    estimated(out="whole.csv")
+    cut_off(made[1], 38, "two.py:make", bound=True, **OPTIONS)
     with pytest.raises(CheckpointError, match="bound"):
-        estimate_record("two.py:make", "record.csv", "out.csv", resume=True, bound=BoundOptions(
-            initial_error=3.0), **OPTIONS)
-    estimate_record("two.py:make", "record.csv", "out.csv", bound=True, resume=True, **OPTIONS)
-    assert Path("out.csv").read_bytes() == Path("whole.csv").read_bytes()
+        estimated(resume=True, bound=BoundOptions(initial_error=3.0))
+    estimated(resume=True)
+    assert get("out.csv") == get("whole.csv")
 
 
 def test_another_norm_than_before_widens_the_bound_and_no_more(made):
-    states, _ = made
-    text = Path("record.csv").read_text().splitlines(keepends=True)
-    Path("record.csv").write_text("".join([*text[:38], "x\n"]))
-    with pytest.raises(RecordError):
-        estimate_record("two.py:make", "record.csv", "out.csv", bound=True, **OPTIONS)
-    Path("record.csv").write_text("".join(text))
+    cut_off(made[1], 38, "two.py:make", bound=True, **OPTIONS)
     path = Path("out.csv.checkpoint")
     checkpoint = load(path)
-    P, P_other = checkpoint.bound["metric"], np.diag([2.0, 0.5]) @ checkpoint.bound["metric"]
-    other = 0.5 * (P_other + P_other.T)
+    P = checkpoint.bound["metric"]
+    other = np.diag([2.0, 0.5]) @ P
+    other = 0.5 * (other + other.T)
     # The same set, or a larger one, in another norm.
     factor = np.sqrt(np.linalg.eigvals(np.linalg.solve(P, other)).real.max())
     checkpoint.bound.update(metric=other, radius=factor * checkpoint.bound["radius"])
     save(path, checkpoint)
-    estimate_record("two.py:make", "record.csv", "out.csv", bound=True, resume=True, **OPTIONS)
-    estimate_record("two.py:make", "record.csv", "whole.csv", bound=True, **OPTIONS)
+    estimated(resume=True)
+    estimated(out="whole.csv")
     found, expected = columns("out.csv"), columns("whole.csv")
-    inside(found, states)
+    inside(found, made[0])
     assert (found["bound_predicted"] >= expected["bound_predicted"] * (1.0 - 1e-9)).all()
     assert found["bound_predicted"][-1] == pytest.approx(expected["bound_predicted"][-1], rel=0.05)
 
@@ -174,14 +159,12 @@ def test_another_norm_than_before_widens_the_bound_and_no_more(made):
 )
 def test_what_cannot_be_bounded_is_said_before_any_row(made, model, options, error, words):
     with pytest.raises(error, match=words):
-        estimate_record(f"two.py:make{model}", "record.csv", "out.csv",
-                        bound=BoundOptions(**options), **OPTIONS)
+        estimated(f"two.py:make{model}", bound=BoundOptions(**options))
     assert not Path("out.csv").exists()
 
 
 def test_a_model_without_a_scenario_takes_options_and_weights(made):
-    estimate_record("two.py:make(scenario=False)", "record.csv", "out.csv",
-                    bound=BoundOptions(initial_error=2.0), **OPTIONS)
+    estimated("two.py:make(scenario=False)", bound=BoundOptions(initial_error=2.0))
     assert np.isfinite(columns("out.csv")["bound_predicted"]).all()
 
 

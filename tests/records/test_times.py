@@ -1,21 +1,18 @@
 """Times keep their type and all their digits."""
 
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qpmhe.records import RecordError, estimate_record
+from qpmhe.records import RecordError
 from qpmhe.records.measurements import FieldReader, seconds_between
 
-from .conftest import CONTINUOUS, DISCRETE
-from .test_resume import put
+from .tools import CONTINUOUS, DISCRETE, estimate, get, put
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-OPTIONS = {"step_time": False}
 START = 1_780_000_000 * 10**9  # in May 2026, in nanoseconds; no float has its last digits
 
 
@@ -49,6 +46,9 @@ def stamps(kind, step):
         (stamps(pa.timestamp("ns", "Europe/Berlin"), 100), 1e-7, 1.0),
         (stamps(pa.timestamp("us", "America/New_York"), 3600 * 10**9), 3600.0, 1.0),
         (stamps(pa.timestamp("us", "+05:30"), 10**6), 1e-3, 1.0),
+        # With the hour that comes twice.
+        (pa.array([1_792_884_600_000 + 1_800_000 * k for k in range(12)]).cast(
+            pa.timestamp("ms", "Europe/Berlin")), 1800.0, 1.0),
         (stamps(pa.timestamp("ms"), 10**6), 1e-3, 1.0),
         (pa.array(np.arange(20_000, 20_012), pa.int32()).cast(pa.date32()), 86_400.0, 1.0),
         (pa.array([f"2026-05-04T12:00:{k:02d}+02:00" for k in range(12)]), 1.0, 1.0),
@@ -57,40 +57,26 @@ def stamps(kind, step):
 )
 def test_parquet_to_parquet(here, time, dt, scale):
     pq.write_table(table(time), "record.parquet")
-    told = estimate_record(
-        DISCRETE, "record.parquet", "out.parquet", dt=dt, time_scale=scale, **OPTIONS
+    summary = estimate(
+        DISCRETE, "record.parquet", "out.parquet", dt=dt, time_scale=scale
     )
-    assert (told.samples, told.inserted) == (12, 0)
+    assert (summary.samples, summary.inserted) == (12, 0)
     found = pq.read_table("out.parquet").column("time").combine_chunks()
     assert found.type == time.type
     assert found.equals(time)
     # And by way of CSV, where there are no types.
-    estimate_record(DISCRETE, "record.parquet", "out.csv", dt=dt, time_scale=scale, **OPTIONS)
-    for name in ("out.csv", "again.csv"):
-        rows = Path(name).read_text().splitlines()[1:]
-        put("text.csv", ["time,y1,y2", *(f"{row.split(',')[0]},1,2" for row in rows)])
-        estimate_record(
-            DISCRETE, "text.csv", "again.csv", dt=dt, time_scale=scale, overwrite=True, **OPTIONS
-        )
-        assert [row.split(",")[0] for row in Path("again.csv").read_text().splitlines()[1:]] == [
-            row.split(",")[0] for row in rows
-        ]
+    estimate(DISCRETE, "record.parquet", dt=dt, time_scale=scale)
+    stamps = [row.split(",")[0] for row in Path("out.csv").read_text().splitlines()]
+    put("text.csv", ["time,y1,y2", *(f"{stamp},1,2" for stamp in stamps[1:])])
+    estimate(DISCRETE, "text.csv", "again.csv", dt=dt, time_scale=scale)
+    again = Path("again.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in again] == stamps
 
 
 def test_a_type_of_time_that_text_cannot_be_converted_to(here):
     pq.write_table(table(pa.array(np.arange(12), pa.float16())), "record.parquet")
-    estimate_record(DISCRETE, "record.parquet", "out.parquet", **OPTIONS)
+    estimate(DISCRETE, "record.parquet", "out.parquet")
     assert pq.read_table("out.parquet").column("time").to_pylist() == list(range(12))
-
-
-def test_the_hour_that_comes_twice(here):
-    first = int(datetime(2026, 10, 24, 23, 30, tzinfo=UTC).timestamp())
-    kind = pa.timestamp("ms", "Europe/Berlin")
-    time = pa.array([1000 * (first + 1800 * k) for k in range(6)], pa.int64()).cast(kind)
-    pq.write_table(table(time), "record.parquet")
-    told = estimate_record(DISCRETE, "record.parquet", "out.parquet", dt=1800.0, **OPTIONS)
-    assert told.inserted == 0
-    assert pq.read_table("out.parquet").column("time").combine_chunks().equals(time)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +95,7 @@ def test_the_hour_that_comes_twice(here):
 )
 def test_csv_to_parquet(here, times, kind):
     put("record.csv", ["time,y1,y2", *(f"{time},1,2" for time in times)])
-    estimate_record(DISCRETE, "record.csv", "out.parquet", **OPTIONS)
+    estimate(DISCRETE, "record.csv", "out.parquet")
     found = pq.read_table("out.parquet").column("time")
     assert found.type == kind
     if pa.types.is_int64(kind):
@@ -142,12 +128,12 @@ def test_inputs_that_are_true_or_false(here):
     frame["u"] = pa.array([float(one) for one in on])
     pq.write_table(pa.table(frame), "plain.parquet")
     for name in ("record", "plain"):
-        estimate_record(CONTINUOUS, f"{name}.parquet", f"{name}.csv", **OPTIONS)
-    assert Path("record.csv").read_bytes() == Path("plain.csv").read_bytes()
+        estimate(CONTINUOUS, f"{name}.parquet", f"{name}.csv")
+    assert get("record.csv") == get("plain.csv")
 
 
 def test_dates_that_no_calendar_has(here):
     time = pa.array([2**62, 2**62 + 1], pa.int64()).cast(pa.timestamp("us"))
     pq.write_table(table(time), "record.parquet")
     with pytest.raises(RecordError, match=r"row 1, column 'time'.*expected a number, or a date"):
-        estimate_record(DISCRETE, "record.parquet", "out.csv", **OPTIONS)
+        estimate(DISCRETE, "record.parquet", "out.csv")

@@ -1,0 +1,87 @@
+"""Records, results, and `qpmhe estimate` in a process of its own, to be interrupted and killed."""
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from qpmhe.records import RecordError, estimate_record
+
+_MODELS = Path(__file__).with_name("oscillator.py")
+CONTINUOUS, DISCRETE, FUSED = (f"{_MODELS}:{name}" for name in ("continuous", "discrete", "fused"))
+#: A record of the discrete model.
+STEPS = ["time,y1,y2", *(f"{t},{t % 7},{t % 3}" for t in range(200))]
+
+_CODE = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
+from rich.console import Console
+from qpmhe.cli.estimate import run
+from qpmhe.errors import QpmheError
+
+try:
+    run(Console(stderr=True, width=1000), *sys.argv[1:4], **eval(sys.argv[4]))
+except QpmheError as error:
+    print(error, file=sys.stderr)
+    sys.exit(2)
+"""
+
+
+def estimate(model, record="record.csv", out="out.csv", **options):
+    return estimate_record(model, record, out, **{"step_time": False} | options)
+
+
+def put(name, text, end="\n"):
+    Path(name).write_text("\n".join(text) + end)
+
+
+def get(name):
+    return Path(name).read_bytes()
+
+
+def rows(path):
+    return Path(path).read_bytes().count(b"\n") if Path(path).exists() else 0
+
+
+def pipe(monkeypatch, text):
+    stream = io.TextIOWrapper(io.BytesIO("\n".join([*text, ""]).encode()))
+    monkeypatch.setattr("sys.stdin", stream)
+
+
+def cut_off(text, cut, model=CONTINUOUS, **options):
+    """Estimate a record that breaks off, and mend it."""
+    put("record.csv", [*text[:cut], "0.0,what"])
+    with pytest.raises(RecordError, match="resume"):
+        estimate(model, overwrite=True, **options)
+    put("record.csv", text)
+
+
+def start(model, record, out, **options):
+    return subprocess.Popen(
+        [sys.executable, "-c", _CODE, model, str(record), str(out), repr(options)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )
+
+
+def talk(running, *text):
+    """Without closing its input: it waits for more."""
+    running.stdin.write("\n".join([*text, ""]).encode())
+    running.stdin.flush()
+
+
+def finish(running, text=""):
+    """What it answers: exit code, standard output and standard error."""
+    out, error = running.communicate(text.encode(), timeout=60)
+    return running.returncode, (out or b"").decode(), error.decode()
+
+
+def shell(line):
+    """Exit code, standard output and standard error of a line with `qpmhe` in it."""
+    call = f'{sys.executable} -c "from qpmhe.cli import main; main()"'
+    done = subprocess.run(
+        ["sh", "-c", line.replace("qpmhe ", f"{call} ", 1)], capture_output=True, text=True,
+        stdin=subprocess.DEVNULL, timeout=120, check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
