@@ -1,6 +1,13 @@
-"""Studies in worker processes of this machine."""
+"""Studies in worker processes of this machine and on a Dask cluster."""
 
 import io
+import json
+import logging
+import socket
+import subprocess
+import sys
+import time
+import warnings
 
 import numpy as np
 import pytest
@@ -8,14 +15,21 @@ from rich.console import Console
 from solvers.hostile_backend import CrashingOnce, entry
 from solvers.problems import registered
 
-import qpmhe
 import qpmhe_solvers
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.studies import Store, StoreError, Study, StudyError, run, runner
 from qpmhe.studies import store as store_module
+from qpmhe.studies.store import Writer
+
+from .commands import command
 
 ODD = "tests/studies/odd_models.py"
 SMALL = {"backends": ["banded"], "qps": [0, 1], "seeds": 2, "steps": 12}
+DEATHS = [
+    ("crashes", "the process that ran it died, twice (SIGSEGV", 60.0),
+    ("is_killed", "the process that ran it died, twice", 60.0),
+    ("hangs", "out of time: the process that ran it did not answer", 6.0),
+]
 
 
 @pytest.fixture
@@ -47,21 +61,10 @@ def test_a_study_runs_once_and_more_cells_are_added(path, monkeypatch):
     assert sorted(frame["key"]) == sorted(handed) == sorted(cell.key for cell in study.cells())
     assert set(frame["outcome"]) == {"done"}
     assert "were there already" not in out.file.getvalue()
-    # The observer's cell is an estimator without QPs.
-    system, observer, cost, scenario = qpmhe.models.batch_reactor()
-    record = scenario.simulate(1, 12)
-    alone = qpmhe.MovingHorizonEstimator(
-        system, observer, cost, horizon=10, initial_state=scenario.initial_estimate, max_qps=0
-    ).run(record.measurements)
-    row = frame[(frame["backend"] == "observer") & (frame["seed"] == 1)].iloc[0]
-    errors = alone.states - record.states
-    assert row["rmse_states"] == pytest.approx(np.sqrt((errors**2).mean(axis=0)), rel=1e-12)
-    # First seeds keep their trajectory, others do not.
-    for row in frame.itertuples():
+    for row in frame.itertuples():  # first seeds keep their trajectory
         assert (store.trajectory(row.key) is None) == (row.seed != 0)
     (environment,) = store.meta()["environments"]
-    assert environment["threads"] == "1"
-    assert "git" in environment
+    assert (environment["threads"], "git" in environment) == ("1", True)
 
     handed.clear()
     before = frame[["key", "finished"]].to_dict("records")
@@ -77,7 +80,7 @@ def test_a_study_runs_once_and_more_cells_are_added(path, monkeypatch):
 def test_errors_of_a_heading_that_wraps(path):
     """Two crossings in the record: whole turns are no errors, nor jumps in the figures."""
     grid = {"models": ["vehicle"], "backends": ["banded"], "qps": [0, 1], "seeds": 1, "steps": 100}
-    run(Study(**grid, measure="accuracy", covariances=True), path, progress=False)
+    run(Study(**grid, measure="accuracy", covariances=True), path, jobs=1, progress=False)
     store = Store(path)
     for row in store.frame().itertuples():
         assert row.rmse_states[2] < 0.1
@@ -91,35 +94,29 @@ def test_accuracy_and_time_are_measured_apart(path):
     run(Study(**SMALL, measure="accuracy"), path, progress=False)
     frame = Store(path).frame()
     assert frame["times"].isna().all()
-    assert frame["cost_ratio"].notna().all()
     run(Study(**SMALL, measure="time"), path, progress=False)
     timed = Store(path).frame()
     assert list(timed["key"]) == list(frame["key"])
     assert timed["time_median"].gt(0).all()
     assert list(timed["cost_ratio"]) == list(frame["cost_ratio"])
     assert not timed["shared"].any()  # one at a time, as nothing else was asked for
-    assert [item["jobs"] for item in Store(path).meta()["studies"]][1] == 1
+    assert Store(path).meta()["studies"][1]["jobs"] == 1
+    more = Study(**{**SMALL, "seeds": [7, 8]}, measure="time")
+    shared = run(more, path, jobs=2, progress=False).frame().set_index("seed")["shared"]
+    assert shared[[7, 8]].all()
 
 
-def test_cells_that_are_timed_side_by_side_are_marked(path):
-    run(Study(**SMALL, measure="time"), path, jobs=2, progress=False)
-    assert Store(path).frame()["shared"].all()
-
-
-@pytest.mark.parametrize(
-    ("model", "words", "timeout"),
-    [
-        ("crashes", "the process that ran it died, twice (SIGSEGV", 60.0),
-        ("is_killed", "the process that ran it died, twice (SIGKILL", 60.0),
-        ("hangs", "out of time: the process that ran it did not answer", 6.0),
-    ],
-)
+@pytest.mark.parametrize(("model", "words", "timeout"), DEATHS)
 def test_a_cell_that_ends_its_process_is_a_row(path, model, words, timeout):
+    ends_alone(path, model, words, timeout, jobs=2)
+
+
+def ends_alone(path, model, words, timeout, **where):
     study = Study(
         models=[f"{ODD}:{model}"], backends=["banded"], qps=[1], seeds=4, steps=12,
         cell_timeout=timeout,
     )
-    frame = run(study, path, jobs=2, progress=False).frame().set_index("seed")
+    frame = run(study, path, progress=False, **where).frame().set_index("seed")
     assert sorted(frame.index) == [0, 1, 2, 3]
     assert frame["outcome"].to_dict() == {0: "done", 1: "failed", 2: "done", 3: "done"}
     assert words in frame["reason"][1]
@@ -145,37 +142,31 @@ def test_cells_that_fail_stop_nothing_and_can_be_tried_again(path, monkeypatch):
     assert [key[-6:] for key in handed] == ["seed=1"] * 2
 
 
-def test_a_backend_that_was_registered_here_runs_there(path):
+def test_a_backend_that_crashes_is_isolated_and_the_qp_is_kept(path, tmp_path):
     banded = qpmhe_solvers.backend("banded")
-    qpmhe_solvers.register(
-        qpmhe_solvers.Backend("mine", lambda options: banded.factory(options), "banded")
+    mine = qpmhe_solvers.Backend("mine", lambda options: banded.factory(options), "banded")
+    with registered(entry(CrashingOnce)), registered(mine):
+        names = ["crashingonce", "banded", "mine"]
+        study = Study(**{**SMALL, "backends": names, "qps": [1], "seeds": 1})
+        store = run(study, path, progress=False, keep_failing=tmp_path / "failing")
+    frame = store.frame().set_index("backend")
+    assert set(frame["outcome"]) == {"done"}
+    # A backend that was registered here runs there.
+    assert frame.loc["mine", "rmse"] == frame.loc["banded", "rmse"]
+    assert frame.loc[["mine", "banded"], "reason"].tolist() == ["", ""]
+    assert frame.loc["crashingonce", "reason"] == (
+        "the backend ran in a process of its own, since the cell's died, twice (SIGSEGV(-11))"
     )
-    try:
-        study = Study(**{**SMALL, "backends": ["mine", "banded"], "qps": [1]})
-        frame = run(study, path, progress=False).frame()
-    finally:
-        qpmhe_solvers.unregister("mine")
-    assert set(frame["outcome"]) == {"done"}
-    rmse = frame.pivot_table(index="seed", columns="backend", values="rmse")
-    assert list(rmse["mine"]) == list(rmse["banded"])
+    failed = {flags: n for flags, n in frame.loc["crashingonce", "reasons"].items()
+              if "SOLVER_FAILED" in flags}
+    assert list(failed.values()) == [1]
+    (folder,) = (tmp_path / "failing").iterdir()  # the others have none
+    (file,) = folder.glob("*-failed.npz")  # beside wrong claims of success
+    assert qpmhe_solvers.load(file).backend == "crashingonce"
+    assert "SOLVED" in command("solve-qp", tmp_path / "failing", "--backend", "banded")
 
 
-def test_a_cell_whose_backend_crashes_is_run_again_with_the_backend_apart(path):
-    with registered(entry(CrashingOnce)):
-        study = Study(**{**SMALL, "backends": ["crashingonce", "banded"], "qps": [1], "seeds": 1})
-        frame = run(study, path, progress=False).frame()
-    assert set(frame["outcome"]) == {"done"}
-    for row in frame.itertuples():
-        if row.backend == "banded":
-            assert row.reason == ""
-            continue
-        assert row.reason == (
-            "the backend ran in a process of its own, since the cell's died, twice (SIGSEGV(-11))"
-        )
-        assert sum(n for flags, n in row.reasons.items() if "SOLVER_FAILED" in flags) == 1
-
-
-def test_a_full_disk_in_the_middle_is_told_and_the_same_call_goes_on(path, monkeypatch):
+def test_a_full_disk_in_the_middle_is_reported_and_the_same_call_goes_on(path, monkeypatch):
     plain = store_module._create
 
     def small(connection):
@@ -199,24 +190,136 @@ def test_a_full_disk_in_the_middle_is_told_and_the_same_call_goes_on(path, monke
     ("options", "error", "words"),
     [
         ({"jobs": 0}, OptionError, "jobs is 0"),
-        ({"jobs": 1.5}, OptionError, "jobs is 1.5"),
         ({"jobs": 2, "scheduler": "tcp://127.0.0.1:1"}, OptionError, "leave it out"),
+        ({"progress": 3}, OptionError, "progress is 3"),
+        ({"study": "study.toml"}, StudyError, r"expected a qpmhe\.studies\.Study"),
+        ({"missing": "joblib"}, InvalidInputError, r"pip install 'qpmhe\[studies\]'"),
+        ({"missing": "distributed", "scheduler": "tcp://127.0.0.1:1"}, InvalidInputError,
+         r"pip install 'qpmhe\[dask\]'"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(path, options, error, words):
+def test_options_that_do_not_fit_are_refused(path, monkeypatch, options, error, words):
+    if (module := options.pop("missing", None)) is not None:
+        monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(error, match=words):
-        run(Study(**SMALL), path, **options)
-    with pytest.raises(StudyError, match=r"expected a qpmhe\.studies\.Study"):
-        run("study.toml", path)
-    assert not path.exists()
+        run(**{"study": Study(**SMALL), "store": path, "progress": False} | options)
 
 
-def test_a_missing_package_is_told_with_the_command_that_installs_it(path, monkeypatch):
-    modules = __import__("sys").modules
-    monkeypatch.setitem(modules, "joblib", None)
-    with pytest.raises(InvalidInputError, match=r"pip install 'qpmhe\[studies\]'"):
-        run(Study(**SMALL), path, progress=False)
-    monkeypatch.undo()
-    monkeypatch.setitem(modules, "distributed", None)
-    with pytest.raises(InvalidInputError, match=r"pip install 'qpmhe\[dask\]'"):
-        run(Study(**SMALL), path, progress=False, scheduler="tcp://127.0.0.1:1")
+try:
+    import distributed
+except ImportError:
+    distributed = None
+
+# What Dask and its own dependencies warn of is theirs.
+on_dask = [
+    pytest.mark.filterwarnings("ignore"),
+    pytest.mark.skipif(distributed is None, reason="Dask is not installed"),
+]
+
+
+def marked(test):
+    """A test of the cluster."""
+    for mark in on_dask:
+        test = mark(test)
+    return test
+
+
+@pytest.fixture(scope="module")
+def address():
+    import dask
+
+    # A busy machine restarts workers slowly, and such a cluster takes that for their end.
+    patient = dask.config.set({"distributed.deploy.lost-worker-timeout": "600s"})
+    with warnings.catch_warnings(), patient:
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as made:
+            yield made.scheduler_address
+
+
+@marked
+def test_results_of_a_cluster_are_those_of_this_machine(address, path, tmp_path):
+    study = Study(**SMALL)
+    there = run(study, path, scheduler=address, progress=False).frame()
+    here = run(study, tmp_path / "here.sqlite", progress=False).frame()
+    assert set(there["outcome"]) == {"done"}
+    there, here = there.set_index("key").sort_index(), here.set_index("key").sort_index()
+    for name in ("rmse", "rmse_settled", "cost_ratio", "improved"):
+        np.testing.assert_array_equal(there[name], here[name])
+    assert there["shared"].all()
+
+
+@pytest.mark.slow
+@marked
+@pytest.mark.parametrize(("model", "words", "timeout"), DEATHS[1:])
+def test_a_cell_that_ends_its_worker_is_a_row(address, path, model, words, timeout):
+    ends_alone(path, model, words, timeout, scheduler=address)
+
+
+@marked
+@pytest.mark.parametrize("given", ["nonsense", "", "http://127.0.0.1:80", 8786, "silent"])
+def test_what_is_no_scheduler_is_refused(tmp_path, monkeypatch, given):
+    monkeypatch.setattr(runner, "_CONNECT", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # it accepts, and never answers
+        if given == "silent":
+            given = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(StudyError, match=r"gives no Dask workers .*such as tcp://10") as caught:
+            run(Study(**SMALL), tmp_path / "store.sqlite", scheduler=given, progress=False)
+    assert str(caught.value).startswith(f"the scheduler is {given!r}")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@marked
+def test_a_scheduler_that_dies_loses_nothing_and_the_same_call_resumes(
+    path, tmp_path, monkeypatch
+):
+    def server(*arguments):
+        return subprocess.Popen(
+            [sys.executable, "-m", *arguments, "--no-dashboard"],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )
+
+    contact, put, stored = tmp_path / "scheduler.json", Writer.put, []
+    study = Study(**{**SMALL, "seeds": 100, "steps": 150})
+    scheduler = server(
+        "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
+        "--scheduler-file", str(contact),
+    )
+
+    def counting(writer, result):
+        put(writer, result)
+        stored.append(result)
+        if len(stored) == 10:
+            scheduler.kill()
+
+    worker = None
+    try:
+        until = time.monotonic() + 300
+        while not (contact.exists() and contact.read_text().strip()):
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        address = json.loads(contact.read_text())["address"]
+        worker = server(
+            "distributed.cli.dask_worker", address, "--nworkers", "1", "--nthreads", "1"
+        )
+        monkeypatch.setattr(runner, "_CONNECT", 300.0)
+        monkeypatch.setattr(Writer, "put", counting)
+        with pytest.raises(StudyError, match="give the same command again"):
+            run(study, path, scheduler=address, progress=False)
+    finally:
+        scheduler.kill()
+        if worker is not None:
+            worker.terminate()
+            worker.wait()
+        scheduler.wait()
+    frame = Store(path).frame()
+    assert 10 <= len(frame) < 200
+    assert set(frame["outcome"]) == {"done"}  # what the cluster could not do is no failure
+    assert not frame["shared"].any()  # one worker with one thread
+    fewer = Study(**{**SMALL, "seeds": 10, "steps": 150})
+    after = run(fewer, path, progress=False).frame()
+    assert list(after["finished"][: len(frame)]) == list(frame["finished"])
+    assert {cell.key for cell in fewer.cells()} <= set(after["key"])
