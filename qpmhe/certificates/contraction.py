@@ -123,8 +123,7 @@ def _undetectable(search: Search, text: str) -> NotCertifiedError:
 
 def _steepest(search: Search) -> str:
     """Where f grows so fast that rounding alone may spoil a program; an error where it jumps."""
-    n, system = search.n, search.system
-    radii = np.abs(np.linalg.eigvals(search.jacobians[:, :n])).max(axis=1)
+    radii, system = _radii(search), search.system
     point, largest = search.points[int(radii.argmax())], float(radii.max())
     if largest < _FAST:
         return ""
@@ -212,7 +211,7 @@ def certify_observer(
     search = Search(
         system, bounded_region(system, region, inputs), "observer", sizes, gain, started(seconds)
     )
-    radii = _radii(search)
+    radii = _radii(search, search.gain)
     worst = int(radii.argmax())
     if radii[worst] >= 1.0:  # then there is no P
         steep = _steepest(search)
@@ -254,21 +253,17 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
 
 def _left_out(search: Search) -> tuple[str, ...]:
     """What to say of states that the region fixes."""
-    fixed = np.setdiff1d(np.arange(search.system.n), search.free)
-    if not fixed.size:
-        return ()
-    names = ", ".join(f"x[{j}]" for j in fixed)
-    return (
-        f"{names} is known: the region has no width there, f keeps it, and no gain or disturbance "
-        "may move it",
+    return tuple(
+        f"x[{j}] is known: the region has no width there, f keeps it, and no gain or disturbance "
+        "may move it" for j in np.setdiff1d(np.arange(search.system.n), search.free)
     )
 
 
-def _radii(search: Search) -> Array:
-    """The spectral radii of A - L C at the samples."""
-    n = search.n
-    assert search.gain is not None
-    closed = search.jacobians[:, :n] - search.gain @ search.jacobians[:, n:]
+def _radii(search: Search, gain: Array | None = None) -> Array:
+    """The spectral radii of A, or of A - L C, at the samples."""
+    closed = search.jacobians[:, : search.n]
+    if gain is not None:
+        closed = closed - gain @ search.jacobians[:, search.n :]
     radii: Array = np.abs(np.linalg.eigvals(closed)).max(axis=1)
     return radii
 
@@ -284,7 +279,7 @@ def _unstable(search: Search, text: str) -> NotCertifiedError:
     return NotCertifiedError(
         f"{text}: no constant P shows contraction on the whole region, although A - L C is stable "
         f"at each of {len(search.points)} states (spectral radius up to "
-        f"{_radii(search).max():.6g})", (_OTHER_GAIN, "a smaller region"),
+        f"{_radii(search, search.gain).max():.6g})", (_OTHER_GAIN, "a smaller region"),
     )
 
 

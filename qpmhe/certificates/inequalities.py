@@ -106,8 +106,7 @@ class Form:
             return _assemble([[X, side], [side.T, low]])
         R = Matrices.exact(self.R)
         if self.injection is None:
-            side = P @ A
-            return _assemble([[X, side], [side.T, low + C.T @ (R @ C)]])
+            return _assemble([[X, P @ A], [A.T @ P, low + C.T @ (R @ C)]])
         Y, M, N = map(Matrices.exact, self.injection)
         side, crossed, mixed = P @ A + Y @ C, C.T @ M, C.T @ N - M.T
         return _assemble([

@@ -115,13 +115,10 @@ class Program:
         self._D = D = groups @ shares
         R = cp.diag(cp.multiply(D[r:], (s / self._v) ** 2))
         PB = P @ (matrix / d[:, None] * self._w)
-        injected = self._Y
-        if gain is not None:
-            injected = P @ (gain / d[:, None] * s)
+        injected = self._Y if gain is None else P @ (gain / d[:, None] * s)
         if observes:
-            PB, supply = cp.hstack([PB, -injected @ np.diag(self._v / s)]), D
-        else:
-            supply = D[:r]
+            PB = cp.hstack([PB, -injected @ np.diag(self._v / s)])
+        supply = D if observes else D[:r]
 
         def problem(squares: bool) -> Any:
             top, rest, eye = self._X if squares else P, P - self._X if squares else P, np.eye(n)
@@ -134,11 +131,9 @@ class Program:
             first, Y, M, N = top - room, self._Y, self._M, self._N
             for jacobian in jacobians:
                 A, C = jacobian[:n] * d / d[:, None], jacobian[n:] * d / s[:, None]
-                if observes:
-                    side = P @ A - injected @ C
-                    rows = [[first, side], [side.T, low]]
-                elif kind == "output weight":
-                    rows = [[first, P @ A], [A.T @ P, low + C.T @ R @ C]]
+                if kind != "output injection":
+                    side = P @ A - injected @ C if observes else P @ A
+                    rows = [[first, side], [side.T, low if observes else low + C.T @ R @ C]]
                 else:
                     side, mixed = P @ A + Y @ C, C.T @ N - M.T
                     rows = [
@@ -237,11 +232,9 @@ def _rounded(matrix: Array) -> Array:
 def _printable(gain: Array) -> Array:
     """A gain with as many digits in each row as are worth printing."""
     sizes = np.abs(gain).max(axis=1)
-    powers = np.floor(np.log10(np.where(sizes > 0.0, sizes, 1.0)))
-    return np.array([
-        [float(f"{round(float(each), _DIGITS - int(power)):.{_DIGITS + 3}g}") for each in row]
-        for row, power in zip(gain, powers, strict=True)
-    ])
+    powers = 10.0 ** (_DIGITS - np.floor(np.log10(np.where(sizes > 0.0, sizes, 1.0))))[:, None]
+    short = np.round(gain * powers) / powers
+    return np.array([[float(f"{each:.{_DIGITS + 3}g}") for each in row] for row in short])
 
 
 def _columns(matrix: Array, scales: Scales, sizes: NoiseSizes) -> tuple[Array, Array, float]:

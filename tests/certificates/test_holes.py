@@ -127,3 +127,17 @@ def test_what_jumps_between_samples_is_known_to():
     assert model.reason == ""
     assert "jump" in model.obstacle(region.lower, region.upper)
     assert np.isnan(model.enclose(region.lower[None], region.upper[None]).error).any()
+
+
+@pytest.mark.parametrize(("more", "word"), [(0.0, ""), (1.0, "jump")])
+def test_a_tangent_continues_a_function_and_another_state_does_not(more, word):
+    value, slope = math.sin(0.5), math.cos(0.5)
+    system = qpmhe.System(
+        lambda x: np.stack([
+            np.where(x[0] < 0.5, np.sin(x[0]), value + slope * (x[0] - 0.5) + more * x[1]), x[1]
+        ]), lambda x: x, n=2, p=2,
+    )
+    region = bounded_region(system, qpmhe.Box([0.0, 0.0], [1.0, 1.0]))
+    found = SmoothModel(system, region).obstacle(region.lower, region.upper)
+    assert word in found
+    assert bool(found) == bool(word)
