@@ -186,11 +186,8 @@ class SmoothModel:
             return f"{name} is not traced: {expression.reason}. {_TRACEABLE}", []
         roots = read(self._graph, expression.function)
         self._programs[name] = Program(self._graph, roots)
-        middle = self.points[0]
-        obstacle = self._programs[name].obstacle(middle, middle)
-        if obstacle:
-            return f"{name} has {obstacle}", []
-        return self._differs(name), roots
+        obstacle = self._programs[name].obstacle(self.points[0], self.points[0])
+        return f"{name} has {obstacle}" if obstacle else self._differs(name), roots
 
     @property
     def unknown(self) -> str:
@@ -218,7 +215,8 @@ class SmoothModel:
 
         def values_at(point: Array) -> Any:
             try:
-                return np.asarray(function(point[:n].copy(), point[n:].copy()), np.float64)
+                with np.errstate(all="ignore"):
+                    return np.asarray(function(point[:n].copy(), point[n:].copy()), np.float64)
             except Exception:  # whatever a user's function does: others report it
                 return np.full(function.shape, np.nan)
 
