@@ -88,9 +88,7 @@ def _boundaries(nodes: Any, p: int, q: int) -> Iterable[_Values]:
             for values in (_Values(nodes, plain.atoms | {atom: _number(k)}, {}) for k in range(3))
         )
         slope = _of("sub", first, second)
-        if slope.points[0] and not slope.varies and slope.points == _of(
-            "sub", second, third
-        ).points:
+        if all(slope.points) and slope.points == _of("sub", second, third).points:
             inverse = _of("pow", slope, extra=(-1,))
             yield _Values(nodes, plain.atoms | {atom: _of("mul", first, inverse)}, {})
 
