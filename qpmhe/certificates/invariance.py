@@ -13,7 +13,6 @@ and cells are divided until it is below c, or above it at a state.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +24,7 @@ from ..model.system import System
 from .branch_and_bound import Cells
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import SmoothModel, halved, place
-from .evidence import Evidence, json_ready
+from .evidence import Evidence
 from .inequalities import Matrices, definite
 from .regions import Region, bounded_region, bounds, inequalities, row_bounds
 
@@ -40,16 +39,13 @@ _SLACKS = (1e-12, 1e-9, 1e-6, 1e-3)
 class Invariance:
     """Whether f and the disturbances keep the state in a region: ``holds``, None if not known.
 
-    ``text`` says it in words: through which side the state leaves, from where (``at``, state and
-    input), how far it reaches and what the ``limit`` is; or why it is not known.
+    ``text`` says it in words: through which side the state leaves, from where, and how far it
+    reaches; or why it is not known.
     """
 
     holds: bool | None
     text: str
     region: Region
-    limit: float = np.nan
-    reach: float = np.nan
-    at: Array | None = None
     cells: int = 0
 
     @property
@@ -59,13 +55,6 @@ class Invariance:
 
     def __str__(self) -> str:
         return self.text
-
-    def to_dict(self) -> dict[str, Any]:
-        """All but the region, in types that JSON knows."""
-        content: dict[str, Any] = json_ready(
-            {name: value for name, value in vars(self).items() if name != "region"}
-        )
-        return content
 
 
 def certify_invariance(
@@ -100,12 +89,11 @@ def certify_invariance(
             worst = np.where(np.isnan(excess), np.inf, excess).argmax(axis=1)
             cells.halve(low, high, parts[left, worst])
     if leaving is not None:
-        return Invariance(False, *leaving, cells.taken)
+        return Invariance(False, leaving, where, cells.taken)
     if cells.done:
-        return Invariance(True, "x stays in the region", where, cells=cells.taken)
+        return Invariance(True, "x stays in the region", where, cells.taken)
     end = "when its time was over" if cells.late else "the most that are allowed"
-    text = f"{unknown}, after {cells.taken} cells, {end}"
-    return Invariance(None, text, where, cells=cells.taken)
+    return Invariance(None, f"{unknown}, after {cells.taken} cells, {end}", where, cells.taken)
 
 
 def inner_region(region: Region, metric: Array, radius: float) -> Region | None:
@@ -195,8 +183,8 @@ def _reach(model: SmoothModel, rows: Array, low: Array, high: Array) -> tuple[Ar
 
 def _leaving(
     model: SmoothModel, region: Region, rows: Array, limits: Array, added: Array, points: Array
-) -> tuple[str, Region, float, float, Array] | None:
-    """From which of some states f leaves farthest, in words, and how far, if it leaves."""
+) -> str | None:
+    """From which of some states f leaves farthest, in words, and how far; None if it does not."""
     if not len(points):
         return None
     n, found = region.n, model.values(points, points)
@@ -208,13 +196,12 @@ def _leaving(
     k, side = np.unravel_index(int(beyond.argmax()), beyond.shape)
     if not beyond[k, side] > 0.0:
         return None
-    reach, limit, row = float(most[k, side]), float(limits[side]), rows[side]
+    row = rows[side]
     sign, relation = (1.0, "<=") if row[np.flatnonzero(row)[0]] > 0.0 else (-1.0, ">=")
     terms = " ".join(f"{each:+.4g} x{j + 1}" for j, each in enumerate(sign * row) if each)
     names = terms.replace("+1 x", "+x").replace("-1 x", "-x").lstrip("+")
     who = "f and the disturbances reach" if added[side] > 0.0 else "f reaches"
-    text = (
-        f"{who} {names} = {sign * reach:.4g} through the face {names} {relation} "
-        f"{sign * limit:.4g}, from {place(np.round(points[k], 4), n)}"
+    return (
+        f"{who} {names} = {sign * most[k, side]:.4g} through the face {names} {relation} "
+        f"{sign * limits[side]:.4g}, from {place(np.round(points[k], 4), n)}"
     )
-    return text, region, limit, reach, points[k]

@@ -48,13 +48,6 @@ class Region:
         """The largest distance of two of its states, or a little more."""
         return float(np.linalg.norm((self.upper - self.lower)[: self.n]))
 
-    def to_dict(self) -> dict[str, Any]:
-        """The box around the region and its diameter, in types that JSON knows."""
-        return {
-            "lower": self.lower.tolist(), "upper": self.upper.tolist(), "box": self.is_box,
-            "diameter": self.diameter,
-        }
-
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Which of the states (..., n) lie in the region."""
         x = numbers("points", points, finite=False)
