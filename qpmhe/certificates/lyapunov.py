@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, choice, count, numbers
 from ..costs import QuadraticCost
-from ..errors import OptionError, SetError, ShapeError
+from ..errors import OptionError, ShapeError
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -302,7 +302,7 @@ def design(
         `OutOfTimeError` says that no weights were found in time.
     """
     checked_system(system)
-    place, known = bounded_region(system, region, inputs), _sizes(system, sizes)
+    place, known = bounded_region(system, region, inputs), Sizes.of(sizes, system)
     if horizon is not None:
         count("horizon", horizon, 1)
     if discount is not None and not 0.0 < discount < 1.0:
@@ -323,18 +323,6 @@ def design(
         system, place, form, gamma, known, horizon or proposed or _MOST, found.evidence,
         found.notes,
     )
-
-
-def _sizes(system: System, sizes: Sizes | None) -> Sizes:
-    """The stated ones, or else the system's W and V."""
-    if sizes is not None:
-        return Sizes.stated(sizes)
-    if system.disturbances is None or system.noises is None:
-        raise SetError(
-            "it is not known how large disturbances and noises may be: the system has no sets of "
-            "them. Pass sizes=Sizes(disturbance=..., noise=...), or boxes in their place."
-        )
-    return Sizes(system.disturbances, system.noises, "the system's W and V")
 
 
 def _short(gamma: float) -> float:

@@ -17,6 +17,7 @@ from ..certificates.evidence import NotCertifiedError, json_ready
 from ..certificates.lyapunov import Design, design
 from ..certificates.regions import Region
 from ..certificates.report import Report, certify_model
+from ..certificates.sizes import intervals
 from ..certificates.theorem import DecayingSums
 from ..errors import OptionError
 from ..models.loading import build, find
@@ -196,9 +197,6 @@ def _horizons(text: str | None) -> list[int]:
 
 
 def _words(region: Region) -> str:
-    parts = [
-        f"{'x' if j < region.n else 'u'}{(j if j < region.n else j - region.n) + 1} in "
-        f"[{low:.4g}, {high:.4g}]"
-        for j, (low, high) in enumerate(zip(region.lower, region.upper, strict=True))
-    ]
-    return ", ".join(parts) + ("" if region.is_box else ", and general inequalities")
+    n, low, high = region.n, region.lower, region.upper
+    parts = [intervals("x", low[:n], high[:n]), intervals("u", low[n:], high[n:])]
+    return ", ".join(filter(None, parts)) + ("" if region.is_box else ", and general inequalities")
