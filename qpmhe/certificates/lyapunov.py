@@ -6,7 +6,6 @@ r"""Weights, discount and horizon from a Lyapunov function of detectability, and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -33,7 +32,6 @@ from .search import Search
 from .sizes import OUTWARD, Size, Sizes, lengths_of
 
 _SUMS = 1.0 + 1e-9  # covers the rounding of a sum over a horizon, and of roots
-_MOST = 10_000  # samples of a horizon
 _TOO_SHORT = 1e6
 _ROOM = 1.1  # how far the proposed horizon's limit may be above the one of endless horizons
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE  # J is another cost
@@ -108,9 +106,9 @@ class Design:
         """The factor on a minimiser's error over a window whose prior is an estimate."""
         return 2.0 * math.sqrt(self.discount ** self._horizon(horizon))
 
-    def least_horizon(self) -> int | None:
-        """The least N for which a minimiser's error contracts; None if none up to 10,000 does."""
-        return _first(lambda N: self.contraction(N) < 1.0)
+    def least_horizon(self) -> int:
+        """The least N for which a minimiser's error contracts."""
+        return _least(self.discount, 0.25)
 
     def limit(self, horizon: int | None = None) -> float:
         """What a minimiser's bound tends to for the design's largest disturbances and noises.
@@ -258,9 +256,9 @@ class Design:
         return content
 
 
-def _first(wanted: Callable[[int], bool]) -> int | None:
-    """The least horizon for which something holds."""
-    return next((N for N in range(1, _MOST + 1) if wanted(N)), None)
+def _least(gamma: float, share: float) -> int:
+    """The least horizon N with gamma^N < share."""
+    return math.floor(math.log(share) / math.log(gamma)) + 1
 
 
 def growth(gamma: float, horizon: int | None) -> float:
@@ -318,9 +316,10 @@ def design(
     found = search.answer("the root of the discount", rate, (), _undetectable)
     form = found.form
     gamma = discount if discount is not None else _short(form.rate**2)
-    proposed = _first(lambda N: growth(gamma, N) <= _ROOM**2 * growth(gamma, None))
+    # From this share on, (1 - left) / (1 - 4 left) of `growth` is at most _ROOM^2.
+    proposed = _least(gamma, (_ROOM**2 - 1.0) / (4.0 * _ROOM**2 - 1.0))
     return Design(
-        system, place, form, gamma, known, horizon or proposed or _MOST, found.evidence,
+        system, place, form, gamma, known, horizon or proposed, found.evidence,
         found.notes,
     )
 

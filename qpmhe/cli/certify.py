@@ -129,9 +129,9 @@ def _findings(found: Report) -> Rows:
 def _details(certificate: Certificate) -> Rows:
     """The theorem's assumptions and constants."""
     rows = [
-        (f"{each.name} ({each.label})", " ".join(filter(None, (
-            {True: "", False: "does not hold", None: "not examined"}[each.holds],
-            "" if each.evidence is None else f"({each.evidence})", each.text,
+        (each.name, " ".join(filter(None, (
+            {True: "", False: "does not hold:", None: "not examined:"}[each.holds], each.text,
+            f"({each.label})" if each.evidence is None else f"({each.evidence}, {each.label})",
         ))))
         for each in certificate.assumptions
     ]
@@ -171,7 +171,7 @@ def _designed(
         ("sizes", str(made.sizes)),
         ("contraction", f"a window of N = {made.horizon} that starts at an estimate shrinks the "
          f"error by {made.contraction():.3g}, if J(estimate) <= J(truth), as for a global "
-         f"minimiser; the least N is {made.least_horizon() or '-'}"),
+         f"minimiser; the least N is {made.least_horizon()}"),
         ("limit", "then "
          + ", ".join(f"|x{i + 1} - x_hat{i + 1}| <= {each:.3g}" for i, each in enumerate(limits))
          + (f": it says nothing of {nothing}" if nothing else "")),
