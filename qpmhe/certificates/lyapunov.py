@@ -6,7 +6,6 @@ r"""Weights, discount and horizon from a Lyapunov function of detectability, and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import Array, choice, count, numbers
 from ..costs import QuadraticCost
-from ..errors import OptionError, SetError, ShapeError
+from ..errors import OptionError, ShapeError
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -33,7 +32,6 @@ from .search import Search
 from .sizes import OUTWARD, Size, Sizes, lengths_of
 
 _SUMS = 1.0 + 1e-9  # covers the rounding of a sum over a horizon, and of roots
-_MOST = 10_000  # samples of a horizon
 _TOO_SHORT = 1e6
 _ROOM = 1.1  # how far the proposed horizon's limit may be above the one of endless horizons
 _BROKEN = Status.MISSING | Status.MODEL_FAILED | Status.FAILED_STAGE  # J is another cost
@@ -108,9 +106,9 @@ class Design:
         """The factor on a minimiser's error over a window whose prior is an estimate."""
         return 2.0 * math.sqrt(self.discount ** self._horizon(horizon))
 
-    def least_horizon(self) -> int | None:
-        """The least N for which a minimiser's error contracts; None if none up to 10,000 does."""
-        return _first(lambda N: self.contraction(N) < 1.0)
+    def least_horizon(self) -> int:
+        """The least N for which a minimiser's error contracts."""
+        return _least(self.discount, 0.25)
 
     def limit(self, horizon: int | None = None) -> float:
         """What a minimiser's bound tends to for the design's largest disturbances and noises.
@@ -258,9 +256,9 @@ class Design:
         return content
 
 
-def _first(wanted: Callable[[int], bool]) -> int | None:
-    """The least horizon for which something holds."""
-    return next((N for N in range(1, _MOST + 1) if wanted(N)), None)
+def _least(gamma: float, share: float) -> int:
+    """The least horizon N with gamma^N < share."""
+    return math.floor(math.log(share) / math.log(gamma)) + 1
 
 
 def growth(gamma: float, horizon: int | None) -> float:
@@ -302,7 +300,7 @@ def design(
         `OutOfTimeError` says that no weights were found in time.
     """
     checked_system(system)
-    place, known = bounded_region(system, region, inputs), _sizes(system, sizes)
+    place, known = bounded_region(system, region, inputs), Sizes.of(sizes, system)
     if horizon is not None:
         count("horizon", horizon, 1)
     if discount is not None and not 0.0 < discount < 1.0:
@@ -318,23 +316,12 @@ def design(
     found = search.answer("the root of the discount", rate, (), _undetectable)
     form = found.form
     gamma = discount if discount is not None else _short(form.rate**2)
-    proposed = _first(lambda N: growth(gamma, N) <= _ROOM**2 * growth(gamma, None))
+    # From this share on, (1 - left) / (1 - 4 left) of `growth` is at most _ROOM^2.
+    proposed = _least(gamma, (_ROOM**2 - 1.0) / (4.0 * _ROOM**2 - 1.0))
     return Design(
-        system, place, form, gamma, known, horizon or proposed or _MOST, found.evidence,
+        system, place, form, gamma, known, horizon or proposed, found.evidence,
         found.notes,
     )
-
-
-def _sizes(system: System, sizes: Sizes | None) -> Sizes:
-    """The stated ones, or else the system's W and V."""
-    if sizes is not None:
-        return Sizes.stated(sizes)
-    if system.disturbances is None or system.noises is None:
-        raise SetError(
-            "it is not known how large disturbances and noises may be: the system has no sets of "
-            "them. Pass sizes=Sizes(disturbance=..., noise=...), or boxes in their place."
-        )
-    return Sizes(system.disturbances, system.noises, "the system's W and V")
 
 
 def _short(gamma: float) -> float:

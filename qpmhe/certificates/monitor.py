@@ -143,7 +143,7 @@ class Monitor:
         self._inputs: deque[Array] = deque(maxlen=estimator.horizon)
         self._certificate: Certificate | None = None
         self._measured: MeasuredCost | None = None
-        self.barred = "the theorem was not certified"
+        self.barred = "the monitor follows the observer's bound alone"
         if isinstance(certified, Certificate):
             self._begin(certified, estimator)
 

@@ -38,7 +38,7 @@ from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region
 from .properties import ObserverStability
 from .regions import Region, bounded_region
-from .sizes import OUTWARD, UNIT, Size, Sizes, lengths_of, weighted_lengths
+from .sizes import OUTWARD, UNIT, Size, Sizes, intervals, lengths_of, weighted_lengths
 
 # How close to its limit the bound is when it is called settled, and in how many samples at most.
 _SETTLED, _MOST_SAMPLES = 0.1, 10**6
@@ -394,11 +394,8 @@ class ObserverBound:
     def condition(self) -> str:
         """Whether state and observer stay in the region, in words."""
         if self.inner is not None:
-            sides = zip(self.inner.region.lower, self.inner.region.upper, strict=True)
-            start = ", ".join(
-                f"x{i + 1} in [{low:.4g}, {high:.4g}]"
-                for i, (low, high) in enumerate(sides) if i < self.region.n
-            )
+            n, place = self.region.n, self.inner.region
+            start = intervals("x", place.lower[:n], place.upper[:n])
             return (
                 f"x and z stay in the region (proved) from {start} on, if the initial error is at "
                 "most the limit"

@@ -81,24 +81,27 @@ class Sizes:
         return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))
 
     @classmethod
-    def of(cls, sizes: Any, system: System, cost: Cost) -> Sizes:
-        """The stated ones, or the usual ones with the weights as inverse covariances."""
+    def of(cls, sizes: Any, system: System, cost: Cost | None = None) -> Sizes:
+        """The stated ones, or the usual ones with the cost's weights as inverse covariances."""
         if sizes is not None:
-            return cls.stated(sizes)
+            if not isinstance(sizes, Sizes):
+                raise OptionError(
+                    f"sizes is {shown(sizes)}; expected Sizes(disturbance=..., noise=...), the "
+                    "largest lengths or boxes."
+                )
+            return sizes
+        if cost is None:
+            if system.disturbances is None or system.noises is None:
+                raise SetError(
+                    "it is not known how large disturbances and noises may be: the system has no "
+                    "sets of them. Pass sizes=Sizes(disturbance=..., noise=...), or boxes in their "
+                    "place."
+                )
+            return cls(system.disturbances, system.noises, "the system's W and V")
         covariance, factor = inverse(cost.disturbance), cost.disturbance_factor
         if factor is not None:
             covariance = factor @ covariance @ factor.T
         return cls.usual(system, covariance, inverse(cost.noise), "the cost's inverse weights")
-
-    @classmethod
-    def stated(cls, sizes: Any) -> Sizes:
-        """What the user states, or an `OptionError`."""
-        if not isinstance(sizes, Sizes):
-            raise OptionError(
-                f"sizes is {shown(sizes)}; expected Sizes(disturbance=..., noise=...), the largest "
-                "lengths or boxes."
-            )
-        return sizes
 
     @property
     def extent(self) -> tuple[float | Array, float | Array]:
@@ -186,9 +189,16 @@ def _words(letter: str, given: float | ConvexSet) -> str:
     """Bounds of one signal in words."""
     if not isinstance(given, ConvexSet):
         return f"|{letter}| <= {given:.4g}"
-    sides = sides_of(letter, given).T
-    names = [letter] if len(sides) == 1 else [f"{letter}{j + 1}" for j in range(len(sides))]
+    return intervals(letter, *sides_of(letter, given))
+
+
+def intervals(letter: str, lower: Array, upper: Array) -> str:
+    """Bounds of each component in words."""
+    names = [letter] if len(lower) == 1 and letter in "wv" else [
+        f"{letter}{j + 1}" for j in range(len(lower))
+    ]
     return ", ".join(
-        f"|{name}| <= {high:.4g}" if low == -high else f"{name} in [{low:.4g}, {high:.4g}]"
-        for name, (low, high) in zip(names, sides, strict=True)
+        f"|{name}| <= {high:.4g}" if low == -high and letter in "wv"
+        else f"{name} in [{low:.4g}, {high:.4g}]"
+        for name, low, high in zip(names, lower, upper, strict=True)
     )

@@ -17,6 +17,7 @@ from ..certificates.evidence import NotCertifiedError, json_ready
 from ..certificates.lyapunov import Design, design
 from ..certificates.regions import Region
 from ..certificates.report import Report, certify_model
+from ..certificates.sizes import intervals
 from ..certificates.theorem import DecayingSums
 from ..errors import OptionError
 from ..models.loading import build, find
@@ -128,9 +129,9 @@ def _findings(found: Report) -> Rows:
 def _details(certificate: Certificate) -> Rows:
     """The theorem's assumptions and constants."""
     rows = [
-        (f"{each.name} ({each.label})", " ".join(filter(None, (
-            {True: "", False: "does not hold", None: "not examined"}[each.holds],
-            "" if each.evidence is None else f"({each.evidence})", each.text,
+        (each.name, " ".join(filter(None, (
+            {True: "", False: "does not hold:", None: "not examined:"}[each.holds], each.text,
+            f"({each.label})" if each.evidence is None else f"({each.evidence}, {each.label})",
         ))))
         for each in certificate.assumptions
     ]
@@ -170,7 +171,7 @@ def _designed(
         ("sizes", str(made.sizes)),
         ("contraction", f"a window of N = {made.horizon} that starts at an estimate shrinks the "
          f"error by {made.contraction():.3g}, if J(estimate) <= J(truth), as for a global "
-         f"minimiser; the least N is {made.least_horizon() or '-'}"),
+         f"minimiser; the least N is {made.least_horizon()}"),
         ("limit", "then "
          + ", ".join(f"|x{i + 1} - x_hat{i + 1}| <= {each:.3g}" for i, each in enumerate(limits))
          + (f": it says nothing of {nothing}" if nothing else "")),
@@ -196,9 +197,6 @@ def _horizons(text: str | None) -> list[int]:
 
 
 def _words(region: Region) -> str:
-    parts = [
-        f"{'x' if j < region.n else 'u'}{(j if j < region.n else j - region.n) + 1} in "
-        f"[{low:.4g}, {high:.4g}]"
-        for j, (low, high) in enumerate(zip(region.lower, region.upper, strict=True))
-    ]
-    return ", ".join(parts) + ("" if region.is_box else ", and general inequalities")
+    n, low, high = region.n, region.lower, region.upper
+    parts = [intervals("x", low[:n], high[:n]), intervals("u", low[n:], high[n:])]
+    return ", ".join(filter(None, parts)) + ("" if region.is_box else ", and general inequalities")

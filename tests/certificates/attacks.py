@@ -30,11 +30,7 @@ NOISES = {
 
 
 def attack_detectability(system, region, claim, *, trials, steps=20, polish=40):
-    """Look for two trajectories in the region that violate (eq:eIOSS).
-
-    Disturbances may be anything, so any two sequences of states in the region are two
-    trajectories.
-    """
+    """Look for two trajectories in the region, with any disturbances, that violate (eq:eIOSS)."""
     rng = np.random.default_rng(0)
     u = any_inputs(region, trials, steps, rng)
 
@@ -57,9 +53,8 @@ def attack_detectability(system, region, claim, *, trials, steps=20, polish=40):
 
 
 def attack_observer(system, region, gain, claim, *, trials, steps=30):
-    """Look for a run of an observer with constant gain that violates (eq:RGES).
+    """Look for a run of an observer with constant gain in the region that violates (eq:RGES).
 
-    A run counts as long as the observer's state stays in the region; the true one does throughout.
     The largest share of the bound, and how many errors were compared.
     """
     rng = np.random.default_rng(0)
@@ -104,11 +99,7 @@ def any_inputs(region, trials, steps, rng):
 
 
 def drawn_pairs(system, region, u, rng):
-    """Pairs of trajectories in the region, (2, trials, steps + 1, n).
-
-    Some have any states, others the same, small, rare or no disturbances, or differences
-    hidden from the output.
-    """
+    """Pairs of trajectories in the region, (2, trials, steps + 1, n), of five kinds."""
     (trials, steps), n = u.shape[:2], region.n
     points = region.sample(4 * trials, rng)[:, :n]
     sizes = 10.0 ** rng.uniform(-5.0, 0.0, (2, trials, 1))
@@ -158,12 +149,10 @@ def attack_estimator(
     certificate, *, trials, steps=15, backends=None, caps=(0, 1, 2, 5), polished=4, rounds=10,
     seed=0,
 ):
-    """Look for runs of the estimator whose error exceeds a bound of the certificate.
+    """Look for runs of the estimator whose error exceeds a bound while the theorem applies.
 
-    Backends, caps and kinds of noise take turns; sizes are drawn over four decades. The worst
-    runs are then made worse. Runs count as long as the monitor lets the certificate apply;
-    returned are the largest shares of the paper's bound and of the monitor's, and how many errors
-    were compared.
+    The worst runs are made worse. Returned are the largest shares of the paper's bound and of the
+    monitor's, and how many errors were compared.
     """
     rng, region, found = np.random.default_rng(seed), certificate.region, []
     noises = list(product(NOISES, NOISES))

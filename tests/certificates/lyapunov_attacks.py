@@ -40,9 +40,7 @@ def bent_output():
 def attack(plan, gain, *, trials, steps=25, seed=0):
     """The largest error as a share of each bound, and how many errors were compared.
 
-    Disturbances and noises reach the sizes of the design, some push along the error. Runs count
-    as long as truth, candidates and estimates stay in the region; those of a minimiser while J is
-    at most the truth's.
+    Runs count within the region; those of a minimiser while J is at most the truth's.
     """
     rng, system, region = np.random.default_rng(seed), plan.system, plan.region
     horizons = sorted({1, 3, plan.least_horizon(), min(plan.horizon, 20)})

@@ -100,7 +100,7 @@ def test_the_report_holds_what_the_terminal_shows(shown, tmp_path):
     for each in content["paper"]:
         for value in (*each["C"], each["lam"], each["limit"]):
             assert re.search(rf" {re.escape(f'{value:.4g}')}[ ,\n]", text), (each["horizon"], value)
-    for words in ("(eq:kappa)", "e-IOSS", "Assumed:"):
+    for words in ("eq:kappa)", "e-IOSS", "Assumed:"):
         assert words in text, words
 
 

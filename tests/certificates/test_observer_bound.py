@@ -11,6 +11,7 @@ from qpmhe.certificates import ObserverBound, Sizes, certify, certify_observer, 
 from qpmhe.certificates import certificate as certification
 from qpmhe.certificates.evidence import Evidence, NotCertifiedError, OutOfTimeError
 from qpmhe.certificates.regions import bounded_region
+from qpmhe.certificates.sizes import lengths_of
 from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError
 
 from . import helpers
@@ -161,13 +162,10 @@ def test_sizes_may_be_lengths_sets_or_vectors(four):
     most = max(np.linalg.norm(w, axis=1)), max(np.linalg.norm(v, axis=1))
     for larger in (four.entering(*boxes), four.entering(*most), four.entering(boxes[0], v)):
         assert (vectors <= larger).all()
-    n = 14  # a box with too many corners is bounded by its sides
-    side, system = np.linspace(0.1, 0.2, n), qpmhe.System(
-        lambda x: 0.5 * x, lambda x: x[..., :1], n=n, p=1
-    )
-    many = bound_of(system, np.zeros((n, 1)), helpers.unit_box(n), qpmhe.Box(-side, side), 0.0)
-    least, most = (plain(side, each) for each in (many.metric, np.abs(many.metric)))
-    assert least * (1.0 - 1e-12) <= many.entering()[0] <= most * (1.0 + 1e-9)
+    # A box with too many corners is bounded by its sides.
+    side, weight = np.linspace(0.1, 0.2, 14), np.full((14, 14), -0.05) + np.eye(14)
+    found = float(lengths_of("w", qpmhe.Box(-side, side), weight))
+    assert found == pytest.approx(plain(side, np.abs(weight)), rel=1e-9)
 
 
 def test_the_systems_own_sets_come_first_and_are_named():
