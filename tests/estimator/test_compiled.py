@@ -271,21 +271,21 @@ def test_an_outage_longer_than_the_window(engine):
         assert mhe.update([5.0], [1.0]).state[0] == pytest.approx(5.0, abs=3.0)
 
 
-@pytest.mark.parametrize(("fails", "f"), [
-    (True, lambda x: [0.5 * casadi.sqrt(casadi.fabs(x[0])), 0.9 * x[1] + 0.1]),
-    (True, lambda x: [0.9 * casadi.sqrt(x[0] ** 2 + x[1] ** 2), 0.9 * x[1]]),
-    (False, lambda x: [0.9 * casadi.fabs(x[0]), 0.9 * x[1]]),
-], ids=["infinite slope", "no slope", "absolute value"])
-def test_jacobians_that_are_not_finite_at_the_start(fails, f):
-    one = case_of(system_of(f, lambda x: x[0] + x[1], n=2), [[0.1], [0.1]], [0.0, 0.0], 3)
-    for max_qps in (0, 1):
-        pair, flags = both(one, max_qps=max_qps), []
-        for sample in one.samples[:12]:
-            expected, found = (mhe.update(**sample) for mhe in pair)
-            agree(expected, found, 1e-7)  # what rounding leaves of 0 has a large root
-            flags.append(found.status)
-        assert (Status.MODEL_FAILED in flags[0]) == (fails and max_qps > 0)
-        assert Status.MODEL_FAILED not in flags[-1]
+def test_jacobians_that_are_not_finite_at_the_start():
+    for fails, f in (
+        (True, lambda x: [0.5 * casadi.sqrt(casadi.fabs(x[0])), 0.9 * x[1] + 0.1]),
+        (True, lambda x: [0.9 * casadi.sqrt(x[0] ** 2 + x[1] ** 2), 0.9 * x[1]]),
+        (False, lambda x: [0.9 * casadi.fabs(x[0]), 0.9 * x[1]]),
+    ):
+        one = case_of(system_of(f, lambda x: x[0] + x[1], n=2), [[0.1], [0.1]], [0.0, 0.0], 3)
+        for max_qps in (0, 1):
+            pair, flags = both(one, max_qps=max_qps), []
+            for sample in one.samples[:12]:
+                expected, found = (mhe.update(**sample) for mhe in pair)
+                agree(expected, found, 1e-7)  # what rounding leaves of 0 has a large root
+                flags.append(found.status)
+            assert (Status.MODEL_FAILED in flags[0]) == (fails and max_qps > 0)
+            assert Status.MODEL_FAILED not in flags[-1]
 
 
 # Sets
@@ -320,7 +320,7 @@ def estimator_in(name, kind, engine="compiled", sets=None, x_unit=1.0, y_unit=1.
 
 def test_bounds_that_are_all_but_infinite():
     costs = []
-    for far in (INF, 1e20, 1e200, 1e300):
+    for far in (INF, 1e20, 1e300):
         one, mhe = estimator_in("reactor", "open", max_qps=2, sets=(
             Box([-far, -0.05], [0.05, far]) & around([0, 0], 0.1, 0.1),
             Box(-1.2, far) & Polytope([[1.0]], [0.3]),
