@@ -72,47 +72,44 @@ FIELDS = {
 }
 
 
+RUNS = ("states", "filtered", "observer_states", "costs", "candidate_costs", "qps", "delayed")
+
+
 def compare(one, Y, U=None, *, starts=(0.5, 0.0), horizon=5, threads=None, **options):
     """Updates and a run of a batch beside single estimators, all bits; the statuses seen."""
-    members, steps = Y.shape[:2]
+    members, half, seen = len(Y), Y.shape[1] // 2, Status(0)
     batch = batch_of(one, members, starts, horizon=horizon, threads=threads, **options)
     assert batch.mode == ("compiled" if options.get("engine") == "compiled" else "looped")
-    starts, common = np.broadcast_to(starts, (members, one[0].n)), U is not None and U.ndim == 2
     singles = [
         qpmhe.MovingHorizonEstimator(*one, horizon=horizon, initial_state=start, **options)
-        for start in starts
+        for start in np.broadcast_to(starts, (members, one[0].n))
     ]
-    seen, half = Status(0), steps // 2
-    for t in range(steps):
-        us = [None] * members if U is None else [U[t]] * members if common else U[:, t]
-        expected = [mhe.update(y, u) for mhe, y, u in zip(singles, Y[:, t], us, strict=True)]
-        if t < half:
-            found = batch.update(Y[:, t], None if U is None else U[t] if common else U[:, t])
-            for several, single in FIELDS.items():
-                values = [getattr(each, single) for each in expected]
-                np.testing.assert_array_equal(getattr(found, several), values, several)
-            assert (len(found), found.time) == (members, t)
-            delayed = found.delayed
-        else:
-            if t == half:
-                run = batch.run(Y[:, t:], None if U is None else U[..., t:, :])
-            k = t - half
-            np.testing.assert_array_equal(run.states[:, k + 1], [e.state for e in expected])
-            for name in ("filtered", "cost", "candidate_cost", "qps"):
-                several = getattr(run, name if name in ("filtered", "qps") else f"{name}s")
-                np.testing.assert_array_equal(several[:, k], [getattr(e, name) for e in expected])
-            assert run.statuses[:, k].tolist() == [each.status.value for each in expected]
-            delayed = run.delayed[:, k]
+    own = None if U is None else np.broadcast_to(U, (members, *U.shape[-2:]))
+    for t in range(half):
+        found = batch.update(Y[:, t], None if U is None else U[..., t, :])
+        expected = [
+            mhe.update(Y[k, t], None if U is None else own[k, t]) for k, mhe in enumerate(singles)
+        ]
+        for several, single in FIELDS.items():
+            values = [getattr(each, single) for each in expected]
+            np.testing.assert_array_equal(getattr(found, several), values, several)
+        assert (len(found), found.time) == (members, t)
         if expected[0].delayed is None:
-            assert delayed is None or np.isnan(delayed).all()
+            assert found.delayed is None
         else:
-            np.testing.assert_array_equal(delayed, [each.delayed for each in expected])
-        for each in expected:
-            seen |= each.status
+            np.testing.assert_array_equal(found.delayed, [each.delayed for each in expected])
+    run = batch.run(Y[:, half:], None if U is None else U[..., half:, :])
+    runs = [
+        mhe.run(Y[k, half:], None if U is None else own[k, half:]) for k, mhe in enumerate(singles)
+    ]
+    for name in RUNS:
+        np.testing.assert_array_equal(getattr(run, name), [getattr(one, name) for one in runs])
+    np.testing.assert_array_equal(run.statuses, [one.flags for one in runs])
+    assert run.share(Status.IMPROVED) == (run.costs < run.candidate_costs).mean()
+    for flags in {*np.ravel(run.statuses).tolist(), *(one.status.value for one in expected)}:
+        seen |= Status(flags)
     np.testing.assert_array_equal(batch.states, [mhe.state for mhe in singles])
-    assert batch.time == steps
-    share = (run.costs < run.candidate_costs).mean()
-    assert run.share(Status.IMPROVED) == share
+    assert batch.time == Y.shape[1]
     return seen
 
 
@@ -149,7 +146,7 @@ def test_inputs_of_each_member_and_shared_ones():
     one = parts(driven, lambda x, u: x[..., :1] * (1.0 + 0.1 * u[..., :1]), m=3)
     generator = np.random.default_rng(3)
     Y, U = generator.standard_normal((3, 20, 1)), generator.standard_normal((3, 20, 3))
-    U[1, 5] = NAN
+    U[1, 15] = NAN
     for engine in ENGINES:
         for inputs in (U, U[0]):
             seen = compare(one, Y, inputs, starts=np.eye(3, 2), max_qps=2, engine=engine)
