@@ -90,12 +90,11 @@ def record(turn, steps, length=0.5):
     return np.array(y), u
 
 
-def estimator(system, observer="luenberger", start=(0.7, 0.0, 0.9), w=COVARIANCES["disturbance"],
-              **options):
+def estimator(system, observer="luenberger", w=COVARIANCES["disturbance"], **options):
     covariances = COVARIANCES | {"disturbance": w}
     return qpmhe.MovingHorizonEstimator(
         system, OBSERVERS[observer](**covariances),
-        qpmhe.QuadraticCost.from_covariances(**covariances), initial_state=list(start),
+        qpmhe.QuadraticCost.from_covariances(**covariances), initial_state=[0.7, 0.0, 0.9],
         **{"horizon": 8, "max_qps": 2} | options,
     )
 
@@ -413,6 +412,10 @@ def test_every_way_to_make_a_system_takes_angles(make):
     for expected, estimate in zip(*found, strict=True):
         np.testing.assert_allclose(estimate.state, expected.state, rtol=1e-8, atol=1e-9)
         assert estimate.cost == pytest.approx(expected.cost, rel=1e-6)
+    # Where nothing wraps, not a bit.
+    y, u = record(0.01, 20, 0.05)
+    states = [estimator(make(**more)).run(y, u / 0.5).states for more in ({}, ANGLES)]
+    np.testing.assert_array_equal(*states)
 
 
 @pytest.mark.parametrize("residuals", [ANGLES, FUNCTIONS])

@@ -57,21 +57,6 @@ def wide():
     ), [[0.1, 0.0, 0.05], [0.0, 0.1, 0.0]], [1.0, 0.5])
 
 
-def scalar(**options):
-    system = system_of(
-        lambda x: 0.9 * x + 0.2 * casadi.sin(x), lambda x: [x[0] + 0.1 * x[0] ** 2, -x[0]], n=1
-    )
-    return case_of(system, [[0.2, -0.1]], [0.7], 3, **options)
-
-
-def three():
-    def rate(x):
-        return [4.0 * (x[1] - x[0]), x[0] * (2.0 - x[2]) - x[1], x[0] * x[1] - x[2]]
-
-    system = system_of(rate, lambda x: [x[0] + x[2], x[1]], n=3, dt=0.05, method="euler")
-    return case_of(system, [[0.1, 0.0], [0.0, 0.1], [0.05, 0.0]], [1.0, 1.0, 0.5])
-
-
 def large(n):
     generator = np.random.default_rng(n)
     A = 0.9 * np.eye(n) + 0.1 * generator.standard_normal((n, n)) / math.sqrt(n)
@@ -91,7 +76,10 @@ def high_gain(method, sampling):
 
 
 MODELS = {
-    "wide": wide, "n=1": scalar, "n=3": three, "reactor": lambda: case("reactor"),
+    "wide": wide, "reactor": lambda: case("reactor"),
+    "n=1": lambda: case_of(system_of(
+        lambda x: 0.9 * x + 0.2 * casadi.sin(x), lambda x: [x[0] + 0.1 * x[0] ** 2, -x[0]], n=1
+    ), [[0.2, -0.1]], [0.7], 3),
     # Where the rows of the factorisation's panels change their padding.
     "n=23": lambda: large(23), "n=25": lambda: large(25),
     **{f"N={k}": lambda k=k: case("inputs").with_options(horizon=k) for k in (1, 2, 12)},
@@ -220,15 +208,6 @@ def logarithm():
     ), [[0.1], [0.2]], [1.0, 1.0], 5, delay=1)
 
 
-def roots():
-    def f(x):
-        upper, lower = 0.4 * casadi.sqrt(x[0]), 0.4 * casadi.sqrt(x[1])
-        return [x[0] + 0.1 * (0.4 - upper), x[1] + 0.1 * (upper - lower)]
-
-    system = system_of(f, lambda x: casadi.sqrt(x[1]), n=2)
-    return case_of(system, [[0.1], [0.2]], [1.0, 1.5], 2)
-
-
 def quotient():
     """Not finite in one output alone, for some of the inputs."""
     one = case_of(system_of(
@@ -241,7 +220,7 @@ def quotient():
     return one
 
 
-FRAGILE = {"logarithm": logarithm, "roots": roots, "quotient": quotient}
+FRAGILE = {"logarithm": logarithm, "quotient": quotient}
 
 
 @pytest.mark.parametrize("way", range(4))
@@ -292,21 +271,21 @@ def test_an_outage_longer_than_the_window(engine):
         assert mhe.update([5.0], [1.0]).state[0] == pytest.approx(5.0, abs=3.0)
 
 
-@pytest.mark.parametrize(("fails", "f"), [
-    (True, lambda x: [0.5 * casadi.sqrt(casadi.fabs(x[0])), 0.9 * x[1] + 0.1]),
-    (True, lambda x: [0.9 * casadi.sqrt(x[0] ** 2 + x[1] ** 2), 0.9 * x[1]]),
-    (False, lambda x: [0.9 * casadi.fabs(x[0]), 0.9 * x[1]]),
-], ids=["infinite slope", "no slope", "absolute value"])
-def test_jacobians_that_are_not_finite_at_the_start(fails, f):
-    one = case_of(system_of(f, lambda x: x[0] + x[1], n=2), [[0.1], [0.1]], [0.0, 0.0], 3)
-    for max_qps in (0, 1):
-        pair, flags = both(one, max_qps=max_qps), []
-        for sample in one.samples[:12]:
-            expected, found = (mhe.update(**sample) for mhe in pair)
-            agree(expected, found, 1e-7)  # what rounding leaves of 0 has a large root
-            flags.append(found.status)
-        assert (Status.MODEL_FAILED in flags[0]) == (fails and max_qps > 0)
-        assert Status.MODEL_FAILED not in flags[-1]
+def test_jacobians_that_are_not_finite_at_the_start():
+    for fails, f in (
+        (True, lambda x: [0.5 * casadi.sqrt(casadi.fabs(x[0])), 0.9 * x[1] + 0.1]),
+        (True, lambda x: [0.9 * casadi.sqrt(x[0] ** 2 + x[1] ** 2), 0.9 * x[1]]),
+        (False, lambda x: [0.9 * casadi.fabs(x[0]), 0.9 * x[1]]),
+    ):
+        one = case_of(system_of(f, lambda x: x[0] + x[1], n=2), [[0.1], [0.1]], [0.0, 0.0], 3)
+        for max_qps in (0, 1):
+            pair, flags = both(one, max_qps=max_qps), []
+            for sample in one.samples[:12]:
+                expected, found = (mhe.update(**sample) for mhe in pair)
+                agree(expected, found, 1e-7)  # what rounding leaves of 0 has a large root
+                flags.append(found.status)
+            assert (Status.MODEL_FAILED in flags[0]) == (fails and max_qps > 0)
+            assert Status.MODEL_FAILED not in flags[-1]
 
 
 # Sets
@@ -341,7 +320,7 @@ def estimator_in(name, kind, engine="compiled", sets=None, x_unit=1.0, y_unit=1.
 
 def test_bounds_that_are_all_but_infinite():
     costs = []
-    for far in (INF, 1e20, 1e200, 1e300):
+    for far in (INF, 1e20, 1e300):
         one, mhe = estimator_in("reactor", "open", max_qps=2, sets=(
             Box([-far, -0.05], [0.05, far]) & around([0, 0], 0.1, 0.1),
             Box(-1.2, far) & Polytope([[1.0]], [0.3]),
