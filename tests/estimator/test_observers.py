@@ -329,7 +329,11 @@ def test_kalman_type_observers_that_do_not_fit():
     check(OptionError, text, UnscentedKalman, **right, spread=0.0)
     steady = SteadyStateKalman(plant.system, plant.start, **right)
     text = ["for 3 states and 2 outputs; expected 2 and 1"]
-    check(ShapeError, text, estimator, oscillator(), steady, np.zeros(2))
+    for prior in (np.eye(2), qpmhe.ObserverPrior()):
+        check(
+            ShapeError, text, qpmhe.MovingHorizonEstimator, oscillator(), steady,
+            cost_of(prior=prior), horizon=3, initial_state=np.zeros(2),
+        )
 
 
 # The high-gain observer
