@@ -250,8 +250,12 @@ def test_what_does_not_fit_the_matrix():
     text = ["disturbance_weight", "singular", "disturbance_matrix"]
     check(OptionError, text, mhe.update, 0.1, disturbance_weight=np.eye(3))
     assert mhe.time == 0
-    state = estimator(system(2.0 * G)).state_dict()
-    check(InvalidInputError, ["disturbance_matrix"], estimator().load_state_dict, state)
+    one, other = estimator(observer=kalman()), estimator(observer=kalman())
+    one.run(Y)
+    other.load_state_dict(one.state_dict())
+    np.testing.assert_array_equal(other.run(Y).states, one.run(Y).states)
+    other = estimator(system(2.0 * G), kalman())
+    check(InvalidInputError, ["disturbance_matrix"], other.load_state_dict, one.state_dict())
     walk = qpmhe.System(lambda x: x, lambda x: x, n=2, p=2)
     noises = {"disturbance": np.diag([1.0, 0.0]), "noise": np.eye(2)}
     text = ["eigenvalue 1", "small variance"]

@@ -137,18 +137,18 @@ def plain_gated(z, Y, sensors, reopen):
     return np.array(states), np.array(rejected)
 
 
-@pytest.mark.parametrize("groups", [None, [[0, 1]], [[3, 1], [0, 2]], [[0, 1, 2]]])
-def test_the_gated_filter_is_the_plain_one(groups):
-    gate = qpmhe.Gate(reopen=2, groups=groups)
-    mhe = estimator(pendulum(), watching(gate), START)
-    for seed, start in ((0, START), (1, FAR), (2, FAR)):
-        Y = disturbed(seed)
-        states, rejected = plain_gated(start, Y, gate.sensors(4), 2)
-        mhe.reset(start)
-        run = mhe.run(Y)
-        np.testing.assert_array_equal(run.rejected_sensors, rejected)
-        np.testing.assert_allclose(run.observer_states, states, rtol=1e-7, atol=1e-7)
-        assert rejected.any()
+def test_the_gated_filter_is_the_plain_one():
+    for groups in (None, [[0, 1]], [[3, 1], [0, 2]], [[0, 1, 2]]):
+        gate = qpmhe.Gate(reopen=2, groups=groups)
+        mhe = estimator(pendulum(), watching(gate), START)
+        for seed, start in ((0, START), (1, FAR), (2, FAR)):
+            Y = disturbed(seed)
+            states, rejected = plain_gated(start, Y, gate.sensors(4), 2)
+            mhe.reset(start)
+            run = mhe.run(Y)
+            np.testing.assert_array_equal(run.rejected_sensors, rejected)
+            np.testing.assert_allclose(run.observer_states, states, rtol=1e-7, atol=1e-7)
+            assert rejected.any()
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
@@ -190,6 +190,19 @@ def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make, reop
     assert errors[reopen + 1] < 15.0
     assert errors[reopen + 40 :].max() < 0.5
     assert shut[reopen + 40 :].mean() < 0.05
+
+
+def test_sensors_that_pass_keep_a_faulty_one_shut():
+    """At most ten times as long; and not where they are in the minority."""
+    for outputs, faulty, shut in ((2, 1, 30), (3, 2, 3)):
+        system = qpmhe.System(lambda x: A @ x, lambda x, p=outputs: x[:1].repeat(p), n=2, p=outputs)
+        covariances = {"prior": 0.01 * np.eye(2), "disturbance": np.diag([1e-6, 1e-4])}
+        observer = watching(qpmhe.Gate(reopen=3), **covariances, noise=0.01 * np.eye(outputs))
+        Y = 0.1 * np.random.default_rng(5).standard_normal((75, outputs))
+        Y[40:, :faulty] += 20.0
+        run = estimator(system, observer, [0.0, 0.0]).run(Y)
+        assert np.flatnonzero(~run.rejected_sensors[40:, 0])[0] == shut
+        assert np.abs(run.observer_states[: 41 + shut, 0]).max() < 0.3
 
 
 @pytest.mark.parametrize("make", FILTERS)

@@ -154,20 +154,19 @@ def test_one_observer_serves_several_estimators():
         prior[...] = plant.P
 
 
-@pytest.mark.parametrize(("n", "p", "radius"), [(1, 1, 1.2), (2, 1, 0.7), (4, 3, 1.0)])
-def test_the_steady_gain_is_the_limit_of_the_extended_kalman_observer(n, p, radius):
-    plant = Plant(n, n, p, radius)
-    steady = SteadyStateKalman(plant.system, plant.start, **plant.covariances)
-    moving, P = ExtendedKalman(prior=plant.P, **plant.covariances), plant.P
-    for _ in range(400):
-        _, P = moving.correct(plant.start, np.zeros(p), plant.sample(P))
-    gain = [moving.correct(plant.start, v, plant.sample(P))[0] for v in np.eye(p)]
-    np.testing.assert_allclose(steady.gain, np.transpose(gain), rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(steady.covariance, P, rtol=1e-8)
-    assert steady.kappa == pytest.approx(np.linalg.svd(steady.gain)[1][0])
-    np.testing.assert_array_equal(
-        steady.gain, design_luenberger(plant.system, plant.start, **plant.covariances).gain
-    )
+def test_the_steady_gain_is_the_limit_of_the_extended_kalman_observer():
+    for n, p, radius in ((1, 1, 1.2), (2, 1, 0.7), (4, 3, 1.0)):
+        plant = Plant(n, n, p, radius)
+        steady = SteadyStateKalman(plant.system, plant.start, **plant.covariances)
+        moving, P = ExtendedKalman(prior=plant.P, **plant.covariances), plant.P
+        for _ in range(400):
+            _, P = moving.correct(plant.start, np.zeros(p), plant.sample(P))
+        gain = [moving.correct(plant.start, v, plant.sample(P))[0] for v in np.eye(p)]
+        np.testing.assert_allclose(steady.gain, np.transpose(gain), rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(steady.covariance, P, rtol=1e-8)
+        assert steady.kappa == pytest.approx(np.linalg.svd(steady.gain)[1][0])
+        designed = design_luenberger(plant.system, plant.start, **plant.covariances)
+        np.testing.assert_array_equal(steady.gain, designed.gain)
 
 
 def test_unscented_moments():
@@ -330,7 +329,11 @@ def test_kalman_type_observers_that_do_not_fit():
     check(OptionError, text, UnscentedKalman, **right, spread=0.0)
     steady = SteadyStateKalman(plant.system, plant.start, **right)
     text = ["for 3 states and 2 outputs; expected 2 and 1"]
-    check(ShapeError, text, estimator, oscillator(), steady, np.zeros(2))
+    for prior in (np.eye(2), qpmhe.ObserverPrior()):
+        check(
+            ShapeError, text, qpmhe.MovingHorizonEstimator, oscillator(), steady,
+            cost_of(prior=prior), horizon=3, initial_state=np.zeros(2),
+        )
 
 
 # The high-gain observer
