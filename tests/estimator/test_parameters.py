@@ -159,11 +159,13 @@ def test_joint_functions_put_parameters_where_they_belong(estimated, order):
     generator, nominal = np.random.default_rng(1), np.array([0.5, 1.5, 2.5])
     own = nominal.copy()
     system = augment_parameters(
-        driven, scaled, n=2, p=1, m=1, nominal=own, estimated=estimated
+        driven, scaled, n=2, p=1, m=1, nominal=own, estimated=estimated, noises=Box(-1.0, 1.0),
+        states=Box([-9.0, -9.0], [9.0, 8.0]),
     )
     own[:] = np.nan  # the system has taken a copy, and pickles
     system = pickle.loads(pickle.dumps(system))
     assert (system.n, system.m) == (2 + len(order), 1)
+    assert system.states.upper.tolist() == [9.0, 8.0] + [np.inf] * len(order)
     z, u = generator.uniform(0.5, 1.5, (7, system.n)), generator.normal(size=(7, 1))
     theta = np.tile(nominal, (7, 1))
     theta[:, order] = z[:, 2:]
@@ -311,6 +313,7 @@ WRONG = [
     ({"parameter_bounds": Box([0.0], [9.0]), "estimated": []}, "SetError",
      "parameter_bounds was given, but no parameter is estimated"),
     ({"f": lambda x: x}, "ModelError", r"cannot be called as f\(x, theta\).*no inputs"),
+    ({"f": 3.0}, "ModelError", "f is 3.0; expected a function"),
     ({"m": 1}, "ModelError", r"f\(x, theta\) cannot be called as f\(x, u, theta\).*1 inputs"),
     ({"h": lambda x, theta: x}, "ModelError", r"h returned shape \(2,\).*expected \(1,\)"),
     ({"f": careless}, "ModelError", "changes its argument in place"),
