@@ -18,7 +18,7 @@ from qpmhe import (
 )
 from qpmhe_solvers import backend
 
-from .plain import euler, rk4
+from .plain import rk4
 
 DT = 0.1
 TRUE = np.array([3.0, 0.8])  # stiffness and damping
@@ -159,11 +159,13 @@ def test_joint_functions_put_parameters_where_they_belong(estimated, order):
     generator, nominal = np.random.default_rng(1), np.array([0.5, 1.5, 2.5])
     own = nominal.copy()
     system = augment_parameters(
-        driven, scaled, n=2, p=1, m=1, nominal=own, estimated=estimated
+        driven, scaled, n=2, p=1, m=1, nominal=own, estimated=estimated, noises=Box(-1.0, 1.0),
+        states=Box([-9.0, -9.0], [9.0, 8.0]),
     )
     own[:] = np.nan  # the system has taken a copy, and pickles
     system = pickle.loads(pickle.dumps(system))
     assert (system.n, system.m) == (2 + len(order), 1)
+    assert system.states.upper.tolist() == [9.0, 8.0] + [np.inf] * len(order)
     z, u = generator.uniform(0.5, 1.5, (7, system.n)), generator.normal(size=(7, 1))
     theta = np.tile(nominal, (7, 1))
     theta[:, order] = z[:, 2:]
@@ -232,30 +234,25 @@ def test_sets_are_products(states, bounds):
     assert system.noises.upper == 1.0
 
 
-@pytest.mark.parametrize(("method", "step"), [(None, rk4), ("euler", euler)])
-@pytest.mark.parametrize("m", [0, 1])
-def test_a_rate_is_discretised(m, method, step):
-    f, h = (spring_rate, position) if m == 0 else (driven_rate, lambda x, u, theta: x[0])
-    system = augment_parameters(
-        f, h, n=2, p=1, m=m, nominal=NOMINAL, estimated=[0], dt=DT, method=method
-    )
+@pytest.mark.parametrize("method", [None, "euler"])
+def test_a_rate_is_discretised(method):
+    options = {"n": 2, "p": 1, "dt": DT, "method": method}
+    system = augment_parameters(spring_rate, position, nominal=NOMINAL, estimated=[0], **options)
+
+    def joint(z):
+        theta = np.stack((z[..., 2], 0.8 + 0.0 * z[..., 2]), axis=-1)
+        return np.concatenate((spring_rate(z, theta), 0.0 * z[..., 2:]), axis=-1)
+
+    options = {k: v for k, v in (options | {"n": 3}).items() if v is not None}
+    expected, nothing = qpmhe.System.from_ode(joint, lambda z: z[..., 0], **options), np.zeros(0)
     assert (system.dt, system.f_jacobian.method) == (DT, "complex step")
-    generator = np.random.default_rng(4)
-    z, u = generator.normal(size=(6, 3)), generator.normal(size=(6, m))
-
-    def following(z, u, dt):
-        theta = np.array([z[2], NOMINAL[1]])
-        rate = (lambda x, u: f(x, theta)) if m == 0 else (lambda x, u: f(x, u, theta))
-        return np.append(step(rate)(z[:2], u, dt), z[2])
-
-    for zi, ui in zip(z, u, strict=True):
-        found = system.timed.f(zi, np.append(ui, 0.25))
-        np.testing.assert_allclose(found, following(zi, ui, 0.25), rtol=1e-14)
-        slope = [following(zi + 1e-30j * unit, ui, DT).imag / 1e-30 for unit in np.eye(3)]
-        np.testing.assert_allclose(system.f_jacobian(zi, ui).T, slope, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(
-        system.f.batch(z, u), [following(*pair, DT) for pair in zip(z, u, strict=True)], rtol=1e-14
-    )
+    for z in np.random.default_rng(4).normal(size=(6, 3)):
+        np.testing.assert_allclose(system.f(z, nothing), expected.f(z, nothing), rtol=1e-14)
+        for dt in (np.array([0.25]), np.array([0.1])):
+            np.testing.assert_allclose(system.timed.f(z, dt), expected.timed.f(z, dt), rtol=1e-14)
+        np.testing.assert_allclose(
+            system.f_jacobian(z, nothing), expected.f_jacobian(z, nothing), rtol=1e-12, atol=1e-15
+        )
 
 
 def test_parameters_that_drift_are_followed():
@@ -316,6 +313,7 @@ WRONG = [
     ({"parameter_bounds": Box([0.0], [9.0]), "estimated": []}, "SetError",
      "parameter_bounds was given, but no parameter is estimated"),
     ({"f": lambda x: x}, "ModelError", r"cannot be called as f\(x, theta\).*no inputs"),
+    ({"f": 3.0}, "ModelError", "f is 3.0; expected a function"),
     ({"m": 1}, "ModelError", r"f\(x, theta\) cannot be called as f\(x, u, theta\).*1 inputs"),
     ({"h": lambda x, theta: x}, "ModelError", r"h returned shape \(2,\).*expected \(1,\)"),
     ({"f": careless}, "ModelError", "changes its argument in place"),

@@ -63,12 +63,12 @@ def random_system(generator, way, sets):
     return qpmhe.System.from_ode(rate, h, dt=DT, **options)
 
 
-def random_cost(generator, system):
+def random_cost(generator, system, robust=False):
     weights = {
         "prior": spd(generator, system.n), "disturbance": 9.0 * spd(generator, system.n),
         "noise": spd(generator, system.p), "discount": generator.choice([1.0, 0.9]),
     }
-    if generator.random() < 0.3:
+    if robust:
         return qpmhe.RobustCost(**weights | {"noise": qpmhe.Huber(weights["noise"])})
     return qpmhe.QuadraticCost(**weights)
 
@@ -134,7 +134,7 @@ def assert_close(mhe, estimate, expected):
 def test_the_candidate_is_that_of_a_replay(way, sets, seed):
     generator, failing = np.random.default_rng(seed), " " in way
     system = failing_system(way) if failing else random_system(generator, way, sets)
-    cost, start = random_cost(generator, system), np.full(system.n, float(failing))
+    cost, start = random_cost(generator, system, seed == 1), np.full(system.n, float(failing))
     gain = 0.3 * np.linalg.pinv(system.h_jacobian(start, np.zeros(system.m)))
     if failing:
         gain, cost = [[0.5]], qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=0.3)

@@ -85,6 +85,8 @@ def test_scales_that_the_user_gave():
     ):
         with pytest.raises(error, match="scales"):
             qpmhe.System(lambda x: x, lambda x: x, n=2, p=2, scales=scales)
+        with pytest.raises(error, match="scales"):
+            qpmhe.System.from_ode(lambda x: x, lambda x: x, dt=0.1, n=2, p=2, scales=scales)
 
 
 @pytest.mark.parametrize("real", [False, True], ids=["complex step", "differences"])

@@ -1,10 +1,9 @@
-"""Boxes, polytopes and intersections, and the same estimates however a set is written."""
+"""Boxes, polytopes and intersections."""
 
 import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe import Status
 from qpmhe.errors import SetError
 
 
@@ -114,65 +113,3 @@ def test_inequalities_on_unknown_components_do_not_count():
         assert one.violation(point, np.array(known, bool)) == expected
     rows = one.touched(np.array([[True, False, False], [False, False, True], [False] * 3]))
     np.testing.assert_array_equal(rows, [[1, 0, 1], [0, 1, 1], [0, 0, 0]])
-
-
-# The estimator
-
-C = np.array([[1.0, 0.2], [0.4, -1.0], [-0.6, 0.5]])
-MEASURED = np.clip(0.7 * np.random.default_rng(3).standard_normal((12, 3)), -1.1, 1.1)
-BOUNDS = {
-    "states": ([-0.2, -0.2], [0.2, 0.15]),
-    "disturbances": ([-0.1, -0.1], [0.1, 0.1]),
-    "noises": ([-0.9, -0.8, -0.66], [0.8, 0.7, 0.9]),
-}
-
-
-def estimator(sets, backend="auto", **options):
-    system = qpmhe.System(
-        lambda x: np.stack(
-            [x[..., 0] + 0.2 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
-        ),
-        lambda x: x @ C.T + 0.1 * x[..., :1] ** 2, n=2, p=3, **sets,
-    )
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=2.0 * np.eye(2), noise=np.eye(3))
-    return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(0.03 * C.T), cost, backend=backend, horizon=4,
-        initial_state=[0.1, -0.1], max_qps=8, solver_tolerance=1e-9, **options,
-    )
-
-
-@pytest.mark.parametrize("name", BOUNDS)
-@pytest.mark.parametrize(
-    "backend", [n for n in qpmhe.solvers.available() if qpmhe.solvers.backend(n).inequalities]
-)
-def test_a_box_written_as_rows_gives_the_same_estimates(backend, name):
-    lower, upper = BOUNDS[name]
-    identity = np.eye(len(lower))
-    rows = qpmhe.Polytope(np.vstack([identity, -identity]), [*upper, *(-s for s in lower)])
-    boxed, other = estimator({name: qpmhe.Box(lower, upper)}), estimator({name: rows}, backend)
-    free, binding = estimator({}), 0
-    for y in MEASURED[:8]:
-        one, two = boxed.update(y), other.update(y)
-        assert one.dropped == two.dropped == ()
-        assert two.cost == pytest.approx(one.cost, rel=2e-4)
-        np.testing.assert_allclose(two.trajectory, one.trajectory, atol=3e-3)
-        assert two.cost <= two.candidate_cost
-        binding += one.cost > free.update(y).cost * (1 + 1e-6)
-    assert binding >= 2
-
-
-@pytest.mark.parametrize("project", [True, False])
-@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
-def test_an_observer_that_leaves_a_polytope(infeasible, project):
-    sets = {"states": qpmhe.Polytope([[1.0, -1.0]], [0.5])}
-    mhe = estimator(sets, infeasible=infeasible, project_observer=project)
-    ys, seen = MEASURED.copy(), Status(0)
-    ys[4] = 30.0 * C @ [1.0, -1.0]
-    for y in ys:
-        estimate = mhe.update(y)
-        seen |= estimate.status
-        assert estimate.cost <= estimate.candidate_cost
-        inside = (estimate.trajectory @ [1.0, -1.0]).max() <= 0.5 + 1e-8
-        assert inside or estimate.dropped or not (project or estimate.improved)
-    assert (Status.OBSERVER_PROJECTED in seen) is (Status.CANDIDATE_OUTSIDE not in seen) is project
-    assert infeasible == "drop_rows" or Status.ROWS_DROPPED not in seen

@@ -96,27 +96,6 @@ def test_what_is_never_touched_changes_nothing(given):
         np.testing.assert_allclose(other.trajectory, expected.trajectory, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["states", "disturbances", "noises", "constraints"])
-def test_a_large_linear_penalty_is_exact(name):
-    hard = {
-        "states": Box([-np.inf, -np.inf], [1.5, 0.8]),
-        "disturbances": Box([-0.04, -0.05], [0.03, 0.05]),
-        "noises": Box([-0.3, -0.3], [0.25, 0.3]),
-        "constraints": [Constraint(ball)],
-    }[name]
-    soft = [Constraint(ball, linear=1e4)] if name == "constraints" else hard.soften(linear=1e4)
-    compared = 0
-    for one, other in zip(
-        estimates({name: hard}, project_observer=False), estimates({name: soft}), strict=True
-    ):
-        if one.improved and not one.dropped:
-            compared += 1
-            # What is hard may be missed by rounding, which a penalty of 1e4 sees.
-            assert other.cost == pytest.approx(one.cost, rel=1e-4)
-            np.testing.assert_allclose(other.trajectory, one.trajectory, atol=1e-4)
-    assert compared >= 15
-
-
 @pytest.mark.parametrize("seed", [10, 19])
 def test_a_large_linear_penalty_of_a_ball_is_exact_from_its_centre(seed):
     a = np.array([[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.1, 0.9]])
@@ -213,7 +192,8 @@ def test_a_constraint_that_fails_far_from_the_data_never_escapes(bad, penalty):
 
 @pytest.mark.parametrize("options", [HARD, SOFT])
 def test_a_snapshot_continues_bit_for_bit(options):
-    ys, first, second = record(), make(options), make(options)
+    ys = record(18)
+    first, second = (make(options, max_qps=3) for _ in range(2))
     for y in ys[:11]:
         first.update(y)
     third = pickle.loads(pickle.dumps(first))

@@ -110,20 +110,6 @@ def test_what_is_no_object_or_has_no_options_is_refused():
         )
 
 
-def test_an_object_that_raises_is_contained():
-    class Raising(Counting):
-        def _solve(self, qp, start):
-            raise RuntimeError("not today")
-
-        shift = forget = prepare = _solve
-
-    mhe = estimator(backend=Raising())
-    for _ in range(5):
-        estimate = mhe.update([1.0])
-        assert estimate.cost <= estimate.candidate_cost
-    assert "not today" in estimate.message
-
-
 def test_a_solver_starts_afresh_when_it_passes_to_another_estimator():
     solver = Counting()
     one, other = estimator(backend=solver, horizon=1), estimator(backend=solver, horizon=1)

@@ -126,7 +126,7 @@ def test_a_casadi_model_is_called_twice_in_a_step():
 
 def test_memory_is_in_proportion_to_the_horizon():
     taken = []
-    for horizon in (50, 100, 400):  # the first only for what is imported late
+    for horizon in (50, 75, 300):  # the first only for what is imported late
         tracemalloc.start()
         mhe = estimator(horizon=horizon)
         for k in range(horizon + 20):

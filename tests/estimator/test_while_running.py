@@ -148,6 +148,9 @@ def test_what_was_not_sampled_is_missing_but_for_the_status():
         if t % 5 == 4:  # a late measurement of a sensor that was not sampled then
             late = np.array([np.nan, 0.3, np.nan])
             assert_same(mhe.amend(t - 1, late), twin.amend(t - 1, late), ignoring=Status.MISSING)
+    # A list of numbers that equals a mask is no mask.
+    with pytest.raises(InvalidInputError, match="at most once"):
+        mhe.update([0.1], u, sensors=[0, 1, 0])
 
 
 @every
