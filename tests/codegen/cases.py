@@ -70,7 +70,7 @@ class Case:
         return replace(self, options=self.options | options)
 
 
-Change = Callable[[Case], Case] | Options
+Table = dict[str, tuple[Any, ...]]
 
 
 def gaps(one: Case) -> Case:
@@ -602,9 +602,9 @@ def by(observer: Callable[[Case], qpmhe.Observer]) -> Callable[[Case], Case]:
     return lambda one: replace(one, observer=observer(one))
 
 
-#: Each case is made when it is asked for, and kept by `case`: what it is made of, by a function or
-#: the name of another case, and its changes: functions, or options.
-CASES: dict[str, tuple[Any, ...]] = {
+# Each case is made when it is asked for, and kept by `case`: what it is made of, by a function or
+# the name of another case, and its changes: functions, or options.
+USUAL: Table = {
     "reactor": (_reactor,),
     "reactor with gaps": ("reactor", gaps),
     "reactor reinitialized": ("reactor", AGAIN, WARM),
@@ -623,6 +623,8 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda: _plain(_rate, lambda x: x[:2], 4, 2, 3, dt=0.2, method="rk4"), AGAIN, gaps,
     ),
     "matrix expressions": (lambda: _plain(_spline, lambda x: x[0] + 0.1 * x[1] ** 2, 2, 1), gaps),
+}
+ANGLES: Table = {
     "angles of outputs": (lambda: _rover(states=False), WARM),
     "angles of states": (lambda: _rover(outputs=False), gaps, AGAIN),
     "angles of both": (_rover, gaps),
@@ -652,6 +654,8 @@ CASES: dict[str, tuple[Any, ...]] = {
             **ROVER, noises=Polytope([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]], [20.0, 0.2])
         ), MANY,
     ),
+}
+DIRECTIONS: Table = {
     "fewer disturbances": (_fewer,),
     "fewer disturbances observer": (_fewer, ALONE),
     "fewer disturbances out of range": (lambda: _fewer(OTHER_GAIN), gaps, WARM),
@@ -668,6 +672,8 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda: _fewer(OTHER_GAIN, disturbances=Box([0.01, -np.inf], [0.01, np.inf])), MANY,
     ),
     "singular covariance": (_singular, gaps),
+}
+HELD: Table = {
     "held": (_held,),
     "held with gaps": ("held", gaps, with_changes),
     "held observer": ("held", ALONE),
@@ -687,9 +693,13 @@ CASES: dict[str, tuple[Any, ...]] = {
         prior=huber(0.5)(prior), disturbance=disturbance, noise=geman(per_component=True)(noise),
         discount=0.9,
     )), outliers, WARM),
+}
+MANY_STATES: Table = {
     "many states": (lambda: _many_states(False),),
     "many states, dense": (lambda: _many_states(True),),
     "many states with gaps": ("many states", gaps),
+}
+LOSSES: Table = {
     "huber": (lambda: _robust(noise=huber(1.345)),),
     "huber with gaps": ("huber", gaps, weighed),
     "huber in sets": ("huber", BOXED),
@@ -747,6 +757,8 @@ CASES: dict[str, tuple[Any, ...]] = {
             ),
         ), gaps,
     ),
+}
+STATES: Table = {
     "states in a box": (lambda: _reaction_in(POSITIVE),),
     "states in a box observer": ("states in a box", ALONE),
     "states in a box reinitialized": ("states in a box", AGAIN, WARM),
@@ -783,6 +795,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "unscented in states observer": (lambda: _kalman_in(WEDGE, UnscentedKalman), ALONE, AGAIN),
     "steady in states": (lambda: _kalman_in(WEDGE, SteadyStateKalman, np.eye(2)), gaps),
     "steady in states observer": ("steady in states", ALONE),
+}
+EQUATIONS: Table = {
     "noise-free": (
         lambda: _inputs_in(disturbances=Box([-0.05, 0.01, -0.05], [0.05, 0.01, 0.05])),
     ),
@@ -805,6 +819,8 @@ CASES: dict[str, tuple[Any, ...]] = {
         disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
     ),),
     "noise-free conditions": ("noise-free in states", conditions),
+}
+CONDITIONS: Table = {
     # Bounds on one side and on both, and an observer that leaves them.
     "inputs and states": (
         lambda: _inputs_in(states=Box([0.0, -np.inf, -0.2], [0.6, 0.4, np.inf])),
@@ -827,6 +843,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "tank observer": ("tank", gaps, conditions, ALONE),
     "tank kept": ("tank", conditions, {"infeasible": "keep_candidate"}, WARM),
     "tank in time": ("tank conditions", {"time_budget": 1e6}),
+}
+OBSERVERS: Table = {
     "smoothed": ("inputs", SMOOTH, {"horizon": 4}),
     "smoothed with gaps": ("smoothed", gaps, AGAIN),
     "smoothed changes": ("smoothed", with_changes),
@@ -862,6 +880,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "steady prior": (_steady,),
     "steady prior with gaps": (_steady, gaps, weighed),
     "steady conditions": (_steady, gaps, conditions),
+}
+INNOVATIONS: Table = {
     "gated": ("inputs", doubtful(Gate(reopen=3))),
     "gated prior": (lambda: _observed(ExtendedKalman), doubtful(Gate(0.95, reopen=2)), gaps),
     "gated group": (
@@ -898,6 +918,8 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda: _observed(UnscentedKalman), doubtful(HuberInnovation(reopen=2), UnscentedKalman),
         gaps, conditions,
     ),
+}
+INJECTIONS: Table = {
     "injection": ("inputs", by(lambda one: qpmhe.OutputInjection(_saturated)), gaps),
     "injection reinitialized": ("injection", with_conditions, AGAIN, WARM, with_changes),
     "injection in sets": ("inputs and states", by(
@@ -907,9 +929,17 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda z, v: np.array([0.4 * v[0] / np.sqrt(z[0]), 0.0])
     ), np.eye(2))),
 }
+#: Of each, there is a case in every sample.
+FEATURES = {
+    "usual": USUAL, "angles": ANGLES, "directions": DIRECTIONS, "held": HELD,
+    "many_states": MANY_STATES, "losses": LOSSES, "states": STATES, "equations": EQUATIONS,
+    "conditions": CONDITIONS, "observers": OBSERVERS, "innovations": INNOVATIONS,
+    "injections": INJECTIONS,
+}
+CASES = {name: made for table in FEATURES.values() for name, made in table.items()}
 
 #: In which rounding decides on trajectories, so that nothing but the promise holds.
-ROUNDED: dict[str, tuple[Any, ...]] = {
+ROUNDED: Table = {
     "failed stage": (_underflowing,),
     "more outputs than states": (
         lambda: _plain(
