@@ -407,14 +407,12 @@ def _turned_states(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _rover(
-    outputs: bool = True, states: bool = True, functions: bool = False, observer: Any = None,
-    **sets: Any,
+    outputs: bool = True, states: bool = True, functions: bool = False, **sets: Any
 ) -> Case:
     """A turning rover with a compass that sees distance and bearing of a beacon.
 
     Where states have angles, f keeps the heading in one turn. Where outputs have none, they are
-    smooth functions of both. The angles may be stated by functions of two vectors. An observer with
-    a covariance weighs the prior.
+    smooth functions of both. The angles may be stated by functions of two vectors.
     """
 
     def f(x: Any) -> Any:
@@ -446,8 +444,7 @@ def _rover(
         "noise": [0.2, 0.1 * unit, 0.1],
     }
     covariances = {name: np.diag(np.square(one)) for name, one in deviations.items()}
-    weighs = {} if observer is None else {"prior": ObserverPrior()}
-    cost = QuadraticCost.from_covariances(**(covariances | weighs))
+    cost = QuadraticCost.from_covariances(**covariances)
     generator, x, samples = np.random.default_rng(4), np.array([0.3, -0.2, 0.5, 1.7]), []
     for _ in range(3 * STEPS):
         y = system.h(x, np.zeros(0)) + generator.normal(0.0, deviations["noise"])
@@ -457,9 +454,8 @@ def _rover(
         x = system.f(x, np.zeros(0)) + generator.normal(0.0, deviations["disturbance"])
     turning = [[0.0, -0.2 / unit, 0.4], [0.0, 0.0, 0.1]] if outputs else np.zeros((2, 3))
     gain = [[0.2, 0.0, 0.0], [0.0, 0.0, 0.0], *turning]
-    filters = Luenberger(gain) if observer is None else observer(**covariances)
     start, options = np.array([0.0, 0.0, 0.9, 1.6]), {"horizon": 6, "max_qps": 3}
-    return Case(system, filters, cost, start, tuple(samples), options)
+    return Case(system, Luenberger(gain), cost, start, tuple(samples), options)
 
 
 def _compass(functions: bool = False) -> Case:
@@ -630,14 +626,10 @@ ANGLES: Table = {
     "angles of both": (_rover, gaps),
     "angles, conditions": ("angles of both", conditions),
     "residual functions": (lambda: _rover(functions=True), gaps, WARM),
-    "angles extended": (lambda: _rover(observer=ExtendedKalman), gaps),
-    "angles smoothed": (lambda: _rover(observer=ExtendedKalman), SMOOTH),
+    "angles extended": (_rover, gaps, filtered_by(ExtendedKalman)),
+    "angles smoothed": (_rover, filtered_by(ExtendedKalman), SMOOTH),
     "functions unscented": (
-        lambda: _rover(functions=True, observer=UnscentedKalman), gaps, SMOOTH, WARM,
-    ),
-    "extended angles": (_rover, gaps, filtered_by(ExtendedKalman)),
-    "unscented angles": (
-        lambda: _rover(functions=True), gaps, filtered_by(UnscentedKalman), SMOOTH,
+        lambda: _rover(functions=True), gaps, filtered_by(UnscentedKalman), SMOOTH, WARM,
     ),
     "unscented with angles": (_rover, by(lambda one: UnscentedKalman(
         prior=np.diag([0.5, 0.5, 0.4, 0.1]) ** 2, noise=np.diag([0.2, 5.73, 0.1]) ** 2,
