@@ -70,7 +70,7 @@ class Case:
         return replace(self, options=self.options | options)
 
 
-Change = Callable[[Case], Case] | Options
+Table = dict[str, tuple[Any, ...]]
 
 
 def gaps(one: Case) -> Case:
@@ -407,14 +407,12 @@ def _turned_states(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _rover(
-    outputs: bool = True, states: bool = True, functions: bool = False, observer: Any = None,
-    **sets: Any,
+    outputs: bool = True, states: bool = True, functions: bool = False, **sets: Any
 ) -> Case:
     """A turning rover with a compass that sees distance and bearing of a beacon.
 
     Where states have angles, f keeps the heading in one turn. Where outputs have none, they are
-    smooth functions of both. The angles may be stated by functions of two vectors. An observer with
-    a covariance weighs the prior.
+    smooth functions of both. The angles may be stated by functions of two vectors.
     """
 
     def f(x: Any) -> Any:
@@ -446,8 +444,7 @@ def _rover(
         "noise": [0.2, 0.1 * unit, 0.1],
     }
     covariances = {name: np.diag(np.square(one)) for name, one in deviations.items()}
-    weighs = {} if observer is None else {"prior": ObserverPrior()}
-    cost = QuadraticCost.from_covariances(**(covariances | weighs))
+    cost = QuadraticCost.from_covariances(**covariances)
     generator, x, samples = np.random.default_rng(4), np.array([0.3, -0.2, 0.5, 1.7]), []
     for _ in range(3 * STEPS):
         y = system.h(x, np.zeros(0)) + generator.normal(0.0, deviations["noise"])
@@ -457,9 +454,8 @@ def _rover(
         x = system.f(x, np.zeros(0)) + generator.normal(0.0, deviations["disturbance"])
     turning = [[0.0, -0.2 / unit, 0.4], [0.0, 0.0, 0.1]] if outputs else np.zeros((2, 3))
     gain = [[0.2, 0.0, 0.0], [0.0, 0.0, 0.0], *turning]
-    filters = Luenberger(gain) if observer is None else observer(**covariances)
     start, options = np.array([0.0, 0.0, 0.9, 1.6]), {"horizon": 6, "max_qps": 3}
-    return Case(system, filters, cost, start, tuple(samples), options)
+    return Case(system, Luenberger(gain), cost, start, tuple(samples), options)
 
 
 def _compass(functions: bool = False) -> Case:
@@ -602,9 +598,9 @@ def by(observer: Callable[[Case], qpmhe.Observer]) -> Callable[[Case], Case]:
     return lambda one: replace(one, observer=observer(one))
 
 
-#: Each case is made when it is asked for, and kept by `case`: what it is made of, by a function or
-#: the name of another case, and its changes: functions, or options.
-CASES: dict[str, tuple[Any, ...]] = {
+# Each case is made when it is asked for, and kept by `case`: what it is made of, by a function or
+# the name of another case, and its changes: functions, or options.
+USUAL: Table = {
     "reactor": (_reactor,),
     "reactor with gaps": ("reactor", gaps),
     "reactor reinitialized": ("reactor", AGAIN, WARM),
@@ -623,19 +619,17 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda: _plain(_rate, lambda x: x[:2], 4, 2, 3, dt=0.2, method="rk4"), AGAIN, gaps,
     ),
     "matrix expressions": (lambda: _plain(_spline, lambda x: x[0] + 0.1 * x[1] ** 2, 2, 1), gaps),
+}
+ANGLES: Table = {
     "angles of outputs": (lambda: _rover(states=False), WARM),
     "angles of states": (lambda: _rover(outputs=False), gaps, AGAIN),
     "angles of both": (_rover, gaps),
     "angles, conditions": ("angles of both", conditions),
     "residual functions": (lambda: _rover(functions=True), gaps, WARM),
-    "angles extended": (lambda: _rover(observer=ExtendedKalman), gaps),
-    "angles smoothed": (lambda: _rover(observer=ExtendedKalman), SMOOTH),
+    "angles extended": (_rover, gaps, filtered_by(ExtendedKalman)),
+    "angles smoothed": (_rover, filtered_by(ExtendedKalman), SMOOTH),
     "functions unscented": (
-        lambda: _rover(functions=True, observer=UnscentedKalman), gaps, SMOOTH, WARM,
-    ),
-    "extended angles": (_rover, gaps, filtered_by(ExtendedKalman)),
-    "unscented angles": (
-        lambda: _rover(functions=True), gaps, filtered_by(UnscentedKalman), SMOOTH,
+        lambda: _rover(functions=True), gaps, filtered_by(UnscentedKalman), SMOOTH, WARM,
     ),
     "unscented with angles": (_rover, by(lambda one: UnscentedKalman(
         prior=np.diag([0.5, 0.5, 0.4, 0.1]) ** 2, noise=np.diag([0.2, 5.73, 0.1]) ** 2,
@@ -652,6 +646,8 @@ CASES: dict[str, tuple[Any, ...]] = {
             **ROVER, noises=Polytope([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0]], [20.0, 0.2])
         ), MANY,
     ),
+}
+DIRECTIONS: Table = {
     "fewer disturbances": (_fewer,),
     "fewer disturbances observer": (_fewer, ALONE),
     "fewer disturbances out of range": (lambda: _fewer(OTHER_GAIN), gaps, WARM),
@@ -668,6 +664,8 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda: _fewer(OTHER_GAIN, disturbances=Box([0.01, -np.inf], [0.01, np.inf])), MANY,
     ),
     "singular covariance": (_singular, gaps),
+}
+HELD: Table = {
     "held": (_held,),
     "held with gaps": ("held", gaps, with_changes),
     "held observer": ("held", ALONE),
@@ -687,9 +685,13 @@ CASES: dict[str, tuple[Any, ...]] = {
         prior=huber(0.5)(prior), disturbance=disturbance, noise=geman(per_component=True)(noise),
         discount=0.9,
     )), outliers, WARM),
+}
+MANY_STATES: Table = {
     "many states": (lambda: _many_states(False),),
     "many states, dense": (lambda: _many_states(True),),
     "many states with gaps": ("many states", gaps),
+}
+LOSSES: Table = {
     "huber": (lambda: _robust(noise=huber(1.345)),),
     "huber with gaps": ("huber", gaps, weighed),
     "huber in sets": ("huber", BOXED),
@@ -747,6 +749,8 @@ CASES: dict[str, tuple[Any, ...]] = {
             ),
         ), gaps,
     ),
+}
+STATES: Table = {
     "states in a box": (lambda: _reaction_in(POSITIVE),),
     "states in a box observer": ("states in a box", ALONE),
     "states in a box reinitialized": ("states in a box", AGAIN, WARM),
@@ -783,6 +787,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "unscented in states observer": (lambda: _kalman_in(WEDGE, UnscentedKalman), ALONE, AGAIN),
     "steady in states": (lambda: _kalman_in(WEDGE, SteadyStateKalman, np.eye(2)), gaps),
     "steady in states observer": ("steady in states", ALONE),
+}
+EQUATIONS: Table = {
     "noise-free": (
         lambda: _inputs_in(disturbances=Box([-0.05, 0.01, -0.05], [0.05, 0.01, 0.05])),
     ),
@@ -805,6 +811,8 @@ CASES: dict[str, tuple[Any, ...]] = {
         disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
     ),),
     "noise-free conditions": ("noise-free in states", conditions),
+}
+CONDITIONS: Table = {
     # Bounds on one side and on both, and an observer that leaves them.
     "inputs and states": (
         lambda: _inputs_in(states=Box([0.0, -np.inf, -0.2], [0.6, 0.4, np.inf])),
@@ -827,6 +835,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "tank observer": ("tank", gaps, conditions, ALONE),
     "tank kept": ("tank", conditions, {"infeasible": "keep_candidate"}, WARM),
     "tank in time": ("tank conditions", {"time_budget": 1e6}),
+}
+OBSERVERS: Table = {
     "smoothed": ("inputs", SMOOTH, {"horizon": 4}),
     "smoothed with gaps": ("smoothed", gaps, AGAIN),
     "smoothed changes": ("smoothed", with_changes),
@@ -862,6 +872,8 @@ CASES: dict[str, tuple[Any, ...]] = {
     "steady prior": (_steady,),
     "steady prior with gaps": (_steady, gaps, weighed),
     "steady conditions": (_steady, gaps, conditions),
+}
+INNOVATIONS: Table = {
     "gated": ("inputs", doubtful(Gate(reopen=3))),
     "gated prior": (lambda: _observed(ExtendedKalman), doubtful(Gate(0.95, reopen=2)), gaps),
     "gated group": (
@@ -898,6 +910,8 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda: _observed(UnscentedKalman), doubtful(HuberInnovation(reopen=2), UnscentedKalman),
         gaps, conditions,
     ),
+}
+INJECTIONS: Table = {
     "injection": ("inputs", by(lambda one: qpmhe.OutputInjection(_saturated)), gaps),
     "injection reinitialized": ("injection", with_conditions, AGAIN, WARM, with_changes),
     "injection in sets": ("inputs and states", by(
@@ -907,9 +921,17 @@ CASES: dict[str, tuple[Any, ...]] = {
         lambda z, v: np.array([0.4 * v[0] / np.sqrt(z[0]), 0.0])
     ), np.eye(2))),
 }
+#: Of each, there is a case in every sample.
+FEATURES = {
+    "usual": USUAL, "angles": ANGLES, "directions": DIRECTIONS, "held": HELD,
+    "many_states": MANY_STATES, "losses": LOSSES, "states": STATES, "equations": EQUATIONS,
+    "conditions": CONDITIONS, "observers": OBSERVERS, "innovations": INNOVATIONS,
+    "injections": INJECTIONS,
+}
+CASES = {name: made for table in FEATURES.values() for name, made in table.items()}
 
 #: In which rounding decides on trajectories, so that nothing but the promise holds.
-ROUNDED: dict[str, tuple[Any, ...]] = {
+ROUNDED: Table = {
     "failed stage": (_underflowing,),
     "more outputs than states": (
         lambda: _plain(

@@ -2,8 +2,6 @@
 
 import os
 import shutil
-import subprocess
-import sys
 
 import pytest
 
@@ -45,19 +43,3 @@ class Script:
     @property
     def calls(self):
         return self.log.read_text().splitlines() if self.log.exists() else []
-
-
-def at_once(program, count=2):
-    """What processes print that run a program at the same time, from its first read on."""
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(count)
-    ]
-    assert [one.stdout.readline() for one in both] == ["ready\n"] * count
-    for one in both:
-        one.stdin.write("\n")
-        one.stdin.flush()
-    return [one.communicate(timeout=120)[0] for one in both]

@@ -6,7 +6,7 @@ import pytest
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
 
-from .cases import CASES, STEPS, case
+from .cases import CASES, FEATURES, STEPS, case
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
@@ -46,8 +46,7 @@ def _interrupt(_time):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_the_same_estimates(name, monkeypatch):
+def same_estimates(name, monkeypatch):
     """Sample by sample, with a snapshot in the middle, and with a late measurement.
 
     Whatever is interrupted is undone bit for bit, and gives the same when it is taken again.
@@ -88,6 +87,20 @@ def same_covariances(reference, compiled):
         return
     found = compiled.covariances()
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-7 * np.abs(expected).max())
+
+
+def _agreements(feature):
+    """A test of its own for each feature: a sample has cases of all of them."""
+
+    @pytest.mark.parametrize("name", FEATURES[feature])
+    def test(name, monkeypatch):
+        same_estimates(name, monkeypatch)
+
+    return test
+
+
+for _feature in FEATURES:
+    globals()[f"test_the_same_estimates_{_feature}"] = _agreements(_feature)
 
 
 @pytest.mark.parametrize("name", [

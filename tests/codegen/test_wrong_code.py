@@ -7,7 +7,7 @@ import qpmhe
 from qpmhe.codegen import compiler, rehearsal
 from qpmhe.errors import CompilationError, EngineWarning
 
-from .scripts import Script, at_once, needed
+from .scripts import Script, needed
 
 ca = pytest.importorskip("casadi")
 pytestmark = needed
@@ -135,23 +135,6 @@ def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypa
         assert mhe.engine == "python"
         costs_are_right(mhe)
         assert len(script.calls) == 6
-
-
-def test_processes_at_once_with_a_compiler_that_lies(script, cache):
-    script.lies(MODEL_LIES["residuals"], [FAST])
-    program = (
-        "import sys, numpy as np, casadi as ca, qpmhe\n"
-        "print('ready', flush=True)\nsys.stdin.readline()\n"
-        f"s = qpmhe.from_casadi(lambda x: ca.mtimes(ca.DM({A.tolist()}), x), lambda x: x, "
-        "n=2, compiled=True)\n"
-        "print(s.kernel.residuals(np.ones((3, 2)), 3 * np.ones((2, 2)), np.zeros((2, 0)))[1, 3])\n"
-    )
-    assert at_once(program) == ["2.0\n", "2.0\n"]
-    before = len(script.calls)
-    assert 2 <= before <= 4
-    assert at_once(program, 1) == ["2.0\n"]
-    assert len(script.calls) == before
-    assert not [path for path in cache.iterdir() if path.suffix not in (".so", ".sha256", ".level")]
 
 
 @pytest.mark.parametrize("level", range(len(compiler._LEVELS)))
