@@ -97,3 +97,14 @@ def test_converged_cost_is_ipopts(seed, engine, sets):
             assert ours.cost == pytest.approx(theirs.cost, rel=1e-6)
             compared += 1
     assert compared > (20 if sets == "free" else 8)
+
+
+def test_ipopt_takes_no_other_residual_function():
+    rover = Rover(0)
+    system = qpmhe.System(rover.f, rover.h, n=4, p=4, output_residual=lambda a, b: a - b)
+    ipopt = IpoptEstimator(
+        system, qpmhe.Luenberger(np.zeros((4, 4))), rover.cost, horizon=3,
+        initial_state=rover.start, f=lambda x: x, h=lambda x: x,
+    )
+    with pytest.raises(qpmhe.errors.InvalidInputError, match=r"qpmhe\.angles only"):
+        ipopt.update(np.zeros(4))

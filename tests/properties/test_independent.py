@@ -14,6 +14,7 @@ from qpmhe.estimation.problem import Problem
 from qpmhe.observers.projection import NearestPoint
 
 from .fuzz_independent import WRITINGS, Case, WrongStepError, fuzz, table
+from .independent import Held
 
 SEED = 1
 # Steps of each by default, and in the sample: whatever is compiled takes its time to be made.
@@ -35,35 +36,23 @@ def test_every_step_is_what_it_says(pytestconfig, source, writing):
     assert counts["steps"] == steps
 
 
-def spoil_model(case):
-    case.model.numbers[0][0][0] += 1e-3
+def scaled(array, place, factor):
+    array[place] *= factor
 
 
-def spoil_output(case):
-    case.model.numbers[2][-1][-1] += 1e-3
+SPOILS = {
+    "model": lambda case: case.model.numbers[0][0].__setitem__(0, case.model.A[0, 0] + 1e-3),
+    "output": lambda case: case.model.numbers[2][-1].__setitem__(-1, case.model.C[-1, -1] + 1e-3),
+    "weight": lambda case: scaled(case.price.weights[1], (0, 0), 1.0 + 1e-6),
+    "noise weight": lambda case: scaled(case.price.weights[2], (-1, -1), 1.0 + 1e-6),
+    "discount": lambda case: setattr(case.price, "discount", case.price.discount * (1.0 - 1e-6)),
+    "gain": lambda case: (
+        scaled(case.watcher.gain, (0, 0), 1.01), scaled(case.watcher.R, (0, 0), 1.01)
+    ),
+}
 
 
-def spoil_weight(case):
-    case.price.weights[1][0, 0] *= 1.0 + 1e-6
-
-
-def spoil_discount(case):
-    case.price.discount *= 1.0 - 1e-6
-
-
-def spoil_gain(case):
-    case.watcher.gain[0, 0] += 1e-3
-    case.watcher.R[0, 0] *= 1.0 + 1e-2
-
-
-def spoil_noise_weight(case):
-    case.price.weights[2][-1, -1] *= 1.0 + 1e-6
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [spoil_model, spoil_output, spoil_weight, spoil_discount, spoil_gain, spoil_noise_weight],
-)
+@pytest.mark.parametrize("spoil", SPOILS)
 @pytest.mark.parametrize("seed", [3, 4])
 def test_what_differs_a_little_is_noticed(monkeypatch, seed, spoil):
     case = Case(seed, "numpy", "batched")
@@ -72,12 +61,25 @@ def test_what_differs_a_little_is_noticed(monkeypatch, seed, spoil):
 
     def configured():
         mhe = configure()
-        spoil(case)
+        SPOILS[spoil](case)
         return mhe
 
     monkeypatch.setattr(case, "configure", configured)
     with pytest.raises(WrongStepError):
         case.run(60, Counter())
+
+
+def test_another_hold_is_noticed(monkeypatch):
+    see = Held.see
+
+    def seen(self, candidate, samples):
+        see(self, candidate, samples)
+        self.weight = self.weight * (1.0 + 1e-3)
+
+    monkeypatch.setattr(Held, "see", seen)
+    words = "the hold's weight"
+    _, failures = fuzz(800, SEED, source="numpy", writing="batched", estimators=1, until=words)
+    assert any(words in failure for failure in failures)
 
 
 def test_a_cost_that_is_too_low_is_noticed(monkeypatch):

@@ -209,23 +209,6 @@ def test_all_rungs_share_the_time(clock, name, budget):
 
 
 @quiet
-@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
-@pytest.mark.parametrize("name", SETS)
-def test_without_time_for_any_qp_the_candidate_is_the_estimate(
-    clock, monkeypatch, name, infeasible
-):
-    monkeypatch.setattr("qpmhe.estimation.optimizer.perf_counter", lambda: clock.now + 2.0)
-    found = tight(name, backend="ticking", time_budget=1.0, infeasible=infeasible)
-    assert clock.now == 0.0
-    for estimate, free, outside in found:
-        # The previous estimate, shifted, may satisfy what the candidate violates.
-        assert kept(estimate, free) if not estimate.improved else outside
-        assert Status.TIME_UP in estimate.status
-        assert estimate.dropped == ()
-        assert estimate.qps == estimate.nearest_points == 0
-
-
-@quiet
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_solvers_with_next_to_no_time_do_no_harm(monkeypatch, backend):
     """Their own clocks run; the one between QPs stands still, so that they are called."""
