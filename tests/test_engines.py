@@ -15,6 +15,7 @@ from qpmhe.models.loading import find
 from qpmhe.records import CheckpointError, checkpoints, estimate_record
 from qpmhe.studies import Store, Study, run
 from qpmhe.studies.cell import Cell, Task, _estimator
+from qpmhe.studies.experiment import Source
 from qpmhe.studies.paper import PaperStudy
 
 pytest.importorskip("casadi")
@@ -232,14 +233,14 @@ def whole():
     _, _, _, other = qpmhe.models.van_der_pol()
     return system, observer, cost, other
 """)
-    source = find("scenario.py:whole")
+    source = Source(find("scenario.py:whole"))
     cell = Cell(source.name, "banded", 1, None, 4, "candidate", 0, 5)
-    example = qpmhe.models.loading.load(source)
+    example = qpmhe.models.loading.load(source.model)
     task = Task(cell, source, frozenset(("accuracy",)), 10.0)
     qpmhe.compile(*example[:3], horizon=4, initial_state=[0.0, 0.0])
     free = qpmhe.MovingHorizonEstimator(*example[:3], horizon=4, initial_state=[0.0, 0.0])
     assert free.engine == "compiled"
-    assert _estimator(example, task).engine == "python"
+    assert _estimator(task).engine == "python"
     assert PaperStudy().estimator(2).settings.engine == "python"
 
 

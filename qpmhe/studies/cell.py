@@ -198,22 +198,25 @@ def _register(entry: Backend) -> None:
         register(entry)
 
 
-def _run(
-    task: Task, record: Record, limit: float, *, covariances: bool = False, backend_name: str = ""
-) -> Run:
+def _estimator(task: Task, backend_name: str = "") -> MovingHorizonEstimator:
     cell, found = task.cell, experiment(task.source)
-    options = found.options | {
+    return MovingHorizonEstimator(*found.parts, **found.options | {
         "horizon": cell.horizon, "max_qps": cell.qps, "warm_start": cell.start == "best",
         "backend": backend_name or ("banded" if cell.backend == OBSERVER else cell.backend),
         "max_solver_iterations": cell.solver_iterations, "isolated": task.isolated,
         "engine": ENGINE,
-    }
-    mhe = MovingHorizonEstimator(*found.parts, **options)
+    })
+
+
+def _run(
+    task: Task, record: Record, limit: float, *, covariances: bool = False, backend_name: str = ""
+) -> Run:
+    mhe, lengths = _estimator(task, backend_name), experiment(task.source).lengths
     start, estimates, collected = mhe.state.copy(), [], []
     total = len(record.measurements)
     inputs = [None] * total if record.inputs is None else record.inputs
-    lengths = [None] * total if found.lengths is None else found.lengths
-    for y, u, dt in zip(record.measurements, inputs, lengths, strict=False):
+    steps = [None] * total if lengths is None else lengths
+    for y, u, dt in zip(record.measurements, inputs, steps, strict=False):
         estimate: Estimate = mhe.update(y, u, dt=dt)
         estimates.append(estimate)
         if covariances:

@@ -113,7 +113,8 @@ def test_shares_of_steps_that_fail_are_fallback():
         status.CANDIDATE | status.MISSING | status.CONVERGED,
     ))
     assert (found["improved"], found["kept"], found["fallback"]) == (2 / 8, 3 / 8, 3 / 8)
-    assert (found["cap_hits"], found["solver_iterations_mean"], found["qps_mean"]) == (1 / 8, 4, 3.5)
+    assert found["cap_hits"] == 1 / 8
+    assert (found["solver_iterations_mean"], found["qps_mean"]) == (4, 3.5)
 
 
 def test_what_says_nothing_is_left_out():

@@ -68,49 +68,47 @@ def test_a_side_of_the_bounds_that_is_finite_is_given_as_such(tmp_path):
         qp.lower[:, component] = -1.0
         exported = export_qpbenchmark(dump(qp, tmp_path / f"{name}.npz"), tmp_path / name)
         problem = qpsolvers.Problem.load(str(exported.problems[0]))
-        assert problem.ub is None
-        assert (problem.lb is not None, problem.G is None) == (given, given)
+        assert (problem.lb is not None, problem.G is None, problem.ub) == (given, given, None)
 
 
-def test_names_are_those_of_the_files(folder, tmp_path):
+def test_names_are_those_of_the_files_and_what_no_solver_must_be_given_is_left_out(
+    folder, tmp_path
+):
     other = tmp_path / "other"
     other.mkdir()
     dump(QP(1, 1), other / "01 boxes.npz")
-    exported = export_qpbenchmark([folder, other], tmp_path / "set")
+    spoilt, crossed = QP(2, 1), QP(2, 1)
+    spoilt.gradient[0] = np.nan
+    crossed.lower[0], crossed.upper[0] = 1.0, 0.0
+    one, two = (dump(qp, tmp_path / f"{k}.npz") for k, qp in enumerate((spoilt, crossed)))
+    exported = export_qpbenchmark([one, folder, two, other], tmp_path / "set")
+    assert exported.skipped == {
+        one: "its data are not finite", two: "a lower bound is above its upper bound",
+    }
     names = [path.stem for path in exported.problems]
     assert names == [f"{number:02d} {case}" for number, case in enumerate(CASES)] + ["01 boxes_2"]
     assert exported.script.name == "mhe_qpbenchmark.py"
     assert sorted((tmp_path / "set" / "problems").iterdir()) == sorted(exported.problems)
 
 
-def test_what_no_solver_must_be_given_is_left_out(folder, tmp_path):
-    spoilt, crossed = QP(2, 1), QP(2, 1)
-    spoilt.gradient[0] = np.nan
-    crossed.lower[0], crossed.upper[0] = 1.0, 0.0
-    one, two = (dump(qp, tmp_path / f"{k}.npz") for k, qp in enumerate((spoilt, crossed)))
-    exported = export_qpbenchmark([one, folder, two], tmp_path / "set")
-    assert exported.skipped == {
-        one: "its data are not finite", two: "a lower bound is above its upper bound",
-    }
-    assert len(exported.problems) == len(CASES)
-    with pytest.raises(InvalidInputError, match="no QP to export: its data are not finite"):
-        export_qpbenchmark([one], tmp_path / "none")
-    assert not (tmp_path / "none").exists()
-
-
-def test_bad_arguments_are_told(folder, tmp_path):
-    with pytest.raises(OptionError, match="matrices is 'banded'"):
-        export_qpbenchmark(folder, tmp_path / "set", matrices="banded")
-    with pytest.raises(InvalidInputError, match="no QP to export: no file was given"):
-        export_qpbenchmark([], tmp_path / "set")
+def test_what_cannot_be_exported_is_reported(folder, tmp_path):
     (tmp_path / "text.npz").write_text("text")
-    with pytest.raises(InvalidInputError, match=r"text.npz is no QP file"):
-        export_qpbenchmark([folder, tmp_path / "text.npz"], tmp_path / "set")
-    with pytest.raises(InvalidInputError, match=r"cannot write the test set to .*text.npz"):
-        export_qpbenchmark(folder, tmp_path / "text.npz")
-    export_qpbenchmark(folder, tmp_path / "set")
-    with pytest.raises(InvalidInputError, match="holds problems already"):
-        export_qpbenchmark(folder, tmp_path / "set")
+    spoilt = QP(2, 1)
+    spoilt.gradient[0] = np.nan
+    one, new = dump(spoilt, tmp_path / "one.npz"), tmp_path / "set"
+    export_qpbenchmark(folder, tmp_path / "full")
+    for files, out, error, words in (
+        ([], new, InvalidInputError, "no QP to export: no file was given"),
+        ([one], new, InvalidInputError, "no QP to export: its data are not finite"),
+        ([folder, tmp_path / "text.npz"], new, InvalidInputError, r"text.npz is no QP file"),
+        (folder, tmp_path / "text.npz", InvalidInputError, "cannot write the test set to .*text"),
+        (folder, tmp_path / "full", InvalidInputError, "holds problems already"),
+    ):
+        with pytest.raises(error, match=words):
+            export_qpbenchmark(files, out)
+        assert not new.exists()
+    with pytest.raises(OptionError, match="matrices is 'banded'"):
+        export_qpbenchmark(folder, new, matrices="banded")
 
 
 @pytest.mark.parametrize(("matrices", "sparse_only"), [("sparse", True), ("dense", False)])

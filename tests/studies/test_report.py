@@ -4,14 +4,18 @@ import resource
 import subprocess
 import sys
 from dataclasses import dataclass
+from io import StringIO
 from itertools import combinations
 
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.image import imread
+from rich.console import Console
 
-from qpmhe.errors import InvalidInputError
+from qpmhe.cli.report import show, show_report
+from qpmhe.errors import InvalidInputError, QpmheError
+from qpmhe.plots.style import _resized
 from qpmhe.studies.report import cases, write_report
 from qpmhe.studies.report.answers import failures, limitations
 from qpmhe.studies.report.drawing import styles
@@ -44,23 +48,23 @@ def texts(rows):
     return {answer.question: answer.text for answer in case.answers()}, case
 
 
-def test_fastest_near_the_best():
+def test_fastest_near_the_best_the_observer_and_failures():
     found, case = texts(frame())
     rows = [row for _, row in case.summary.iterrows()]
     least = min(row.rmse for row in rows)
-    near = [row for row in rows if row.rmse <= 1.01 * least]
-    first = min(near, key=lambda row: row.time_median)
+    first = min((row for row in rows if row.rmse <= 1.01 * least), key=lambda row: row.time_median)
     text = found["Fastest within 1 % of the best RMSE"]
     assert text.startswith(f"{configuration_words(first)}: {seconds(first.time_median)} per step")
     assert f"RMSE {number(first.rmse)} (95 %" in text
-
-
-def test_observer_and_failures_are_told():
+    assert found["Failures"] == "No backend failed, in any run or step."
     found, case = texts(spoilt("osqp", 1, "out of time"))
     observer = case.summary[case.summary.backend == "observer"].iloc[0]
     assert found["Observer alone (no QP)"].startswith(f"RMSE {number(observer.rmse)} ")
     assert found["Failures"] == "Never: daqp and proxqp. Failed: osqp: 2 of 6 runs failed."
-    assert texts(frame())[0]["Failures"] == "No backend failed, in any run or step."
+    rows = frame()
+    rows["reasons"] = [{"SOLVER_FAILED": 4} if one == "osqp" else {} for one in rows.backend]
+    words = "osqp, 2 QPs per sample, cap 2: no run, but 10 % of the steps"
+    assert words in texts(rows)[0]["Failures"]
 
 
 def test_what_is_worse_than_no_qp_is_named():
@@ -85,10 +89,6 @@ def test_what_is_worse_than_no_qp_is_named():
     assert "osqp, 2 QPs per sample, cap 2 (RMSE ∞); daqp" in texts(rows)[0]["Worse than no QP"]
 
 
-def test_without_the_observer_nothing_is_worse_than_it():
-    assert "Worse than no QP" not in texts(frame().query("backend != 'observer'"))[0]
-
-
 def test_most_of_what_is_worse_is_counted():
     rows = frame().query("horizon == 10 and backend != 'observer'")
     many = pd.concat([frame().query("horizon == 10 and backend == 'observer'"), *(
@@ -97,30 +97,24 @@ def test_most_of_what_is_worse_is_counted():
     text = texts(many.drop_duplicates(["backend", "solver_iterations", "seed"]))[0]
     assert text["Worse than no QP"].startswith("9 of 9 configurations have")
     assert text["Worse than no QP"].endswith("; and 3 more.")
+    assert "Worse than no QP" not in texts(rows)[0]  # without the observer
 
 
-def test_failed_steps_are_told():
-    rows = frame()
-    rows["reasons"] = [
-        {"SOLVER_FAILED": 4} if backend == "osqp" else {} for backend in rows.backend
-    ]
-    told = texts(rows)[0]["Failures"]
-    assert "osqp, 2 QPs per sample, cap 2: no run, but 10 % of the steps" in told
-
-
-def test_accuracy_alone():
-    rows = frame()
+def test_accuracy_alone_and_nothing_at_all(tmp_path):
+    rows = frame().query("horizon == 10").assign(times=None)
     rows[["time_median", "time_p95", "time_p99", "time_max"]] = np.nan
-    found, _ = texts(rows.assign(times=None))
+    found, _ = texts(rows)
     assert "accuracy only" in found["Fastest"]
     assert "RMSE" in found["Most accurate"]
     assert any("No times" in note for note in limitations(rows, summarise(rows)))
-
-
-def test_nothing_finished():
-    rows = frame().assign(outcome="failed", reason="crash")
-    found, _ = texts(rows)
+    text = write_report(Altered(rows), tmp_path).read_text(encoding="utf-8")
+    assert "Accuracy against time" not in text
+    assert "Time per step" not in text
+    assert "Stopping the solver early" in text
+    found, _ = texts(frame().assign(outcome="failed", reason="crash"))
     assert found["Result"] == "No configuration finished all its runs."
+    with pytest.raises(InvalidInputError, match="no finished cell"):
+        write_report((frame()[:0], {}), tmp_path)
 
 
 def test_limitations_follow_the_data():
@@ -204,21 +198,12 @@ def test_times_alone_have_no_figure_of_a_cost(tmp_path):
     assert (tmp_path / "batch-reactor-N-10-anytime.png").exists()
 
 
-def test_accuracy_alone_has_no_figure_of_times(tmp_path):
-    rows = frame().assign(times=None)
-    rows[["time_median", "time_p95", "time_p99", "time_max"]] = np.nan
-    text = write_report(Altered(rows), tmp_path).read_text(encoding="utf-8")
-    assert "Accuracy against time" not in text
-    assert "Time per step" not in text
-    assert "Stopping the solver early" in text
-
-
 def test_a_menu_entry_for_each_state():
     rows, (_, data) = summarise(frame()), embedded(written())
     case = data["cases"]["batch-reactor-N-10"]
     entries = dict(case["menus"]["accuracy"]["metric"])
-    assert list(entries)[:4] == ["rmse", "rmse_settled", "rmse_excess", "cost_ratio"]
-    assert list(entries.values())[4:] == ["RMSE of x1 (A)", "RMSE of x2 (B)"]
+    assert list(entries)[:5] == ["rmse", "rmse_settled", "rmse_excess", "cost_ratio", "cost"]
+    assert list(entries.values())[5:] == ["RMSE of x1 (A)", "RMSE of x2 (B)"]
     assert set(case["accuracy"]) == set(entries)
     for j in (0, 1):
         drawn = sorted(
@@ -230,12 +215,8 @@ def test_a_menu_entry_for_each_state():
         assert case["accuracy"][f"rmse_{j + 1}"]["layout"]["yaxis"]["title"]["text"] == (
             entries[f"rmse_{j + 1}"]
         )
-
-
-def test_states_without_names_are_numbered():
-    rows = frame()
-    (case, *_) = cases(summarise(rows))
-    assert Part(case, rows, None).state_labels() == ["state 1", "state 2"]
+    (one, *_) = cases(rows)
+    assert Part(one, frame(), None).state_labels() == ["state 1", "state 2"]  # without names
 
 
 @pytest.mark.parametrize(
@@ -262,7 +243,8 @@ def test_thirty_backends_look_different():
     assert len({(one.color, one.dash) for one in drawn.values()}) == 31
 
 
-def test_no_text_is_clipped_or_covered():
+@pytest.mark.parametrize("inches", [None, 3.3])
+def test_no_text_is_clipped_or_covered(inches):
     rows = frame()
     parts = []
     for case in cases(summarise(rows)):
@@ -270,21 +252,21 @@ def test_no_text_is_clipped_or_covered():
         runs = choose_runs(stored(), cells, case, 100_000)
         assert runs.observer is not None
         parts.append(Part(case, cells, 1e-3, runs))
-    found = files(parts, styles(rows.backend), profiles(rows))
-    assert len(found) == 9
+    found = files(parts, styles(sorted(rows.backend)), profiles(rows), inches)
+    assert len(found) == 9 + 2  # the errors against N and i
     for figure in found.values():
-        figure.draw_without_rendering()
-        drawn_box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
-        assert drawn_box.x0 >= -0.01
-        assert drawn_box.y0 >= -0.01
-        assert drawn_box.x1 <= width + 0.01
-        assert drawn_box.y1 <= height + 0.01
-        titles = [figure._suptitle, *figure.legends]
-        for axes in figure.axes:
-            titles += [axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label]
-        boxes = [one.get_window_extent() for one in titles
-                 if one is not None and (one in figure.legends or one.get_text())]
-        assert not [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])]
+        with _resized(figure, inches):
+            figure.draw_without_rendering()
+            drawn_box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+            assert min(drawn_box.x0, drawn_box.y0) >= -0.01
+            assert drawn_box.x1 <= width + 0.01
+            assert drawn_box.y1 <= height + 0.01
+            titles = [figure._suptitle, *figure.legends]
+            for axes in figure.axes:
+                titles += [axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label]
+            boxes = [one.get_window_extent() for one in titles
+                     if one is not None and (one in figure.legends or one.get_text())]
+            assert not [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])]
 
 
 def test_report_is_whole_and_needs_no_network():
@@ -295,7 +277,8 @@ def test_report_is_whole_and_needs_no_network():
     assert not re.findall(r"""<(?:script|link|img|iframe)[^>]*(?:src|href)\s*=\s*["']?http""", text)
     names = {path.name for path in folder.iterdir()}
     stems = {f"batch-reactor-N-{n}-{kind}" for n in (4, 10)
-             for kind in ("accuracy-time", "anytime", "step-times", "run")} | {"profile"}
+             for kind in ("accuracy-time", "anytime", "step-times", "run")}
+    stems |= {"profile", "batch-reactor-daqp-error-N", "batch-reactor-daqp-error-i"}
     assert names == {"index.html", "summary.csv"} | {f"{s}.{e}" for s in stems
                                                      for e in ("png", "svg")}
     for stem in stems:
@@ -315,19 +298,6 @@ def test_runs_for_which_there_is_no_room_are_counted():
     assert choose_runs(stored(), rows, case, 10**6).left_out == 0
 
 
-def test_frame_and_meta_do(tmp_path):
-    page = write_report((frame().query("horizon == 4"), stored().meta()), tmp_path)
-    assert 'id="trajectories"' not in page.read_text(encoding="utf-8")
-
-
-def test_failed_runs_are_listed_and_escaped(tmp_path):
-    rows = spoilt("proxqp", 1, "</script><b>out of time").query("horizon == 4")
-    page = write_report(Altered(rows), tmp_path)
-    text = page.read_text(encoding="utf-8")
-    assert "&lt;/script&gt;&lt;b&gt;out of time" in text
-    assert "</script><b>" not in text
-
-
 def embedded(page):
     """The texts of the page's script elements, as a browser ends them, and the figures' data."""
     text = page.read_text(encoding="utf-8")
@@ -345,40 +315,29 @@ def test_the_figures_are_what_plotly_takes():
             assert figure["data"]
 
 
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    """The script elements of a report of one horizon."""
-    rows = frame().query("horizon == 4")
-    return embedded(write_report(Altered(rows), tmp_path_factory.mktemp("plain")))[0]
+def test_no_text_of_a_user_reaches_into_the_script_elements(tmp_path):
+    label = "]]><!--<script></script>"
 
-
-@pytest.mark.parametrize("label", ["<!--<script>", "</script>", "]]><!--"])
-def test_no_text_of_a_user_reaches_into_the_script_elements(tmp_path, plain, label):
     class Labelled(Altered):
         def trajectory(self, key):
             return {**stored().trajectory(key), "labels": [label, "y"]}
 
-    rows = frame().query("horizon == 4").assign(model=f"m.py:make(label={label!r})")
-    scripts, data = embedded(write_report(Labelled(rows), tmp_path))
+    rows = spoilt("proxqp", 1, "</script><b>out of time").query("horizon == 4")
+    plain = embedded(write_report((rows, stored().meta()), tmp_path / "plain"))[0]
+    page = write_report(Labelled(rows.assign(model=f"m.py:make(label={label!r})")), tmp_path)
+    scripts, data = embedded(page)
+    assert 'id="trajectories"' not in (tmp_path / "plain" / "index.html").read_text()
     assert len(scripts) == len(plain)
     # "<!--" and then "<script" would keep a browser within the element beyond its end.
     assert [one.count("<!--") for one in scripts] == [one.count("<!--") for one in plain]
+    text = page.read_text(encoding="utf-8")
+    assert "&lt;/script&gt;&lt;b&gt;out of time" in text
+    assert "</script><b>" not in text
     titles = [
         axis["title"]["text"] for case in data["cases"].values()
         for name, axis in case["trajectories"]["layout"].items() if name.startswith("yaxis")
     ]
     assert titles == [label, "y"]
-
-
-def test_nothing_to_report(tmp_path):
-    with pytest.raises(InvalidInputError, match="no finished cell"):
-        write_report((frame()[:0], {}), tmp_path)
-
-
-def test_folder_that_cannot_be(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidInputError, match="cannot make the folder"):
-        write_report(stored(), tmp_path / "file" / "out")
 
 
 def test_a_full_disk_leaves_the_former_report(tmp_path):
@@ -396,11 +355,13 @@ def test_a_full_disk_leaves_the_former_report(tmp_path):
     assert page.read_text() == "the former one"
 
 
-@pytest.mark.parametrize("name", ["summary.csv", "profile.png"])
-def test_what_cannot_be_written_is_named(tmp_path, name):
-    (tmp_path / name).mkdir()
+def test_what_cannot_be_written_or_is_missing_is_named(tmp_path, monkeypatch):
+    (tmp_path / "summary.csv").mkdir()
     with pytest.raises(InvalidInputError, match=r"cannot write the report into .*directory"):
         write_report((frame(), stored().meta()), tmp_path)
+    monkeypatch.setattr("qpmhe.studies.report.page.find_spec", lambda name: name != "itables")
+    with pytest.raises(InvalidInputError, match=r"itables.*qpmhe\[studies\]"):
+        write_report(stored(), tmp_path)
 
 
 def test_libraries_are_loaded_late():
@@ -413,7 +374,66 @@ def test_libraries_are_loaded_late():
     assert done.stdout.strip() == "[]"
 
 
-def test_missing_library_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr("qpmhe.studies.report.page.find_spec", lambda name: name != "itables")
-    with pytest.raises(InvalidInputError, match=r"itables.*qpmhe\[studies\]"):
-        write_report(stored(), tmp_path)
+def shown(summary, width):
+    """What the terminal shows, and the headings of its first table, or their last words."""
+    console = Console(width=width, record=True, color_system=None, file=StringIO())
+    show(console, summary)
+    text = console.export_text()
+    assert "…" not in text
+    (line, *_) = (line for line in text.splitlines() if line.strip().startswith("backend"))
+    return text, set(re.split(r"\s{2,}", line.strip()))
+
+
+def table_lines(text):
+    return [line for line in text.splitlines() if re.match(r"\s*(daqp|osqp|proxqp|obs\w+) ", line)]
+
+
+@pytest.mark.parametrize("width", [80, 120, 200])
+def test_the_terminals_room_is_used(width):
+    text, headings = shown(summarise(frame()), width)
+    assert {"RMSE", "conv.", "median", "impr."} <= headings
+    assert ("99 %" in headings) == (width >= 120)
+    assert ({"95 %", "kept", "back", "hits", "max"} <= headings) == (width == 200)
+    assert ("No room here, but in the report" in " ".join(text.split())) == (width < 200)
+    assert not {"late", "NEES"} & headings
+    # What was asked for is shown at any width: generic backends, two starts, failed runs.
+    rows = frame().query("horizon == 10")
+    rows = rows.assign(late=0.9995, nees=1230.0, backend="qpsolvers:" + rows.backend)
+    text, headings = shown(summarise(pd.concat([rows, rows.assign(start="best")])), width)
+    assert {"late", "NEES", "RMSE", "median"} <= headings
+    assert "> 99.9 %" in text
+    assert "1,230" in text
+
+
+def test_best_of_a_column_is_marked_once():
+    summary = summarise(frame().query("horizon == 10"))
+    rows = table_lines(shown(summary, 120)[0])
+    assert len(rows) == len(summary)
+    times = [line for line in rows if re.search(r"[µm]s\*", line)]
+    assert {line.split()[0] for line in times} == {"observer"}
+    near = summary[summary.rmse <= summary.rmse.min() * 1.001]
+    best = near.loc[near.time_median.idxmin()]
+    marked = [line for line in rows if f"{best.rmse:.3f}*" in line]
+    assert [line.split()[0] for line in marked] == [best.backend]
+    assert sum(line.rstrip().endswith("front") for line in rows) == summary.pareto.sum()
+
+
+def test_of_many_configurations_those_that_matter_are_shown():
+    rows = frame().query("horizon == 10")
+    capped = rows[rows.solver_iterations == 2]
+    summary = summarise(pd.concat([rows, *(
+        capped.assign(solver_iterations=capped.solver_iterations + cap, rmse=capped.rmse * 2)
+        for cap in range(1, 13)
+    )]))
+    assert len(summary) == 7 + 3 * 12
+    text, _ = shown(summary, 120)
+    lines = table_lines(text)
+    assert len(lines) == int(re.search(r"(\d+) of 43 configurations", text).group(1)) < 20
+    assert {line.split()[0] for line in lines} == {"daqp", "osqp", "proxqp", "observer"}
+    assert sum(line.rstrip().endswith("front") for line in lines) == summary.pareto.sum()
+
+
+def test_no_store(tmp_path):
+    with pytest.raises(QpmheError, match=r"none\.sqlite"):
+        show_report(Console(file=StringIO()), tmp_path / "none.sqlite", tmp_path / "out")
+    assert not (tmp_path / "out").exists()

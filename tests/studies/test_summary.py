@@ -22,9 +22,9 @@ def cells_of(rows, row):
 
 def chosen(summary, backend, cap, horizon):
     rows = summary[(summary.backend == backend) & (summary.horizon == horizon)]
-    (row,) = (row for _, row in rows.iterrows()
-              if row.solver_iterations == cap or (cap is None and pd.isna(row.solver_iterations)))
-    return row
+    rows = rows[rows.solver_iterations.fillna(0) == (cap or 0)]
+    assert len(rows) == 1
+    return rows.iloc[0]
 
 
 def test_means_and_limits_are_students_and_the_excess_is_paired_by_seed():

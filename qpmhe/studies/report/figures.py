@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._checks import Array
 from ..summary import CONFIGURATION, PROBLEM, RANKED_BY, measure
-from .answers import chosen
+from .answers import NEAR
 from .drawing import Axis, Drawing, Mark, Panel, Style, styles
 from .words import (
     cap_words,
@@ -117,17 +117,18 @@ AXES = {
 def sweeps(summary: DataFrame) -> dict[str, tuple[Drawing, dict[str, Style]]]:
     """Errors against N, noise level and i where they vary: the drawing, and how lines look.
 
-    Uncapped, of the usual start and of one backend, which is in the name: the fastest near the
-    best. Bars are confidence limits over the seeds. The lines are those of i, else of N.
+    Uncapped, of the usual start and of one backend, which is in the name: of those within 1 % of
+    the best, the first in the alphabet. Bars are confidence limits over the seeds. The lines are
+    those of i, else of N.
     """
     drawn = {}
     for (model, steps), rows in summary.groupby(["model", "steps"], sort=False):
         rows = rows[(rows["failures"] == 0) & rows["solver_iterations"].isna()]
         rest = rows[rows["backend"] != "observer"]
-        best = chosen(rest)
-        if best is None:
+        least = rest.groupby("backend")[measure(rows)].min()
+        if least.isna().all():
             continue
-        backend = str((best[1] if best[0] is None else best[0])["backend"])
+        backend = min(least.index[least <= (1 + NEAR) * least.min()])
         start = min(rest["start"], key=usual_first)
         rows = rows[rows["backend"].isin(["observer", backend]) & rows["start"].isin(
             [start, "candidate"])]

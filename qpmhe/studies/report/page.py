@@ -233,7 +233,7 @@ def choose_runs(source: Store, cells: DataFrame, case: Case, most: int) -> Runs:
         configuration_words(row): bool(row["pareto"]) for _, row in case.summary.iterrows()
     }
     order = sorted(
-        (not pareto[configuration_words(row)], float(row["rmse"]), configuration_words(row),
+        (not pareto[configuration_words(row)], float(row[case.by]), configuration_words(row),
          str(row["key"]))
         for _, row in first.iterrows()
     )
@@ -255,7 +255,7 @@ def choose_runs(source: Store, cells: DataFrame, case: Case, most: int) -> Runs:
         runs.entries.append((key, words if behind else f"{words} (Pareto front)"))
         if words == "observer" or words in named:
             runs.static.append((words, trajectory))
-    runs.entries.sort(key=lambda entry: entry[1] == "observer")
+    runs.entries.sort(key=lambda entry: entry[1].startswith("observer"))
     return runs
 
 
