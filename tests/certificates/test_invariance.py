@@ -71,9 +71,13 @@ def test_what_has_no_enclosure_or_no_end_is_not_known():
     found = certify_invariance(touching, qpmhe.Box([-1.0], [1.0]), seconds=5.0)
     assert found.holds is None
     assert found.cells > 10
-    # Nothing of f is known by its slopes where the region fixes a state that f moves.
-    shear = linear([[0.5, 0.0], [0.1, 0.0]], [[1.0, 0.0]])
-    assert certify_invariance(shear, qpmhe.Box([-1.0, 0.0], [1.0, 0.0])).holds is False
+    # Between samples, f moves a state that the region fixes.
+    bump = qpmhe.System(
+        lambda x: np.stack([0.5 * x[0], np.maximum(1e-6 - np.abs(x[0] - 0.1234567), 0.0)]),
+        lambda x: x, n=2, p=2,
+    )
+    found = certify_invariance(bump, qpmhe.Box([-1.0, 0.0], [1.0, 0.0]), seconds=5.0)
+    assert found.holds is not True
 
 
 def test_observer_stays_in_the_region_while_the_state_is_in_the_inner_one():
