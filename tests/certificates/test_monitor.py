@@ -138,6 +138,9 @@ def test_weights_do_not_matter_to_the_observer_and_wrong_sizes_are_found_out(cer
     watch = followed(certificate, mhe, 0.0, sizes=Sizes(0.0, 0.0))
     assert [watch.check(mhe.update([24.0])).lost for _ in range(4)] == [None, 1, 1, 1]
     assert "larger than stated" in watch.reason
+    run = estimator(certificate).run(np.full((4, 1), 24.0))
+    band = certificate.observer_bound.along(run, 0.0, 0.0, initial_error=0.0)
+    assert (band.lost, band.reason) == (1, watch.reason)
 
 
 def test_model_failures_and_sensors_that_are_not_sampled_end_it(certificate):
