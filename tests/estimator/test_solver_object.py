@@ -127,6 +127,21 @@ def test_a_solver_starts_afresh_when_it_passes_to_another_estimator():
     assert solver.time_limit is None
 
 
+def test_a_solver_forgets_where_its_estimator_changes():
+    solver = Counting()
+    mhe = estimator(backend=solver)
+    mhe.update([1.0])
+    state = mhe.state_dict()
+    for change in (
+        mhe.state_dict, lambda: mhe.load_state_dict(state), lambda: mhe.set(noise_weight=2.0),
+        mhe.reset,
+    ):
+        mhe.update([1.0])
+        solver.calls.clear()
+        change()
+        assert "forget" in solver.calls
+
+
 @pytest.mark.parametrize(
     "way", [lambda mhe: pickle.loads(pickle.dumps(mhe)), copy.copy, copy.deepcopy, None]
 )
