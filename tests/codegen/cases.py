@@ -709,14 +709,6 @@ LOSSES: Table = {
     "power per component": (
         lambda: _robust(power(1.0, True), power(3.0, True), power(1.5, True), discount=0.9), AGAIN,
     ),
-    "power failing": (
-        lambda: _failing(1.8), lambda one: replace(
-            one, observer=Luenberger([[0.5], [0.3]]), cost=RobustCost(
-                prior=power(1.5)(10.0 * np.eye(2)), disturbance=power(1.2)(100.0 * np.eye(2)),
-                noise=power(1.5)([[100.0]]),
-            ),
-        ),
-    ),
     "own losses": (lambda: _robust(PseudoHuber, Heavier, PseudoHuber), gaps),
     "own losses per component": (
         lambda: _robust(
@@ -855,8 +847,6 @@ OBSERVERS: Table = {
         prior=np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
     )), gaps),
     "extended irregular reinitialized": ("extended irregular", AGAIN, WARM),
-    "extended failing": (_failing,),
-    "extended failing reinitialized": (_failing, AGAIN),
     "extended conditions": ("extended prior", conditions),
     "extended conditions reinitialized": ("extended irregular", conditions, AGAIN, WARM),
     "unscented": (lambda: _observed(UnscentedKalman, spd(1, 3)), weighed),
@@ -868,7 +858,6 @@ OBSERVERS: Table = {
     ))),
     # A covariance that is singular up to rounding has a root only up to that.
     "unscented singular": (lambda: _observed(UnscentedKalman, spd(1, 3), **SINGULAR), looser),
-    "unscented failing": (lambda: _failing(make=UnscentedKalman),),
     "steady prior": (_steady,),
     "steady prior with gaps": (_steady, gaps, weighed),
     "steady conditions": (_steady, gaps, conditions),
@@ -886,8 +875,6 @@ INNOVATIONS: Table = {
     "gated observer": ("gated prior", ALONE, {"horizon": 1}),
     "gated in states": ("inputs and states", doubtful(Gate(reopen=2)), gaps),
     "gated angles": (_rover, doubtful(Gate(reopen=2)), gaps),
-    # Without QPs, as the observer is far from their estimates, of which there is a warning.
-    "gated failing": (_failing, doubtful(Gate(reopen=2)), ALONE),
     "gated singular": ("inputs", doubtful(
         Gate(reopen=2), prior=np.diag([1e-4, 0.0, 1e-4]), disturbance=np.diag([0.002, 0.0, 0.0])
     ), looser),
@@ -917,6 +904,21 @@ INJECTIONS: Table = {
     "injection in sets": ("inputs and states", by(
         lambda one: qpmhe.OutputInjection(lambda z, v: 2.0 * _saturated(z, v))
     )),
+}
+FAILING: Table = {
+    "power failing": (
+        lambda: _failing(1.8), lambda one: replace(
+            one, observer=Luenberger([[0.5], [0.3]]), cost=RobustCost(
+                prior=power(1.5)(10.0 * np.eye(2)), disturbance=power(1.2)(100.0 * np.eye(2)),
+                noise=power(1.5)([[100.0]]),
+            ),
+        ),
+    ),
+    "extended failing": (_failing,),
+    "extended failing reinitialized": (_failing, AGAIN),
+    "unscented failing": (lambda: _failing(make=UnscentedKalman),),
+    # Without QPs, as the observer is far from their estimates, of which there is a warning.
+    "gated failing": (_failing, doubtful(Gate(reopen=2)), ALONE),
     "injection failing": (_failing, lambda one: own_weight(one, qpmhe.OutputInjection(
         lambda z, v: np.array([0.4 * v[0] / np.sqrt(z[0]), 0.0])
     ), np.eye(2))),
@@ -926,7 +928,7 @@ FEATURES = {
     "usual": USUAL, "angles": ANGLES, "directions": DIRECTIONS, "held": HELD,
     "many_states": MANY_STATES, "losses": LOSSES, "states": STATES, "equations": EQUATIONS,
     "conditions": CONDITIONS, "observers": OBSERVERS, "innovations": INNOVATIONS,
-    "injections": INJECTIONS,
+    "injections": INJECTIONS, "failing": FAILING,
 }
 CASES = {name: made for table in FEATURES.values() for name, made in table.items()}
 

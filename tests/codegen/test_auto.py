@@ -269,6 +269,7 @@ def models():
     yield system(), 4
     for one in (
         system(0.8), system(0.9 + 1e-15), system(disturbances=box), system(disturbances=rows),
+        system(disturbances=qpmhe.Box([-2.0, -np.inf], [2.0, 9.0])),
         system(noises=qpmhe.Box([-1.0], [1.0])),
     ):
         yield one, 3

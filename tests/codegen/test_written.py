@@ -115,7 +115,7 @@ def test_levels_differ_by_contraction_only(name, command, tmp_path):
     start, events, _ = recorded(name)
     bits = set()
     for level in LEVELS:
-        for contraction in ("-ffp-contract=off", "-ffp-contract=fast"):
+        for contraction in ("-ffp-contract=off", "-ffp-contract=fast")[: 1 + (level in LEVELS[2:])]:
             program = built(name, tmp_path, (*FLAGS, contraction, *level), command)
             for record in (events, wild(name)):
                 found, log = driven(program, name, start, record)
@@ -176,16 +176,15 @@ def test_exports_its_public_names_and_needs_libm_only(tmp_path):
     )}
     libm = {"fmax", "fmin", "fabs", "sin", "cos", "sincos", "exp", "log", "log1p", "sqrt"}
     memory = {"memcpy", "memset", "memmove", "_GLOBAL_OFFSET_TABLE_"}
-    for real in ("double", "float"):
-        for name in ("matrix expressions", "tank", "unscented prior"):
-            header, source = write(
-                case(name).estimator("python"), tmp_path, name="reactor", real=real
-            )
-            made = tmp_path / "reactor.o"
-            subprocess.run(["cc", "-std=c99", "-O1", "-c", "-o", made, source], check=True)
-            assert symbols(made, "-g", "--defined-only") == public
-            assert symbols(made, "-u") <= memory | libm | {f"{one}f" for one in libm}
-            assert public <= set(re.findall(r"\b(reactor_\w+)[(;]", header.read_text()))
+    for name, real in (
+        ("matrix expressions", "double"), ("tank", "float"), ("unscented prior", "double"),
+    ):
+        header, source = write(case(name).estimator("python"), tmp_path, name="reactor", real=real)
+        made = tmp_path / "reactor.o"
+        subprocess.run(["cc", "-std=c99", "-O1", "-c", "-o", made, source], check=True)
+        assert symbols(made, "-g", "--defined-only") == public
+        assert symbols(made, "-u") <= memory | libm | {f"{one}f" for one in libm}
+        assert public <= set(re.findall(r"\b(reactor_\w+)[(;]", header.read_text()))
 
 
 BOTH = r"""

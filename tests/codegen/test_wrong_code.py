@@ -34,7 +34,6 @@ STEP_LIES = {
     "a step's length": "s/stage->step = step > 0 ? step :/stage->step =/",
     "a noise weight": "s/stage->has_own_noise ? stage->own_noise_weight : //",
     "failures": "s/int held = !isfinite(stage->cost)/int held = 1/",
-    "the verdict": "s/if (o->spare->cost < target) {/if (1) {/;s/= -k->gradient/= k->gradient/",
 }
 
 
@@ -107,7 +106,16 @@ def test_a_wrong_model_is_compiled_with_less_optimisation(lie, script, cache, mo
 
 @pytest.mark.parametrize("lie", STEP_LIES)
 def test_a_wrong_estimator_is_compiled_with_less_optimisation(lie, script, cache, monkeypatch):
-    script.lies(STEP_LIES[lie], [FAST, MIDDLE])
+    is_found_out(STEP_LIES[lie], script, cache, monkeypatch)
+
+
+def test_a_wrong_verdict_is_found_out(script, cache, monkeypatch):
+    verdict = "s/if (o->spare->cost < target) {/if (1) {/;s/= -k->gradient/= k->gradient/"
+    is_found_out(verdict, script, cache, monkeypatch)
+
+
+def is_found_out(edit, script, cache, monkeypatch):
+    script.lies(edit, [FAST, MIDDLE])
     system = linear(False)
     for _ in range(2):
         mhe = estimator(system)

@@ -83,8 +83,12 @@ def raw(**changes):
     return RawSolution(**{"claimed": True, "iterations": 7, **honest, **changes})
 
 
+def giving(found):
+    return lambda qp: found
+
+
 def answer(**changes):
-    return lambda qp: raw(**changes)
+    return giving(raw(**changes))
 
 
 def raising(error):
@@ -146,48 +150,45 @@ def test_the_user_can_still_interrupt():
             method(*arguments)
 
 
-@pytest.mark.parametrize("name", ARRAYS)
-def test_a_claim_is_not_judged_by_what_the_solver_left_of_the_problem(name):
-    def scale(lent):
-        getattr(lent, name)[...] *= 1e-12
-        lent.gradient *= 1e-12  # at zero, without multipliers, there is now nothing left to do
-        return RawSolution(np.zeros(21), True, 1, np.zeros(21), np.zeros(14))
+def test_a_claim_is_not_judged_by_what_the_solver_left_of_the_problem():
+    for name in ARRAYS:
+        def scale(lent, name=name):
+            getattr(lent, name)[...] *= 1e-12
+            lent.gradient *= 1e-12  # at zero, without multipliers, there is now nothing left to do
+            return RawSolution(np.zeros(21), True, 1, np.zeros(21), np.zeros(14))
 
-    solution = ask(scale)
-    assert solution.status is INACCURATE
-    assert solution.residuals.dual == np.abs(QP.gradient).max()
-    assert solution.message.startswith("it wrote into ")
-    assert name in solution.message
-    assert "read only" in solution.message
+        solution = ask(scale)
+        assert solution.status is INACCURATE
+        assert solution.residuals.dual == np.abs(QP.gradient).max()
+        assert solution.message.startswith("it wrote into ")
+        assert name in solution.message
+        assert "read only" in solution.message
 
 
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
+def test_who_scribbles_is_named_unless_right():
+    for changes, expected in [
         ({}, (SOLVED, "")),  # who is right all the same is believed
         ({"claimed": False, "message": "gave up"},
          (STOPPED, "gave up; it wrote into band, gradient, ")),
-    ],
-)
-def test_who_scribbles_is_named_unless_right(changes, expected):
-    def scribble(lent):
-        for name in ARRAYS:
-            getattr(lent, name)[...] = 1e-12
-        lent.bounded = False
-        return raw(**changes)
+    ]:
+        def scribble(lent, changes=changes):
+            for name in ARRAYS:
+                getattr(lent, name)[...] = 1e-12
+            lent.bounded = False
+            return raw(**changes)
 
-    solution = ask(scribble)
-    assert solution.status is expected[0]
-    assert solution.message.startswith(expected[1])
-    assert QP.bounded
-    assert ask(answer(claimed=False)).message == ""  # who only reads is not accused
+        solution = ask(scribble)
+        assert solution.status is expected[0]
+        assert solution.message.startswith(expected[1])
+        assert QP.bounded
+        assert ask(answer(claimed=False)).message == ""  # who only reads is not accused
 
-    class Derived(DispatchSolver):  # of one of ours: lent copies as well
-        def _solve(self, qp, start):
-            return scribble(qp)
+        class Derived(DispatchSolver):  # of one of ours: lent copies as well
+            def _solve(self, qp, start):
+                return scribble(qp)
 
-    assert Derived("quadprog", SolverOptions()).solve(QP).status is expected[0]
-    assert QP.gradient.all()
+        assert Derived("quadprog", SolverOptions()).solve(QP).status is expected[0]
+        assert QP.gradient.all()
 
 
 def test_an_overridden_solve_is_lent_a_copy_and_its_buffer_is_not_kept():
@@ -215,20 +216,19 @@ def test_what_is_no_qp_is_refused(name):
                 solver.solve(thing)
 
 
-@pytest.mark.parametrize("thing", [None, 3, "solved", {}, np.zeros(21), (None, True)])
-def test_something_else_than_a_solution(thing):
-    kind = type(thing).__name__
-    assert ask(lambda qp: thing).message == f"the backend returned {kind}, not a RawSolution"
-    expected = f"the backend's solve returned {kind}, not a Solution"
-    assert contained(lambda qp: thing).message == expected
+def test_something_else_than_a_solution():
+    for thing in [None, 3, "solved", {}, np.zeros(21), (None, True)]:
+        kind = type(thing).__name__
+        assert ask(giving(thing)).message == f"the backend returned {kind}, not a RawSolution"
+        expected = f"the backend's solve returned {kind}, not a Solution"
+        assert contained(giving(thing)).message == expected
 
 
 NOT_FINITE = "the solver returned an iterate that is not finite"
 
 
-@pytest.mark.parametrize(
-    ("d", "message"),
-    [
+def test_an_unusable_iterate():
+    for d, message in [
         (None, "the solver returned no iterate"),
         (np.zeros(20), "the solver returned 20 numbers for 21 unknowns"),
         (np.zeros((7, 4)), "the solver returned 28 numbers for 21 unknowns"),
@@ -240,16 +240,14 @@ NOT_FINITE = "the solver returned an iterate that is not finite"
         ([[0.0] * 20, [0.0]], "ValueError: "),
         ({}, "TypeError: "),
         ([1j] * 21, "the solver returned complex numbers"),
-    ],
-)
-def test_an_unusable_iterate(d, message):
-    for claimed in (True, False):
-        solution = ask(answer(d=d, claimed=claimed))
-        assert (solution.status, solution.residuals) == (FAILED, None)
+    ]:
+        for claimed in (True, False):
+            solution = ask(answer(d=d, claimed=claimed))
+            assert (solution.status, solution.residuals) == (FAILED, None)
+            assert solution.message.startswith(message)
+        solution = contained(giving(Solution(d, SOLVED)))
+        assert (solution.d, solution.status) == (None, FAILED)
         assert solution.message.startswith(message)
-    solution = contained(lambda qp: Solution(d, SOLVED))
-    assert (solution.d, solution.status) == (None, FAILED)
-    assert solution.message.startswith(message)
 
 
 class Touchy(Solution):
@@ -259,19 +257,16 @@ class Touchy(Solution):
     d = property(raising(RuntimeError("do not touch")), lambda self, value: None)
 
 
-@pytest.mark.parametrize(
-    ("found", "message"),
-    [
+def test_solutions_that_are_none():
+    for found, message in [
         (raw(), "the backend's solve returned RawSolution"),
         (Solution(np.zeros((7, 3)), "solved"), "the status of the backend's Solution is str"),
         (Solution(np.zeros((7, 3)), FAILED, message="gave up"), "gave up"),
         (Touchy(None, SOLVED), "RuntimeError: do not touch"),
-    ],
-)
-def test_solutions_that_are_none(found, message):
-    solution = contained(lambda qp: found)
-    assert (solution.d, solution.status) == (None, FAILED)
-    assert solution.message.startswith(message)
+    ]:
+        solution = contained(giving(found))
+        assert (solution.d, solution.status) == (None, FAILED)
+        assert solution.message.startswith(message)
 
 
 def test_the_words_of_a_solver_without_iterate_are_kept():
@@ -279,15 +274,15 @@ def test_the_words_of_a_solver_without_iterate_are_kept():
     assert (solution.status, solution.message, solution.iterations) == (FAILED, "gave up", 7)
 
 
-@pytest.mark.parametrize("shape", [(21,), (7, 3), (21, 1), (1, 21)])
-def test_the_form_of_an_iterate_is_free(shape):
-    d = BEST.d.reshape(shape)
-    for given_as in (d, d.tolist(), np.asfortranarray(d), d.astype(object)):
-        for solution in (
-            ask(answer(d=given_as)), contained(lambda qp, d=given_as: Solution(d, SOLVED, 5)),
-        ):
-            assert solution.status is SOLVED
-            np.testing.assert_array_equal(solution.d, BEST.d)
+def test_the_form_of_an_iterate_is_free():
+    for shape in [(21,), (7, 3), (21, 1), (1, 21)]:
+        d = BEST.d.reshape(shape)
+        for given_as in (d, d.tolist(), np.asfortranarray(d), d.astype(object)):
+            for solution in (
+                ask(answer(d=given_as)), contained(giving(Solution(given_as, SOLVED, 5))),
+            ):
+                assert solution.status is SOLVED
+                np.testing.assert_array_equal(solution.d, BEST.d)
 
 
 def interior(where):
@@ -297,34 +292,35 @@ def interior(where):
     return qp, d, dense.hessian @ d.ravel() + dense.gradient
 
 
-@pytest.mark.parametrize("options", [
-    SolverOptions(), SolverOptions(absolute_tolerance=1e-3), SolverOptions(relative_tolerance=1e-3),
-])
-def test_success_that_is_none(options):
-    d = BEST.d.copy()
-    d[0] += 1.0
-    for duals in ({}, {"bound_duals": None, "row_duals": None}):
-        solution = ask(answer(d=d, **duals), options=options)
-        assert (solution.status, solution.status.usable) == (INACCURATE, True)
-        assert solution.residuals.primal == pytest.approx(DENSE.violation(d))
-        np.testing.assert_array_equal(solution.d, d)
-    zeros, none = np.zeros(12), np.zeros(0)
-    qp, d, gradient = interior("inside")
-    solution = ask(answer(d=d, bound_duals=zeros, row_duals=none), qp, options)
-    assert (solution.status, solution.residuals.primal) == (INACCURATE, 0.0)
-    assert solution.residuals.dual == pytest.approx(np.abs(gradient).max())
-    # Every point is stationary with these; that they push from no bound shows in the gap.
-    solution = ask(answer(d=d, bound_duals=-gradient, row_duals=none), qp, options)
-    assert solution.status is INACCURATE
-    assert solution.residuals.gap > 0.01
-    # At zero, with multipliers zero, there is no gap and no violation, only a gradient.
-    qp.lower[...], qp.upper[...] = -0.1, 0.1
-    solution = ask(answer(d=zeros, bound_duals=zeros, row_duals=none), qp, options)
-    assert (solution.residuals.primal, solution.residuals.gap) == (0.0, 0.0)
-    assert (solution.status, solution.residuals.dual) == (INACCURATE, np.abs(qp.gradient).max())
-    qp, d, gradient = interior("far")
-    solution = ask(answer(d=d, bound_duals=-gradient, row_duals=none), qp, options)
-    assert solution.status is INACCURATE
+def test_success_that_is_none():
+    for options in [
+        SolverOptions(), SolverOptions(absolute_tolerance=1e-3),
+        SolverOptions(relative_tolerance=1e-3),
+    ]:
+        d = BEST.d.copy()
+        d[0] += 1.0
+        for duals in ({}, {"bound_duals": None, "row_duals": None}):
+            solution = ask(answer(d=d, **duals), options=options)
+            assert (solution.status, solution.status.usable) == (INACCURATE, True)
+            assert solution.residuals.primal == pytest.approx(DENSE.violation(d))
+            np.testing.assert_array_equal(solution.d, d)
+        zeros, none = np.zeros(12), np.zeros(0)
+        qp, d, gradient = interior("inside")
+        solution = ask(answer(d=d, bound_duals=zeros, row_duals=none), qp, options)
+        assert (solution.status, solution.residuals.primal) == (INACCURATE, 0.0)
+        assert solution.residuals.dual == pytest.approx(np.abs(gradient).max())
+        # Every point is stationary with these; that they push from no bound shows in the gap.
+        solution = ask(answer(d=d, bound_duals=-gradient, row_duals=none), qp, options)
+        assert solution.status is INACCURATE
+        assert solution.residuals.gap > 0.01
+        # At zero, with multipliers zero, there is no gap and no violation, only a gradient.
+        qp.lower[...], qp.upper[...] = -0.1, 0.1
+        solution = ask(answer(d=zeros, bound_duals=zeros, row_duals=none), qp, options)
+        assert (solution.residuals.primal, solution.residuals.gap) == (0.0, 0.0)
+        assert (solution.status, solution.residuals.dual) == (INACCURATE, np.abs(qp.gradient).max())
+        qp, d, gradient = interior("far")
+        solution = ask(answer(d=d, bound_duals=-gradient, row_duals=none), qp, options)
+        assert solution.status is INACCURATE
 
 
 @pytest.mark.parametrize(
@@ -357,15 +353,12 @@ def test_what_comes_with_a_step_is_kept_where_it_can_be_used():
     assert isinstance(solution.message, str)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_huge_finite_numbers_are_judged():
+    for changes in [
         {"d": 1e308 * (-1.0) ** np.arange(21)}, {"d": np.full(21, 1e308)},
         {"bound_duals": np.full(21, 1e308)}, {"row_duals": np.full(14, 1e308)},
-    ],
-)
-def test_huge_finite_numbers_are_judged(changes):
-    assert ask(answer(**changes)).status is INACCURATE
+    ]:
+        assert ask(answer(**changes)).status is INACCURATE
 
 
 def test_warnings_stay_inside():
@@ -459,7 +452,7 @@ iterates = st.one_of(rubbish, st.lists(st.floats(-1e6, 1e6), min_size=4, max_siz
 def test_any_answer_is_contained(d, claimed, bound_duals, row_duals):
     qp, dense = make(2, 2, 2, bounds="part", sides="two")
     for found in (d, RawSolution(d, claimed, None, bound_duals, row_duals)):
-        solution = ask(lambda _, found=found: found, qp)
+        solution = ask(giving(found), qp)
         assert solution.status is not SOLVED or dense.violation(solution.d) <= 1e-3
 
 

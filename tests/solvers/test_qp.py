@@ -23,7 +23,6 @@ from qpmhe_solvers import (
     SolverOptions,
     band_index,
 )
-from qpmhe_solvers.layout import Structure
 from qpmhe_solvers.qp import ARRAYS, Places
 
 from .problems import make, overwrite, registered
@@ -149,22 +148,6 @@ def test_all_numbers_of_a_qp_are_in_one_array():
             (places.own + one.row_own.size, one.row_next),
         ):
             np.testing.assert_array_equal(one.numbers[start : start + array.size], array.ravel())
-
-
-def test_the_pattern_is_that_of_limits_and_sizes_only():
-    def key(qp):
-        return *qp.sizes, Structure.of(qp, exact=True).key
-
-    qp, seen = QP(2, 1, 1), [key(QP(1, 2, 1)), key(QP(2, 1, 1))]
-    for name, value in (
-        ("lower", 0.0), ("upper", 0.0), ("row_lower", 1.0), ("row_upper", 2.0), ("row_upper", 1.0),
-    ):
-        getattr(qp, name)[1, 0] = value
-        seen.append(key(qp))
-    assert len(set(seen)) == len(seen)
-    for name in ARRAYS:
-        getattr(qp, name)[...] += 0.5
-    assert key(qp) == seen[-1]
 
 
 @pytest.mark.parametrize(
