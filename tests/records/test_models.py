@@ -87,7 +87,8 @@ MISFITS = [
     ("return 1", "x = 1\ny = (", ["line 2", "SyntaxError"]),
     ("return 1", "x = 1\nimport nowhere_to_be_found", ["line 2", "nowhere_to_be_found"]),
     ("return 1", "def f():\n    return 1 / 0\nf()", ["line 2", "ZeroDivisionError"]),
-    (f"f = lambda x: x * gain\n    return qpmhe.System(f, f, n=1, p=1), {PARTS[14:]}", BEGIN,
+    (f"f = lambda x: x * gain\n    return qpmhe.System(f, f, n=1, p=1), {PARTS[15:]}, "
+     "dict(horizon=3, initial_state=1.0)", BEGIN,
      ["line 8: ", "f raised NameError: name 'gain' is not defined"]),
 ]
 
