@@ -154,6 +154,7 @@ class Case:
         }
         self.scribble = rng.random() < 0.3
         self.snapshots = rng.random() < 0.15
+        observer, cost = self.watcher.made(self.system), self.price.made()
         self.hold = None
         if quadratic and model.kind in SMOOTH and rng.random() < 0.5:
             self.hold = Held(rng, model, self.price, self.watcher, self.fixed)
@@ -163,7 +164,6 @@ class Case:
         )
         if self.options["max_qps"] == 0:
             self.hold = None
-        observer, cost = self.watcher.made(self.system), self.price.made()
         self.arguments = (self.system, observer, cost)
         return self._estimator()
 

@@ -36,6 +36,16 @@ def test_every_step_is_what_it_says(pytestconfig, source, writing):
     assert counts["steps"] == steps
 
 
+@pytest.mark.parametrize(
+    ("source", "writing", "seed"), [("numpy", "matmul", 3), ("casadi", "compiled", 2)]
+)
+def test_states_are_held_as_the_formulas_say(source, writing, seed):
+    pytest.importorskip(source)
+    counts, failures = fuzz(240, seed, source=source, writing=writing)
+    assert failures == []
+    assert counts["held", True] >= 80
+
+
 def scaled(array, place, factor):
     array[place] *= factor
 

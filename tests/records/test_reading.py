@@ -32,7 +32,7 @@ def refused(content, model=CONTINUOUS, **options):
     return message
 
 
-@pytest.mark.parametrize(("wrong", "words"), [
+WRONG_LINES = [
     ("0.3,high,0\n", ["column 'y'", "'high' is not a number", "blank"]),
     ("0.3,0.5,1_000\n", ["column 'u'", "'1_000' is not a number"]),
     ("0.3,\0\0,0\n", ["column 'y'", "not a number"]),
@@ -56,22 +56,26 @@ def refused(content, model=CONTINUOUS, **options):
     ("0.3", ["cut off"]), ("0.3,0.5", ["cut off"]), ("0.3,\"0.5", ["quotation"]),
     ("0.3,0.5,-", ["may be cut off"]),
     (b"0.3,\xb0,0\n", ["byte 5", "--encoding"]),
-], ids=repr)
-def test_a_wrong_line(here, wrong, words):
-    content = GOOD.encode() + (wrong if isinstance(wrong, bytes) else wrong.encode())
-    message = refused(content)
-    assert message.startswith("record.csv, line 5")
-    for word in (*words, "--resume"):
-        assert word in message
-    # The good ones are estimated all the same.
-    found = get("out.csv")
-    assert found.count(b"\n") >= 3
+]
+
+
+def test_wrong_lines(here):
     put("record.csv", [GOOD], "")
     estimate(CONTINUOUS, out="expected.csv")
-    assert get("expected.csv").startswith(found)
+    for wrong, words in WRONG_LINES:
+        content = GOOD.encode() + (wrong if isinstance(wrong, bytes) else wrong.encode())
+        message = refused(content)
+        assert message.startswith("record.csv, line 5"), message
+        for word in (*words, "--resume"):
+            assert word in message, wrong
+        # The good ones are estimated all the same.
+        assert get("out.csv").count(b"\n") >= 3
+        assert get("expected.csv").startswith(get("out.csv"))
+    # With the right encoding it is a text, and no number.
+    assert "'°' is not a number" in refused(GOOD.encode() + b"0.3,\xb0,0\n", encoding="cp1252")
 
 
-@pytest.mark.parametrize(("content", "words"), [
+NO_SAMPLES = [
     (b"", "is empty"), (b"\n\n \n", "is empty"), (b"\xef\xbb\xbf", "is empty"),
     (b"time,y,u\n", "no samples"), (b"time,y,u", "no samples"),
     (b"0.0,0.5,0\n0.1,0.6,0\n", "header"),
@@ -89,11 +93,14 @@ def test_a_wrong_line(here, wrong, words):
     (f"# logger v1\n{GOOD}".encode(), "Skip lines above the header by --skip-lines"),
     (f"Logger,v1\n\nserial,77\n{GOOD}".encode(), "Skip lines above the header by --skip-lines"),
     (",".join(f"channel {k:04d} {'x' * 500}" for k in range(500)).encode(), "and 460 more"),
-], ids=lambda one: one[:20] if isinstance(one, str) else "")
-def test_records_without_a_single_sample(here, content, words):
-    message = refused(content)
-    assert words in message
-    assert "--encoding" not in message
+]
+
+
+def test_records_without_a_single_sample(here):
+    for content, words in NO_SAMPLES:
+        message = refused(content)
+        assert words in message, content[:40]
+        assert "--encoding" not in message
 
 
 def test_files_that_cannot_be_read(here):
@@ -147,7 +154,7 @@ def test_gzip_and_parquet_by_whatever_name(here):
     assert "it is a Parquet file" in error
 
 
-@pytest.mark.parametrize(("content", "options", "note"), [
+WRITINGS = [
     (SHORT[:-1], {}, "the last line of record.csv, 4, has no end of line"),
     (f"{SHORT},,\n,,\n", {}, "2 rows without any value"),
     (f"{SHORT},,\n , ,\n,,", {}, "3 rows without any value"),
@@ -166,27 +173,30 @@ def test_gzip_and_parquet_by_whatever_name(here):
     ('"Time, h","Level ""1""",x\n"0",1,2\n"1",2,1\n2,"1",2\n',
      {"time": "Time, h", "outputs": '"y1=Level ""1""",y2=x', "separator": ","}, None),
     (SHORT.replace("\n2,", "\n1,7,7\n1.0,,\n2,"), {"skip_repeated": True}, None),
-], ids=lambda one: one[:30] if isinstance(one, str) else "")
-def test_ways_of_writing_a_record_make_no_difference(here, content, options, note):
+]
+
+
+def test_ways_of_writing_a_record_make_no_difference(here):
     _, expected = read(SHORT)
-    summary, found = read(content, **options)
-    assert found == expected
-    assert summary.repeated == (2 if "skip_repeated" in options else 0)
-    assert [note in one for one in summary.notes] == [True] * bool(note)
+    for content, options, note in WRITINGS:
+        summary, found = read(content, **options)
+        assert found == expected, content
+        assert summary.repeated == (2 if "skip_repeated" in options else 0)
+        assert [note in one for one in summary.notes] == [True] * bool(note), content
 
 
-@pytest.mark.parametrize(("time", "options"), [
-    ("04.05.2026 12:00:0{}", {}), ("4.5.2026 12:00:0{}.000", {}),
-    ("05/04/2026 0{}", {"time_format": "%m/%d/%Y %S"}),
-    ("{},000", {}), ("{}000", {"time_scale": 1e-3}),
-])
-def test_ways_of_writing_times_make_no_difference(here, time, options):
-    results = []
-    for form in (time, "{}"):
+def test_ways_of_writing_times_make_no_difference(here):
+    expected = None
+    for form, options in (
+        ("{}", {}), ("04.05.2026 12:00:0{}", {}), ("4.5.2026 12:00:0{}.000", {}),
+        ("05/04/2026 0{}", {"time_format": "%m/%d/%Y %S"}), ("{},000", {}),
+        ("{}000", {"time_scale": 1e-3}),
+    ):
         text = [f"{form.format(t)};{t % 2};1,5" for t in range(9)]
-        _, found = read("\n".join(["time;y1;y2", *text, ""]), **(options if form == time else {}))
-        results.append([row.partition(",")[2] for row in found.splitlines()])
-    assert results[0] == results[1]
+        _, found = read("\n".join(["time;y1;y2", *text, ""]), **options)
+        found = [row.partition(",")[2] for row in found.splitlines()]
+        expected = expected or found
+        assert found == expected, form
 
 
 def test_an_end_that_may_be_cut_off_is_read_again(here):
