@@ -78,6 +78,7 @@ def test_a_record_is_compared_by_its_costs_and_where_truth_is_known_by_errors(he
     assert found[0] == pytest.approx(np.sqrt((errors**2).mean()), rel=1e-4)
     assert np.isnan(found[1])
     assert frame["rmse"].gt(0).all()
+    assert frame["rmse_settled"].isna().all()  # without a scenario nobody knows from when on
 
 
 def test_a_record_in_python_and_in_a_file(here, tmp_path):
