@@ -78,6 +78,42 @@ def test_estimates_of_angles_are_drawn_on_the_turn_of_the_truth():
         assert high > drawn["estimate"][1:, 1].max()
 
 
+def test_time_is_in_seconds_where_the_step_is_known(case):
+    _, run, estimate = case
+    for panel in (plots.states(run)[-1], plots.costs(run), plots.outcomes(run)):
+        assert panel.get_xlabel() == "time t (s)"
+        assert panel.lines[0].get_xdata()[-1] == pytest.approx(3.0)
+    assert plots.costs(run, time_label="time t (min)").get_xlabel() == "time t (min)"
+    assert plots.window(estimate)[-1].get_xlabel() == "time t (samples)"
+    assert plots.window(estimate, dt=0.1)[-1].get_xlabel() == "time t (s)"
+    steps = np.linspace(0.1, 0.2, 30)
+    source, run.source = run.source, run.source._replace(steps=steps)
+    try:
+        drawn = lines(plots.states(run)[0])["estimate"]
+        np.testing.assert_allclose(drawn[:, 0], [0.0, *np.cumsum(steps)])
+        run.source = None
+        assert plots.states(run)[-1].get_xlabel() == "time t (samples)"
+    finally:
+        run.source = source
+
+
+def test_one_thing_has_one_colour(case):
+    _, run, estimate = case
+    states, colors = run.states, plots.COLORS
+    (panel, _) = plots.trajectories(
+        np.arange(31.0), states, {"EKF": states, "observer alone": states, "MHE, 2 QPs": states,
+                                  "i = 0": states}, ["x", "y"], "time")
+    found = {line.get_label(): line.get_color() for line in panel.lines}
+    assert found["truth"] == colors["truth"]
+    assert found["observer alone"] == found["i = 0"] == colors["observer"]
+    assert found["MHE, 2 QPs"] == colors["estimate"]
+    assert found["EKF"] not in colors.values()
+    for drawn in (plots.costs(run), plots.window(estimate)[0]):
+        found = {line.get_label().partition(",")[0]: line.get_color() for line in drawn.lines}
+        assert found["estimate"] == colors["estimate"]
+        assert found["candidate"] == colors["observer"]
+
+
 def test_the_window_stands_at_its_times(case):
     _, _, estimate = case
     axes = plots.window(estimate)
@@ -97,7 +133,7 @@ def test_costs_mark_the_steps_that_kept_the_candidate(case):
     assert "candidate kept" not in drawn
     run.flags[4] ^= Status.IMPROVED.value | Status.CANDIDATE.value
     try:
-        assert lines(plots.costs(run))["candidate kept"][:, 0].tolist() == [5.0]
+        assert lines(plots.costs(run, dt=2.0))["candidate kept"][:, 0].tolist() == [10.0]
     finally:
         run.flags[4] ^= Status.IMPROVED.value | Status.CANDIDATE.value
 
@@ -108,7 +144,7 @@ def test_outcomes_have_a_row_for_what_occurred(case):
     assert [text.get_text() for text in panel.get_yticklabels()] == [
         "improved (100%)", "missing data (10%)"
     ]
-    assert panel.lines[1].get_xdata().tolist() == [13.0, 14.0, 15.0]
+    assert panel.lines[1].get_xdata() == pytest.approx([1.3, 1.4, 1.5])
 
 
 def test_step_times_tell_how_many_are_late(case):
