@@ -28,7 +28,7 @@ SINGULAR = 1e-12
 
 
 def numbers(name: str, value: ArrayLike, *, finite: bool = True) -> Array:
-    """A float copy of value; real, and finite unless told otherwise.
+    """A float copy of value; real, and finite unless stated otherwise.
 
     NaN stands for None, pandas' NA and NaT, and what is masked.
     """

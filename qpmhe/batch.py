@@ -444,11 +444,11 @@ class BatchRun:
     Attributes
     ----------
     states : (K, T + 1, n) array
-        Estimates of x(0), ..., x(T), each made before y of its own time.
+        Estimates of x(0), ..., x(T); that of x(t) is made before y(t).
     observer_states : (K, T + 1, n) array
         The observers' own states z(0), ..., z(T).
     filtered, delayed : (K, T, n) array
-        Estimates with y of their own time; delayed ones, NaN until the windows reach the delay.
+        Estimates of x(t) made with y(t); delayed ones, NaN until the windows reach the delay.
     costs, candidate_costs : (K, T) array
         True cost J of estimates and candidates.
     statuses, qps : (K, T) int array

@@ -35,7 +35,7 @@ def write(
     estimator: MovingHorizonEstimator, directory: str | PathLike[str], *, name: str = "mhe",
     real: str = "double", fmu: bool = False,
 ) -> tuple[Path, ...]:
-    """Write the estimator as a C99 header and source that need nothing but libm.
+    """Write the estimator as a C99 header and source that need only libm.
 
     The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
     factorisation (active sets where inequalities bind), the verdict by the true

@@ -134,7 +134,7 @@ class CompiledEngine:
 
     @property
     def usual(self) -> Conditions:
-        """What holds where a sample has nothing of its own."""
+        """The conditions of a sample that comes without any."""
         return self._tools.usual
 
     @property

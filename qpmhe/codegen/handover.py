@@ -51,7 +51,7 @@ def hand_over(record: Any, directions: Directions, usual: Conditions, engine: Py
 
 
 def _conditions(stage: Any, directions: Directions) -> Conditions | None:
-    """What a stage was taken with; None if nothing but what is usual."""
+    """What a stage came with; None if it came without any conditions."""
     found: dict[str, Any] = {}
     if stage["has_own_noise"]:
         found["noise_weight"] = stage["own_noise_weight"].copy()

@@ -107,7 +107,7 @@ def _without_form(cost: Cost) -> str:
         for name in TERMS:
             loss = getattr(cost, f"{name}_loss")
             form = loss.c_form
-            reason = "it has a cost of its own" if form is None else ""
+            reason = "a subclass overrides its cost" if form is None else ""
             if form is not None and form.kind == "own":
                 reason = loss_function(form).reason
             if reason:

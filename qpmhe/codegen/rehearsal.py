@@ -204,7 +204,7 @@ def _magnitude(problem: Problem, trial: Trial) -> float:
 
 
 class _Follower(PythonEngine):
-    """The Python step with C's trajectories in place of its own."""
+    """The Python step, given the trajectories of the C step."""
 
     def __init__(self, nudge: Any, *arguments: Any) -> None:
         self.guide = _Guide(nudge)

@@ -1,4 +1,4 @@
-"""A sample with weights, sides, sensors or a step of its own, as the C step takes it."""
+"""A sample that comes with weights, sides, sensors or a step length, for the C step."""
 
 from __future__ import annotations
 

@@ -386,7 +386,7 @@ class Cost(ABC):
         """The stage weight where only the observed components of y are there, (p,) bool.
 
         It is zero on the others; those there weigh the inverse of their block of the covariance
-        of the noise. This sample may have weights of its own, ``noise`` and ``disturbance``.
+        of the noise. This sample may come with other weights, ``noise`` and ``disturbance``.
         """
         if noise is not None or disturbance is not None:
             return self._reduced(observed, self.noise if noise is None else noise, disturbance)

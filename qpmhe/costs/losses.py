@@ -62,7 +62,7 @@ class Loss(ABC):
 
     @property
     def c_form(self) -> LossForm | None:
-        """What the step in C needs of the loss; None of one with a `cost` of its own."""
+        """What the step in C needs of the loss; None if a subclass overrides `cost`."""
         names = ("cost", "majorise")
         if any(getattr(type(self), name) is not getattr(Loss, name) for name in names) or any(
             name in vars(self) for name in names

@@ -242,7 +242,7 @@ class ConditionReader:
         if mask.sum() != array.size:
             raise InvalidInputError(
                 f"sensors is {shown(sensors)}; expected each output at most once. For a second "
-                "measurement of one, make it an output of its own."
+                "measurement of one, make it a separate output."
             )
         return array.astype(np.intp), mask
 

@@ -165,7 +165,7 @@ class PythonEngine:
 
     @property
     def usual(self) -> Conditions:
-        """What holds where a sample has nothing of its own."""
+        """The conditions of a sample that comes without any."""
         return self._tools.usual
 
     @property

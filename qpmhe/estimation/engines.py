@@ -57,7 +57,7 @@ class Engine(Protocol):
 
     @property
     def usual(self) -> Conditions:
-        """What holds where a sample has nothing of its own."""
+        """The conditions of a sample that comes without any."""
 
     @property
     def system(self) -> System:

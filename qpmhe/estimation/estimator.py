@@ -111,7 +111,7 @@ class MovingHorizonEstimator:
         ``estimate.delayed`` is the estimate of the state this many steps before
         ``estimate.state``; at most N.
     isolated : bool
-        Whether the backend solves in a process of its own, so that a crash of compiled code is
+        Whether the backend solves in a separate process, so that a crash of compiled code is
         a failed QP and nothing more, and the time budget stops any backend. It adds some tenths
         of a millisecond to each QP. Not for ``engine="compiled"``, which needs no backend.
     arrival : {"observer", "smoothed"}
@@ -629,7 +629,7 @@ class MovingHorizonEstimator:
         ------
         InvalidInputError
             Before the first measurement, or if second derivatives do not exist along the
-            estimate or are not known: of a cost of the user's own, or of an active nonlinear
+            estimate or are not known: of a cost that the user wrote, or of an active nonlinear
             constraint of more than the state.
         """
         return self._sensitivity_of(self._engine.solved())

@@ -63,9 +63,9 @@ class Run:
     Parameters
     ----------
     states : (T + 1, n) array
-        Estimates of x(0), ..., x(T), each made before y of its own time; row 0 is the start.
+        Estimates of x(0), ..., x(T); that of x(t) is made before y(t); row 0 is the start.
     filtered : (T, n) array
-        Estimates of x(0), ..., x(T-1), each made with y of its own time.
+        Estimates of x(0), ..., x(T-1); that of x(t) is made with y(t).
     costs, candidate_costs : (T,) array
         True cost J of estimate and candidate.
     times, solve_times : (T,) array

@@ -44,7 +44,7 @@ class Gradient:
     prior_weight : (..., n, n) array
         By the weight of the prior; where the observer gives it, by what it gave.
     disturbance_weight, noise_weight : (..., r, r) and (..., p, p) array
-        By the cost's weights. Samples that came with weights of their own do not count. Where
+        By the cost's weights. Samples that came with other weights do not count. Where
         the covariance of w is singular, by the weight (s, s) of its factor, see `Cost`.
     disturbance_weights, noise_weights : (..., K, r, r) and (..., K, p, p) array
         By the weights of each sample, whether usual or its own.

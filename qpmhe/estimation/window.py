@@ -118,7 +118,7 @@ class Window(Stages):
 
     @property
     def has_special_weights(self) -> bool:
-        """Whether some stage of the window has a weight of its own."""
+        """Whether some sample of the window came with another weight."""
         return self.unusual and bool(np.count_nonzero(self._special[self.start : self.end]))
 
     @property

@@ -328,7 +328,7 @@ def _watch(record: Record) -> Iterator[None]:
 
 @functools.lru_cache(maxsize=1000)
 def _telling(code: Any) -> str:
-    """What in some code could tell symbols from numbers; blank if nothing."""
+    """What in some code could distinguish symbols from numbers; blank if nothing."""
     before = None
     instructions = list(dis.get_instructions(code))
     for one, after in zip(instructions, [*instructions[1:], None], strict=True):
@@ -339,7 +339,7 @@ def _telling(code: Any) -> str:
             # The type of the object that a method belongs to.
             one.argval == "type" and after is not None and after.argval in ("self", "cls")
         ):
-            return f"{one.argval}, which tells symbols from numbers"
+            return f"{one.argval}, which distinguishes symbols from numbers"
         if one.opname == "IS_OP" and not (before and before.opname == "LOAD_CONST"):
             return "whether two objects are the same"
         before = one

@@ -272,7 +272,7 @@ def module_file(place: str) -> Path | None:
 
 
 def fingerprint(path: Path) -> str:
-    """Digest of a file, and of the files of its own folder that it imports."""
+    """Digest of a file, and of the files in its folder that it imports."""
     digest = hashlib.sha256(path.read_bytes())
     for file in sorted(_files(path)[1:]):
         digest.update(f"\0{file.relative_to(path.parent).as_posix()}\0".encode())

@@ -1,4 +1,4 @@
-"""An observer with a correction of the user's own."""
+"""An observer with a correction that the user writes."""
 
 from __future__ import annotations
 

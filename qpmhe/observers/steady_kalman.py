@@ -33,7 +33,7 @@ class SteadyStateKalman(Observer):
         P(t+1) = (A - K C) P(t) (A - K C)^\top + Q + K R K^\top
 
     which stays at P from P(0) = P on, and leaves it only where outputs are missing (their
-    columns of K are zero then) or a sample has a noise weight of its own. The gain itself
+    columns of K are zero then) or a sample comes with another noise weight. The gain itself
     never changes. On a linear system with P(0) = P it is the Kalman predictor.
 
     Parameters

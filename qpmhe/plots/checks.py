@@ -80,7 +80,7 @@ def named_curves(
     if len(estimates) > most:
         raise InvalidInputError(
             f"estimates are {len(estimates)}: {', '.join(map(str, estimates))}; expected at most "
-            f"{most}, which can be told apart. Draw the others into axes of their own."
+            f"{most}, which readers can distinguish. Draw the others into other axes."
         )
     return {
         label: curve(f"estimates[{label!r}]", values, length, n)

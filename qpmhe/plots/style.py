@@ -121,7 +121,7 @@ def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:
         if not isinstance(one, Axes):
             raise InvalidInputError(
                 f"axes contain {one!r}; expected matplotlib Axes, {count} of them, such as "
-                "plt.subplots makes; leave axes out for a figure of its own."
+                "plt.subplots makes; leave axes out to get a new figure."
             )
     if len(given) != count:
         raise ShapeError(f"axes are {len(given)}; expected {count}, one for each panel.")

@@ -182,7 +182,7 @@ def _names(labels: Sequence[str] | None, n: int) -> list[str]:
 
 
 def _legend(drawn: list[Any], axes: Any) -> None:
-    """One legend: above all panels of a figure of its own, else within the first panel."""
+    """One legend: above all panels of a new figure, or within the first of given panels."""
     handles, names = drawn[0].get_legend_handles_labels()
     if axes is not None:
         drawn[0].legend(frameon=False)

@@ -300,7 +300,8 @@ def _again(workers: _Processes | _Cluster, task: Task) -> Result:
         if isinstance(answer, dict):
             if isolated and answer["outcome"] == "done":
                 answer["reason"] = (
-                    f"the backend ran in a process of its own, since the cell's died, twice{words}"
+                    "the backend ran in a separate process, since the cell's process died "
+                    f"twice{words}"
                 )
             return answer
         signals = _SIGNALS.search(str(answer))

@@ -86,7 +86,7 @@ class Data:
                 raise InvalidInputError(f"dt of {name} has steps <= 0; sort the record by time.")
             if system.make_timed is None:
                 raise InvalidInputError(
-                    f"{name} has steps of its own (dt), and the system is discrete; make it by "
+                    f"{name} has step lengths (dt), but the system is discrete; make it by "
                     "System.from_ode, or resample the record."
                 )
         self.truth = None if given.states is None else _truth(
@@ -224,7 +224,7 @@ def constant_inputs(data: list[Data], needed: bool) -> list[int]:
     still = np.flatnonzero(np.ptp(us, axis=0) == 0.0).tolist() if us.size else []
     if needed and us.shape[1] and len(still) == us.shape[1]:
         raise InvalidInputError(
-            "all inputs are constant in all records: what they act by cannot be told from an "
+            "all inputs are constant in all records: their effect cannot be distinguished from an "
             "offset, so parameters of the model cannot be tuned. Record with inputs that change, "
             "or leave parameters out."
         )

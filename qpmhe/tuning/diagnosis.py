@@ -117,9 +117,9 @@ def diagnose(
 
     An extended Kalman filter with the model, and with the inverse weights Q, R as covariances,
     runs over the record from the N-th sample on, or from the tenth. If all is well, its
-    innovations are white and as large as it says. Where they are not, each fault below has a
-    filter of its own, which takes the record for what it would be without the fault; the one under
-    which the record is most likely is the first finding, and the search goes on beside it. Ten
+    innovations are white and have the predicted covariance. Where they do not, each fault below
+    has a filter that corrects the record for this fault. The fault that makes the record most
+    likely is the first finding; the search for others continues with it corrected. The ten
     measurements after a gap of ten samples or more are no evidence.
 
     * R or Q, of all or of one component, too small or too large by a factor;

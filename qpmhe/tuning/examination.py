@@ -1,4 +1,4 @@
-"""What is computed of a run to tell whether it is healthy, and what it says."""
+"""What is computed of a run to judge whether it is healthy, and the findings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The faults that a record can have: each a filter of its own, judged by its likelihood."""
+"""The faults that a record can have: each is a filter, judged by its likelihood."""
 
 from __future__ import annotations
 

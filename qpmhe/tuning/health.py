@@ -293,7 +293,7 @@ def _item(one: Finding) -> str:
 
 
 def _svg(diagnosis: Diagnosis, one: _Figure, number: int) -> str:
-    """One figure as SVG for a page, with text as text, and names of its own for its parts."""
+    """One figure as SVG for a page, with text as text; the number makes its ids unique."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

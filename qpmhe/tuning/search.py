@@ -170,7 +170,7 @@ def search_all(
 
 
 def _alone(recipe: tuple[Any, ...], k: int, begin: Array) -> tuple[int, Array, float]:
-    """One search in a process of its own."""
+    """One search in a separate process."""
     return k, *search_likelihood(Likelihood(*recipe), begin, lambda *_: None)
 
 

@@ -321,7 +321,7 @@ def _interruptible() -> Iterator[None]:
 
 @contextmanager
 def _shown(progress: bool | Console) -> Iterator[Callable[[str], None]]:
-    """A progress bar, and what tells it where the search is."""
+    """A progress bar, and the function that reports progress to it."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

@@ -1,4 +1,4 @@
-"""A backend in a process of its own, which it may crash or hang as it likes."""
+"""A backend in a separate process, whose crashes and hangs end one QP only."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def _csc(entries: Entries, shape: tuple[int, int]) -> csc_matrix:
 
 
 def as_csc(pattern: csc_matrix, values: Array) -> csc_matrix:
-    """A matrix of these values, with indices of its own: solvers may sort or scale in place."""
+    """A matrix of these values with new indices: solvers may sort or scale in place."""
     matrix = pattern.astype(np.float64)
     matrix.data = values  # afterwards: of a view into a larger array scipy may make a copy
     return matrix
@@ -198,7 +198,7 @@ class QP:
         return _remade, (self.sizes, self.numbers, self.bounded, self.key)
 
     def copy(self) -> QP:
-        """The same problem in arrays of its own."""
+        """A copy of the problem that shares no array."""
         return _remade(self.sizes, self.numbers, self.bounded, self.key)
 
     @property
@@ -211,7 +211,7 @@ class QP:
         return self.csc().toarray()
 
     def csc(self) -> csc_matrix:
-        """H as a full symmetric CSC matrix with sorted indices of its own."""
+        """H as a full symmetric CSC matrix with new, sorted indices."""
         pattern = hessian_pattern(self.stages, self.n)
         return as_csc(pattern, self.band.ravel()[pattern.data])
 

@@ -103,7 +103,7 @@ def create(
     options : SolverOptions, optional
         Limits and accuracy; the defaults if left out.
     isolated : bool
-        Whether it solves in a process of its own: a crash is then a FAILED solution, and a time
+        Whether it solves in a separate process: a crash is then a FAILED solution, and a time
         limit holds for every backend. It adds some tenths of a millisecond to each QP.
 
     Raises

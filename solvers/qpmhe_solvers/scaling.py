@@ -68,7 +68,7 @@ class Scale:
         scaled.key = self.key
 
     def leave_out(self, peaks: list[float]) -> None:
-        """Note the parts whose unit is not known, because there is nothing but zeros."""
+        """Note the parts whose unit is not known, because all their numbers are zero."""
         self._unknown = [at for at, peak in enumerate(peaks) if not peak > 0.0]
 
     def fits(self, peaks: list[float]) -> bool:

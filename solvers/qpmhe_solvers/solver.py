@@ -243,7 +243,7 @@ class Solver(ABC):
 
 
 class ContainedSolver:
-    """A solver whose methods raise nothing but KeyboardInterrupt, whatever class it is of.
+    """A solver whose methods raise only KeyboardInterrupt, whatever its class.
 
     `Solver.solve` contains what `Solver._solve` does. This contains the rest: a user's class may
     override `solve` itself, and its `shift`, `forget` and `prepare` may raise.

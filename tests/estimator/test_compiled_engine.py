@@ -109,7 +109,7 @@ def steady():
     return OwnSteady(plain, [0.0], disturbance=[[1.0]], noise=[[1.0]])
 
 
-LOSSES = {Whole: "cost of its own", Branching: "", Together: "depends on others"}
+LOSSES = {Whole: "overrides its cost", Branching: "", Together: "depends on others"}
 
 
 WITHOUT_FORM = [

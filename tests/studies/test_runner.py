@@ -155,7 +155,7 @@ def test_a_backend_that_crashes_is_isolated_and_the_qp_is_kept(path, tmp_path):
     assert frame.loc["mine", "rmse"] == frame.loc["banded", "rmse"]
     assert frame.loc[["mine", "banded"], "reason"].tolist() == ["", ""]
     assert frame.loc["crashingonce", "reason"] == (
-        "the backend ran in a process of its own, since the cell's died, twice (SIGSEGV(-11))"
+        "the backend ran in a separate process, since the cell's process died twice (SIGSEGV(-11))"
     )
     failed = {flags: n for flags, n in frame.loc["crashingonce", "reasons"].items()
               if "SOLVER_FAILED" in flags}
