@@ -139,7 +139,8 @@ def test_a_supply_that_is_too_small_for_the_disturbance_proves_nothing(monkeypat
     one = np.eye(1)
     for Q, holds in ((3.0 * one, True), (1e-9 * one, False)):
         form = Form(one, 0.9, one, 0.0 * one, X=0.5 * one, B=np.array([[1.0, 0.0]]), Q=Q)
-        monkeypatch.setattr(Program, "solve", lambda *_, form=form, **__: Answer("solved", 1.0, form))
+        answer = Answer("solved", 1.0, form)
+        monkeypatch.setattr(Program, "solve", lambda *_, answer=answer, **__: answer)
         refused = pytest.raises(NotCertifiedError, match="no matrix that passes")
         with contextlib.nullcontext() if holds else refused:
             found = certify_observer(
