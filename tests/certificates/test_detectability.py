@@ -1,5 +1,6 @@
 """Detectability: known constants, the paper's reactor, pairs of trajectories, refusals."""
 
+import contextlib
 import math
 
 import numpy as np
@@ -132,6 +133,20 @@ def test_solvers_that_lie_or_stop_early_prove_nothing(monkeypatch, answer):
     words = "user_limit" if answer.form is None else "no matrix that passes"
     with pytest.raises(NotCertifiedError, match=words):
         certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.9)
+
+
+def test_a_supply_that_is_too_small_for_the_disturbance_proves_nothing(monkeypatch):
+    one = np.eye(1)
+    for Q, holds in ((3.0 * one, True), (1e-9 * one, False)):
+        form = Form(one, 0.9, one, 0.0 * one, X=0.5 * one, B=np.array([[1.0, 0.0]]), Q=Q)
+        answer = Answer("solved", 1.0, form)
+        monkeypatch.setattr(Program, "solve", lambda *_, answer=answer, **__: answer)
+        refused = pytest.raises(NotCertifiedError, match="no matrix that passes")
+        with contextlib.nullcontext() if holds else refused:
+            found = certify_observer(
+                linear(0.5, 1.0), qpmhe.Luenberger(0.0 * one), unit_box(1), rho=0.9
+            )
+            assert found.evidence is Evidence.PROVED
 
 
 @pytest.mark.parametrize(("A", "C", "L"), [
