@@ -262,7 +262,8 @@ def test_snapshots_of_other_holds_and_damaged_ones_are_refused():
     y, u, _ = record(2)
     for engine in ("python", "compiled")[: 1 + (find_compiler() is not None)]:
         mhe = estimator(0.1, engine=engine)
-        mhe.run(y[:15], u[:15])
+        mhe.run(y[:14], u[:14])
+        assert mhe.update(y[14], u[14]).message == ""
         state = mhe.state_dict()
         for hold in (None, 0.2):
             other = estimator(hold, engine=engine)
