@@ -57,7 +57,10 @@ def certificate_of(name):
         region, rates = qpmhe.Box([-4.4, -15.6], [4.8, 15.1]), (0.9, 0.955)
     if name == "batch_reactor":
         region, rates = qpmhe.Box([0.1, -1.0], [9.0, 9.0]), (0.9, 0.95)
-        system = system.copy(states=region)
+        system = qpmhe.System.from_ode(
+            lambda x: (0.16 * x[..., :1] ** 2 - 0.64 * x[..., 1:]) * np.array([-2.0, 1.0]),
+            lambda x: x[..., :1] + x[..., 1:], dt=0.1, method="euler", n=2, p=1, states=region,
+        )
     return certify(
         system, observer, cost, horizon=4, region=region,
         detectability=certify_detectability(system, region, eta=rates[0]),
