@@ -321,6 +321,12 @@ def test_a_monitor_continues_from_its_state(certificate):
             watch = followed(certificate, estimator(certificate), 99.0)
             watch.load_state_dict(state)
         np.testing.assert_equal(vars(watch.check(mhe.update(y))), vars(expected[t]))
+    mine = followed(certificate, estimator(certificate)).state_dict()
+    for factor in (0.25, 4.0):  # of another search, with another P
+        watch.load_state_dict(mine | {
+            "metric": factor * mine["metric"], "radius": np.sqrt(factor) * mine["radius"],
+        })
+        assert watch.state_dict()["radius"] == pytest.approx(mine["radius"], rel=1e-9)
     for wrong in ({}, {**state, "observer": [1.0]}, {**state, "radius": "x"}):
         with pytest.raises(InvalidInputError, match="no monitor of this observer"):
             watch.load_state_dict(wrong)
