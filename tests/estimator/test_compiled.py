@@ -246,29 +246,27 @@ def test_a_model_that_is_not_finite_everywhere(name, way):
                 when = max(t - 1, t + 1 - one.options["horizon"])
                 agree(*(mhe.amend(when, one.samples[when]["y"]) for mhe in pair), 1e-7)
     assert failed > 3
-    if name == "logarithm" and way == 0:
-        for mhe in pair:
-            mhe.update([-2000.0])
-            mhe.update([0.1])
-            with pytest.raises(InvalidInputError, match="finite"):
-                mhe.covariances()
 
 
-@both_engines
-def test_an_outage_longer_than_the_window(engine):
+def test_an_outage_longer_than_the_window():
     """The observer waits where the model last worked, however long that is ago."""
     system = system_of(lambda x, u: x * u[0], lambda x, u: x, n=1, m=1)
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.5]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
-        horizon=2, initial_state=[0.0], engine=engine,
-    )
-    for samples in (1, 2, 3, *range(60, 70), 130):
-        mhe.reset()
-        for _ in range(samples):
-            mhe.update([5.0], [1.0])
-        held = [mhe.update([5.0], [NAN]).state[0] for _ in range(5)]
-        assert held == [held[0]] * 5, samples
-        assert mhe.update([5.0], [1.0]).state[0] == pytest.approx(5.0, abs=3.0)
+    for engine in ENGINES:
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.5]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
+            horizon=2, initial_state=[0.0], engine=engine,
+        )
+        for samples in (1, 2, 3, *range(60, 70), 130):
+            mhe.reset()
+            with pytest.raises(InvalidInputError, match="no estimate yet"):
+                mhe.covariances()
+            for _ in range(samples):
+                mhe.update([5.0], [1.0])
+            held = [mhe.update([5.0], [NAN]).state[0] for _ in range(5)]
+            assert held == [held[0]] * 5, samples
+            with pytest.raises(InvalidInputError, match="finite"):
+                mhe.covariances()
+            assert mhe.update([5.0], [1.0]).state[0] == pytest.approx(5.0, abs=3.0)
 
 
 def test_jacobians_that_are_not_finite_at_the_start():

@@ -152,7 +152,7 @@ def test_programs_of_jax_and_casadi_are_made_with_the_estimator():
         qpmhe.from_casadi(f, ca.Function("h", [x], [x[0]]), compiled=one) for one in (None, False)
     )
     for system, programs, horizon in (
-        (by_jax, by_jax.kernel._programs._batches, 16), (by_casadi, by_casadi.kernel._local, 4),
+        (by_jax, by_jax.kernel._programs._batches, 40), (by_casadi, by_casadi.kernel._local, 4),
         (interpreted, interpreted.kernel._local, 4),
     ):
         mhe = qpmhe.MovingHorizonEstimator(
