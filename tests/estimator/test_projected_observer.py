@@ -203,7 +203,7 @@ def in_euclidean_metric(gain, metric):
 
 
 @pytest.mark.parametrize(
-    ("runs", "steps"), [(12, 20), pytest.param(2_000, 5, marks=pytest.mark.slow)]
+    ("runs", "steps"), [(12, 20), pytest.param(1_000, 5, marks=pytest.mark.slow)]
 )
 def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
     for observer_of, bound_of in (
@@ -214,7 +214,7 @@ def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
         found = [worst_excess(rng, steps, observer_of, bound_of) for _ in range(runs)]
         worst = max(worst for worst, _ in found)
         assert worst > 1e-2 if observer_of is in_euclidean_metric else worst < 1e-9
-        assert sum(projected for _, projected in found) > 2.5 * runs
+        assert sum(projected for _, projected in found) > 0.09 * runs * steps
 
 
 def test_the_candidates_disturbance_is_bounded_where_kappa_does_not_bound_it():
