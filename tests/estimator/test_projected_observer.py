@@ -203,7 +203,7 @@ def in_euclidean_metric(gain, metric):
 
 
 @pytest.mark.parametrize(
-    ("runs", "steps"), [(20, 20), pytest.param(2_000, 5, marks=pytest.mark.slow)]
+    ("runs", "steps"), [(12, 20), pytest.param(1_000, 5, marks=pytest.mark.slow)]
 )
 def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
     for observer_of, bound_of in (
@@ -214,13 +214,13 @@ def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
         found = [worst_excess(rng, steps, observer_of, bound_of) for _ in range(runs)]
         worst = max(worst for worst, _ in found)
         assert worst > 1e-2 if observer_of is in_euclidean_metric else worst < 1e-9
-        assert sum(projected for _, projected in found) > 2.5 * runs
+        assert sum(projected for _, projected in found) > 0.09 * runs * steps
 
 
 def test_the_candidates_disturbance_is_bounded_where_kappa_does_not_bound_it():
     """|L(t)| <= |e(t+1)| + L_f |e(t)| + |w(t)|; and the plain one's |L|_M where f(z) is in X."""
     rng, seen = np.random.default_rng(4), {True: 0, False: 0}
-    for _ in range(60):
+    for _ in range(40):
         closed, gain, c, metric, _ = certified(rng, 2)
         a, box = closed + gain @ c, qpmhe.Box([0.0, -1.0], [2.0, 1.0])
         mhe = estimator(linear(a, c, box), in_own_metric(gain, metric), start=[1.0, 0.0])
@@ -240,7 +240,7 @@ def test_the_candidates_disturbance_is_bounded_where_kappa_does_not_bound_it():
                     assert applied @ metric @ applied <= plain @ metric @ plain * (1 + 1e-9)
                 assert (Status.PREDICTION_OUTSIDE in estimate.status) is not stays
             x, z = following, estimate.state
-    assert min(seen.values()) > 20
+    assert min(seen.values()) > 10
 
 
 CLOSED = np.array([[1.2, 1.0], [-1.0, -0.5]])
