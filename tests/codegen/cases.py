@@ -293,6 +293,12 @@ def _underflowing() -> Case:
     ).with_options(max_qps=1)
 
 
+def _starved() -> Case:
+    """A model that inputs let fail at several samples in a row, whatever the state."""
+    one = _plain(lambda x, u: 0.9 * x + 0.1 * ca.sqrt(x + 2.0 - u), lambda x, u: x, 1, 1, m=1)
+    return samples_with(one, lambda t, y: {"u": np.array([9.0])} if t in (6, 7, 8) else {})
+
+
 def _reaction_in(states: ConvexSet, start: Any = (0.1, 4.5), **sets: Any) -> Case:
     """2A -> B in pressures, of which the sum is measured; runs away from negative ones.
 
@@ -906,6 +912,7 @@ INJECTIONS: Table = {
     )),
 }
 FAILING: Table = {
+    "failing inputs": (_starved,),
     "power failing": (
         lambda: _failing(1.8), lambda one: replace(
             one, observer=Luenberger([[0.5], [0.3]]), cost=RobustCost(
