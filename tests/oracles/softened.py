@@ -48,20 +48,21 @@ class Case:
             (((0.5, 3), n), ((4, 40), n), ((4, 40), p))
         ]
         self.inputs = draw.uniform(-0.2, 0.2, (self.horizon + 8, self.m))
-        x, states, measurements = draw.uniform(-1, 1, n), [], []
-        disturbances = 0.1 * draw.normal(size=(len(self.inputs), n))
-        noises = 0.3 * draw.normal(size=(len(self.inputs), p))
-        for u, w, v in zip(self.inputs, disturbances, noises, strict=True):
-            states.append(x)
-            measurements.append(self.model.h(x) + v)
+        x, record = draw.uniform(-1, 1, n), []
+        for u in self.inputs:
+            w, v = draw.normal(size=n) * 0.1, draw.normal(size=p) * 0.3
+            record.append((x, w, v, self.model.h(x) + v))
             x = self.f(x, u) + w
-        self.measurements, self.start = np.array(measurements), draw.uniform(-1.2, 1.2, n)
+        states, disturbances, noises, self.measurements = (
+            np.array(one) for one in zip(*record, strict=True)
+        )
+        self.start = draw.uniform(-1.2, 1.2, n)
         penalties = {}
         if penalty in ("linear", "both"):
             penalties["linear"] = float(10.0 ** draw.uniform(-0.3, 1.5))
         if penalty in ("quadratic", "both"):
             penalties["quadratic"] = float(10.0 ** draw.uniform(0, 1.7))
-        reached = {"x": np.array(states), "u": self.inputs, "w": disturbances, "v": noises}
+        reached = {"x": states, "u": self.inputs, "w": disturbances, "v": noises}
         make = self.constraint if kind in HARD else self.soft_set
         self.system = qpmhe.System(
             self.f if self.m else self.model.f, self.model.h, n=n, p=p, m=self.m,

@@ -30,10 +30,11 @@ def loss_of(loss, rows):
     return cp.sum(each, axis=1) if loss.per_component else each
 
 
-def minimum(estimate, slopes, weights, loss, discount=1.0, sets=None):
+def minimum(estimate, slopes, weights, loss, discount=1.0, sets=None, hold=None):
     """The least cost of the linearised residuals about an estimate, and where it is.
 
-    slopes are the Jacobians (A, C) at all states but the last.
+    slopes are the Jacobians (A, C) at all states but the last; ``hold`` adds what the estimator
+    states of it.
     """
     x, w, v = estimate.trajectory, estimate.disturbances, estimate.noises
     (count, n), (a, c) = w.shape, slopes
@@ -48,6 +49,9 @@ def minimum(estimate, slopes, weights, loss, discount=1.0, sets=None):
         discount**count * cp.sum_squares(start @ roots[0]) + factors @ loss_of(None, w @ roots[1])
         + factors @ loss_of(loss, cp.multiply(there * 1.0, v) @ roots[2])
     )
+    if hold is not None:
+        away = x[0][hold.components] + d[0][hold.components] - hold.target
+        cost += discount**count * cp.quad_form(away, cp.psd_wrap(hold.weight))
     rows = {"disturbances": w, "noises": v}
     constraints = []
     for name, box in (sets or {}).items():
@@ -142,6 +146,25 @@ def test_on_a_linear_system_the_minimum_is_that_of_the_convex_problem(
         found, best = of_linear(estimate, loss, discount, sets)
         assert estimate.cost == pytest.approx(found, rel=tolerance)
         np.testing.assert_allclose(estimate.trajectory, best, atol=1e-2)
+
+
+@pytest.mark.parametrize("discount", [1.0, 0.8])
+def test_held_states_are_weighed_in(discount):
+    system = qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=2, p=2)
+    system.held = {0: 0.5, 1: 0.3}  # as `augment_parameters` does
+    cost = qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=0.02 * R, discount=discount)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(np.zeros((2, 2))), cost, horizon=5, initial_state=[2.5, -3.5]
+    )
+    generator, weights = np.random.default_rng(3), (P, Q, 0.02 * R)
+    for _ in range(9):
+        estimate = mhe.update(generator.standard_normal(2))
+        slopes = [[one] * len(estimate.noises) for one in (A, C)]
+        found, best = minimum(estimate, slopes, weights, None, discount, hold=mhe.hold)
+        free, _ = minimum(estimate, slopes, weights, None, discount)
+        assert free < 0.99 * found  # the hold is felt
+        assert estimate.cost == pytest.approx(found, rel=1e-6)
+        np.testing.assert_allclose(estimate.trajectory, best, atol=1e-3)
 
 
 @cache
