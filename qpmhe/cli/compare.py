@@ -103,7 +103,7 @@ def compare(
     """Compare QP backends, caps and numbers of QPs: accuracy and time, a table and a report."""
     given = locals()
     reading = {key: given[key] for key in READING if given[key] is not None} if record else {}
-    if model is None and steps is None:
+    if model is None and steps is None and record is None:
         steps = 100  # all backends at all caps are to be done within ten minutes
     what = Study(
         models=model or ("batch_reactor",), records=record or (), reading=reading,

@@ -34,11 +34,12 @@ Measure = Literal["both", "accuracy", "time"]
 Start = Literal["candidate", "best"]
 #: What stands for None in files and on the command line.
 WORDS = {"qps": "none", "solver_iterations": "none", "horizons": "default"}
-#: How a record is read.
-READING = (
-    "time", "outputs", "inputs", "truth", "dt", "time_scale", "separator", "decimal", "encoding",
-    "missing", "skip_repeated", "skip_lines", "time_format",
-)
+#: How a record is read: the options and their defaults.
+READING = {
+    **dict.fromkeys(("time", "outputs", "inputs", "truth", "dt", "separator", "time_format")),
+    "time_scale": 1.0, "decimal": "auto", "encoding": "utf-8", "missing": (),
+    "skip_repeated": False, "skip_lines": 0,
+}
 
 
 class StudyError(OptionError):
@@ -111,7 +112,7 @@ class Study:
 
     models: Sequence[str] = ("batch_reactor",)
     records: Sequence[str | Path] = ()
-    reading: Mapping[str, Any] = field(default_factory=dict)
+    reading: Mapping[str, Any] = field(default_factory=dict, hash=False)
     backends: Sequence[str] | None = None
     qps: Sequence[int | None] = (0, 1, 2, 5, None)
     solver_iterations: Sequence[int | None] = (1, 2, 5, 10, None)
@@ -328,7 +329,7 @@ def _reading(value: Any) -> dict[str, Any]:
                 f"reading has the key {shown(name)}; expected some of {', '.join(READING)}."
                 f"{f' Did you mean {near[0]}?' if near else ''}"
             )
-    return dict(value)
+    return {name: given for name, given in value.items() if given != READING[name]}
 
 
 def _levels(value: Any) -> tuple[float, ...]:

@@ -198,9 +198,9 @@ class Writer:
             for name, fingerprint in fingerprints.items():
                 if known.get(name, fingerprint) != fingerprint:
                     raise StoreError(
-                        f"the file of model {name!r}, or one that it imports, has changed since "
-                        f"cells of it were put into {self._path}; name another store for the new "
-                        "model, or change the file back."
+                        f"model {name!r} has changed since cells of it were put into "
+                        f"{self._path}: its file, one that it imports, or its record and how that "
+                        "is read. Name another store for the new one, or change it back."
                     )
                 connection.execute(
                     "INSERT OR IGNORE INTO models VALUES (?, ?)", (name, fingerprint)

@@ -102,6 +102,24 @@ def test_a_record_in_python_and_in_a_file(here, tmp_path):
     assert Store("new.sqlite").frame()["rmse"].isna().all()
 
 
+def test_steps_of_any_length_are_those_of_the_record(here, tmp_path):
+    times = np.cumsum([0.0, *np.tile([0.1, 0.13, 0.1], 6)])
+    rows = [f"{t:.2f},{y:.17g}\n" for t, y in zip(times, here.measurements[:, 0], strict=False)]
+    (tmp_path / "uneven.csv").write_text("time,P\n" + "".join(rows))
+    study = Study(models=["mine.py:make"], records=["uneven.csv"], backends=["banded"], qps=[1])
+    store = run(study, "s.sqlite", jobs=1, progress=False)
+    (row,) = store.frame().itertuples()
+    kept = store.trajectory(row.key)
+    np.testing.assert_allclose(kept["times"][:-1], times)
+    system, observer, cost, _ = qpmhe.models.batch_reactor()
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=5, initial_state=[3.0, 0.0], backend="banded")
+    steps = [*np.diff(kept["times"])]
+    found = [mhe.update(y, dt=dt).state for y, dt in zip(here.measurements, steps, strict=False)]
+    np.testing.assert_allclose(kept["estimates"][1:], found, rtol=1e-6)
+    assert np.isnan(kept["states"]).all()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
