@@ -383,11 +383,9 @@ BARS = {  # the sample 6, and why the theorem's bound ends there; the observer's
 }
 
 
-@pytest.mark.parametrize(("event", "unit"), [
-    *((event, 1.0) for event in BARS), ("cost of less", 1e-9), ("cost of less", 1e9),
-])
-def test_the_theorem_ends_where_a_hypothesis_does(event, unit):
-    (what, words), weight = BARS[event], unit**-2
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_theorem_ends_where_a_hypothesis_does(unit):
+    weight = unit**-2
     cost = qpmhe.QuadraticCost(
         prior=weight * np.eye(2), disturbance=100.0 * weight * np.eye(2), noise=25.0 * weight
     )
@@ -395,17 +393,19 @@ def test_the_theorem_ends_where_a_hypothesis_does(event, unit):
         linear(), qpmhe.Luenberger(GAIN), cost, horizon=4, sizes=Sizes(0.2 * unit, 0.2 * unit),
         region=qpmhe.Box([-10.0 * unit] * 2, [10.0 * unit] * 2),
     )
-    mhe, ys = estimator(certificate), unit * record()[1]
-    watch = Monitor(certificate, mhe, initial_error=unit * START)
-    for y in ys[:6]:
-        assert watch.check(mhe.update(y)).lost is None
-        assert watch.applies
-    assert watch.summary() == "The observer's bound held at all 6 samples. The theorem applies."
-    watch.check(what(mhe, ys[6]))
-    assert re.search(f"^from sample 6 on: .*({words})", watch.barred)
-    for y in ys[7:20]:  # the window recovers; the bound goes back to the first sample
-        watch.check(mhe.update(y))
-    assert f"The theorem does not apply: {watch.barred}" in watch.summary()
+    for event in BARS if unit == 1.0 else ["cost of less"]:
+        what, words = BARS[event]
+        mhe, ys = estimator(certificate), unit * record()[1]
+        watch = Monitor(certificate, mhe, initial_error=unit * START)
+        for y in ys[:6]:
+            assert watch.check(mhe.update(y)).lost is None
+            assert watch.applies
+        assert watch.summary() == "The observer's bound held at all 6 samples. The theorem applies."
+        watch.check(what(mhe, ys[6]))
+        assert re.search(f"^from sample 6 on: .*({words})", watch.barred), event
+        for y in ys[7:20]:  # the window recovers; the bound goes back to the first sample
+            watch.check(mhe.update(y))
+        assert f"The theorem does not apply: {watch.barred}" in watch.summary()
 
 
 def test_what_the_theorem_does_not_cover_leaves_the_observers_bound(certificate):
