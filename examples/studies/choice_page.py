@@ -96,8 +96,8 @@ def main() -> None:
         limit = figures.widest()
         if limit > 1.0:
             text += (
-                "\n\nOver the seeds, the upper 95 % confidence limit of each error ratio is at most "
-                f"{100.0 * (limit - 1.0):.1f} % above it."
+                "\n\nOver the seeds, the upper 95 % confidence limit of each error ratio is at "
+                f"most {100.0 * (limit - 1.0):.1f} % above it."
             )
         page = filled(page, name, text)
     page = filled(page, "backends", choice_tables.backends(DOCS / "comparison.md"))

@@ -83,7 +83,9 @@ def test_all_kinds_of_models_have_the_same_enclosure(kind):
 
 
 def test_a_kinked_output_is_proved():
-    found = certify_detectability(of_numpy(), qpmhe.Box([-0.5, -0.5], [0.5, 0.5]), eta=0.98)
+    found = certify_detectability(
+        of_numpy(), qpmhe.Box([-0.5, -0.5], [0.5, 0.5]), eta=0.98, seconds=300.0
+    )
     assert found.evidence is Evidence.PROVED
 
 
