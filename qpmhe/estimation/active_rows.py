@@ -30,14 +30,14 @@ _ROUNDS = 10
 
 
 class ActiveRow(NamedTuple):
-    """An inequality that holds an estimate.
+    """An active inequality of an estimate.
 
     Attributes
     ----------
     set, row, side, time
         As in `DroppedRow`.
     multiplier : float
-        By how much J falls for each unit by which the side is moved outwards.
+        Decrease of J per unit by which the side moves outwards.
     """
 
     set: str
@@ -208,7 +208,7 @@ class HeldRows:
         return value
 
     def named(self, first: int) -> tuple[tuple[ActiveRow, ...], tuple[ActiveRow, ...]]:
-        """The inequalities that hold the estimate, and those that do so weakly."""
+        """The active inequalities, and the weakly active ones."""
         every, inequalities = self._all, ~self._all["fixed"]
         return tuple(
             tuple(
@@ -275,9 +275,10 @@ def _candidates(
         other = ~functions.on_state[function]
         if other.any():
             raise InvalidInputError(
-                f"row {int(function[other][0])} of the nonlinear constraints is active, a function "
-                "of more than the state, whose second derivatives are not known; write it as a "
-                "function of x alone (qpmhe.Constraint), or as a set of disturbances or noises."
+                f"row {int(function[other][0])} of the nonlinear constraints is active and "
+                "depends on more than the state, so its second derivatives are unknown; write "
+                "it as a function of x alone (qpmhe.Constraint), or as a set of disturbances "
+                "or noises."
             )
         on_state[...] = np.einsum("rt,rtn->rn", matrix, slopes[k])
     elif rows.name == "states":

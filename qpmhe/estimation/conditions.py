@@ -112,7 +112,7 @@ class ConditionReader:
             if cost.disturbance_factor is not None:
                 raise OptionError(
                     "disturbance_weight was given, but the cost has a singular covariance of the "
-                    "disturbance, of which no weight is the inverse; give the system a "
+                    "disturbance, which no weight can replace; give the system a "
                     "disturbance_matrix in place of the singular covariance."
                 )
         cost.check_weights(noise, disturbance)
@@ -142,13 +142,13 @@ class ConditionReader:
         built = self._system.set_of(name)
         if built is None:
             raise OptionError(
-                f"bounds has {name!r}, but the system has no set of {name}; make it with "
-                f"System(..., {name}=...), as wide as it ever is, and narrow it here."
+                f"bounds has {name!r}, but the system has no set of {name}; create it with "
+                f"System(..., {name}=...), as wide as it will ever be, and narrow it here."
             )
         if not isinstance(given, ConvexSet):
             raise SetError(
-                f"bounds[{name!r}] is {shown(given)}; expected a qpmhe.Box or a qpmhe.Polytope, "
-                "also for a soft set, whose penalties stay. Leave it out for the usual bounds."
+                f"bounds[{name!r}] is {shown(given)}; expected a qpmhe.Box or a qpmhe.Polytope "
+                "(a soft set keeps its penalties). Leave it out for the usual bounds."
             )
         checked_set(f"bounds[{name!r}]", given, built.dimension)
         key = tuple(
@@ -176,13 +176,13 @@ class ConditionReader:
         if new.size:
             raise OptionError(
                 f"{what}, which bounds component {int(new[0])}; the system's set of {name} does "
-                "not. Give that component a bound in the system, as wide as it ever is, and narrow "
+                "not. Bound that component in the system, as wide as it will ever be, and narrow "
                 "it here."
             )
         if given.matrix.shape[0] and not np.array_equal(given.matrix, built.matrix):
             raise OptionError(
-                f"{what}, whose general inequalities are not those of the system's set of {name}; "
-                "only their sides may change. Take the same matrix in the same order of rows."
+                f"{what}, whose general inequalities differ from the system's set of {name}; only "
+                "their sides may change. Use the same matrix, with its rows in the same order."
             )
         if name == "disturbances" and name not in self._system.soft:
             fixed = np.zeros(built.dimension, np.bool_)
@@ -193,9 +193,10 @@ class ConditionReader:
                 j = int(np.argmax(changed))
                 raise OptionError(
                     f"{what}, which "
-                    + ("frees component" if fixed[j] else "leaves no width to component")
-                    + f" {j}; the components without a disturbance are those of the system. Make "
-                    "another estimator, or leave this component as it is."
+                    + ("frees component" if fixed[j] else "fixes component")
+                    + f" {j}; only the system can fix components of the "
+                    "disturbance. Create another "
+                    "estimator, or leave this component as it is."
                 )
 
     def sensors(self, sensors: Any) -> tuple[NDArray[np.intp], Conditions | None]:
@@ -235,7 +236,7 @@ class ConditionReader:
         if not (whole and array.size and array.min() >= 0 and array.max() < p):
             raise InvalidInputError(
                 f"sensors is {shown(sensors)}; expected indices of outputs from 0 to {p - 1}, at "
-                "least one. For a sample without any, update(None)."
+                "least one. For a sample without measurements, call update(None)."
             )
         mask = np.zeros(p, np.bool_)
         mask[array] = True
@@ -250,8 +251,8 @@ class ConditionReader:
         """Validated values of the parameters."""
         if usual.parameters is None:
             raise InvalidInputError(
-                f"parameters is {shown(given)}, but the estimator has none; name their usual "
-                "values when it is made: MovingHorizonEstimator(..., parameters=...)."
+                f"parameters is {shown(given)}, but the estimator has none; give their usual "
+                "values at construction: MovingHorizonEstimator(..., parameters=...)."
             )
         return vector("parameters", given, usual.parameters.size)
 

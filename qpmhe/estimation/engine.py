@@ -451,7 +451,7 @@ class PythonEngine:
     def covariances(self) -> Array:
         """Covariances along the last estimate."""
         if self._trajectory is None:
-            raise InvalidInputError("there is no estimate yet; update first.")
+            raise InvalidInputError("there is no estimate yet; call update first.")
         with np.errstate(all="ignore"):
             problem = self._tools.formulation.problem(self._window)
             trial = problem.evaluate(self._trajectory.copy())
@@ -466,7 +466,7 @@ class PythonEngine:
     def solved(self) -> Solved:
         """The last step's problem and its estimate."""
         if self._trajectory is None:
-            raise InvalidInputError("there is no estimate yet; update first.")
+            raise InvalidInputError("there is no estimate yet; call update first.")
         window, formulation = self._window, self._tools.formulation
         with np.errstate(all="ignore"):
             problem = formulation.problem(window)
@@ -504,9 +504,9 @@ class PythonEngine:
         check_problem(state, self._size())
         if str(state.get("engine", "python")) != "python":
             raise InvalidInputError(
-                f"the state is of an estimator with engine={state['engine']!r}, and this one "
-                "has the Python step; make it with that engine, which needs a C compiler, or "
-                "snapshot with engine='python'."
+                f"the state is from an estimator with engine={state['engine']!r}, but this "
+                "one runs the Python step; create it with that engine, which needs a C "
+                "compiler, or take the snapshot with engine='python'."
             )
         before = self._system.call_modes()
         try:

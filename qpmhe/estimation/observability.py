@@ -1,4 +1,4 @@
-"""What the data of each window say about its states: Gauss-Newton matrices along a run."""
+"""How well each window's data determine its states: Gauss-Newton matrices along a run."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ Array = NDArray[np.float64]
 class Observability:
     r"""Singular values of the windows' Gauss-Newton matrices, in deviations of the prior.
 
-    With the disturbances eliminated, the measurements of a window add
-    :math:`|x_0 - \hat x_0|_\Lambda^2` to the cost of its first state, and the prior
-    :math:`|x_0 - \bar x|_P^2`. In deviations of the prior, :math:`x_0 = L \xi` with
-    :math:`P^{-1} = L L^\top`, the prior's matrix is the identity and the data's is
-    :math:`L^\top \Lambda L`. Where its singular value is 1, data and prior say equally much;
-    where it is 0, the data say nothing.
+    With the disturbances eliminated, the measurements of a window add :math:`|x_0 - \hat
+    x_0|_\Lambda^2` to the cost of its first state, and the prior :math:`|x_0 - \bar x|_P^2`. In
+    deviations of the prior, :math:`x_0 = L \xi` with :math:`P^{-1} = L L^\top`, the prior's matrix
+    is the identity and the data's is :math:`L^\top \Lambda L`. At a singular value of 1, data and
+    prior inform equally; at 0, the data give no information.
 
     Attributes
     ----------
@@ -51,7 +50,7 @@ def observability(
     disturbance : (n, n) array
         Covariance of what the disturbance adds to the state at each sample.
     prior : (n, n) array
-        Covariance of the initial error, in whose deviations the values are.
+        Covariance of the initial error; the values are in its standard deviations.
     horizon : int
         N <= T.
     """

@@ -203,7 +203,7 @@ def test_samples_that_do_not_fit_leave_the_estimator_as_it_was(build, wrong, sam
 
 def test_late_measurements_are_those_of_samples_in_the_window():
     mhe = estimator()
-    check(InvalidInputError, ["time is 0", "no sample yet", "update first"],
+    check(InvalidInputError, ["time is 0", "no sample yet", "call update first"],
           lambda: mhe.amend(0, [1.0]))
     for after in (1, 2, 3, 4, 9):
         while mhe.time < after:
