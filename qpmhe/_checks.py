@@ -220,7 +220,8 @@ def check_problem(state: Any, mine: tuple[int, ...]) -> None:
         or tuple(found) != mine
     ):
         raise InvalidInputError(
-            f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
+            f"the snapshot is of another problem: (n, p, m, horizon) = {shown(found)}; expected "
+            f"{shown(list(mine) if isinstance(found, list) else mine)}."
         )
 
 

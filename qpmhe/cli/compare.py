@@ -22,8 +22,9 @@ from .values import read_numbers
 _JOBS = typer.Option(min=1, help="Cells to run in parallel, default all cores; to measure "
                                  "times, give 1.")
 _SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
-_FAILING = typer.Option(metavar="DIR", help="Folder for QPs on which a backend failed, for qpmhe "
-                                             "solve-qp; keeps those of cells that run.")
+_FAILING = typer.Option(metavar="DIR", help="Folder for QPs on which a backend failed or gave "
+                                             "up without a cap, for qpmhe solve-qp; cells that "
+                                             "the store has do not run again.")
 _RETRY = typer.Option("--retry-failed", help="Run the cells again that failed before.")
 
 
@@ -168,12 +169,25 @@ def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
             highlight=False,
         )
     show_report(console, store, out)
+    _show_kept(console, options["keep_failing"])
     if 0 < len(failed) == len(cells):
         raise StudyError(
             f"no cell of the study finished, {len(failed)} failed; the first because of: "
             f"{failed['reason'].iloc[0].rstrip('.')}. Correct that, then give the same command "
             "with --retry-failed."
         )
+
+
+def _show_kept(console: Console, folder: Path | None) -> None:
+    if folder is None:
+        return
+    count = sum(1 for _ in folder.glob("*/*.npz"))
+    console.print(
+        f"{folder} has {count} QP{'s' * (count != 1)} that a backend failed on or gave up without "
+        f"a cap. Solve them again: qpmhe solve-qp {folder} --all" if count
+        else f"{folder} has no QPs: every backend solved its QPs, or stopped at a cap.",
+        highlight=False, markup=False, soft_wrap=True,
+    )
 
 
 def _numbers(name: str, text: str) -> list[int | None]:

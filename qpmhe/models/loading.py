@@ -164,7 +164,10 @@ def load(source: ModelSource) -> Example:
             f"model {name!r} gave {type(parts).__name__}; expected (system, observer, cost, "
             "scenario), as qpmhe.models.Example."
         )
-    check_parts(name, parts)
+    options = isinstance(parts[3], dict)
+    check_parts(
+        name, parts, " A dict of options in its place is enough for a record." if options else ""
+    )
     return Example(*parts)
 
 

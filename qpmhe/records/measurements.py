@@ -140,12 +140,20 @@ class RecordReader:
         except ValueError as error:
             field = row.fields[position].strip()
             shown = field if len(field) <= 40 else f"{field[:40]}..."
-            is_time = position == self._columns.time
-            remedy = (
-                "expected a number, or a date such as 2026-05-04T12:00:00 or 04.05.2026 12:00:00; "
-                "choose another form by --time-format, such as '%d/%m/%Y %H:%M:%S'" if is_time
-                else "correct it, or leave it blank if it is missing"
-            )
+            if position != self._columns.time:
+                remedy = "correct it, or leave it blank if it is missing"
+                if str(error) == "is not a number":
+                    remedy += ", or declare it missing by --missing"
+            else:
+                remedy = (
+                    "correct the line or --time-format; %f is a fraction of a second"
+                    if self._reader.has_format
+                    else "expected a number, or a date such as 2026-05-04T12:00:00 or 04.05.2026 "
+                    "12:00:00; choose another form by --time-format, such as "
+                    "'%d/%m/%Y %H:%M:%S', followed by '.%f' for fractions of a second"
+                )
+                if not any(mark.isdigit() for mark in field):
+                    remedy += "; delete the line if it holds units or a comment"
             what = f"{shown!r} {error}; {remedy}." if shown else f"the time {error}."
             if not row.ended:
                 what += " It is the last line, which has no end and may be cut off."
@@ -341,6 +349,11 @@ class FieldReader:
                 self._numbers.add(float(word))
             except ValueError:
                 continue
+
+    @property
+    def has_format(self) -> bool:
+        """Whether the user gave the form of the times."""
+        return self._format is not None
 
     def number(self, field: str) -> float:
         """The value of a field, NaN where it is missing; ValueError where it is no number."""

@@ -85,6 +85,9 @@ def test_what_is_worse_than_no_qp_is_named():
         f"(RMSE {number(mean)}, 4.00 times); daqp, 2 QPs per sample "
         f"(RMSE after settling {number(settled)}, 1.50 times)."
     )
+    early = rows.assign(rmse=frame().rmse)
+    assert texts(early)[0]["Worse than no QP"].startswith(
+        "1 of 6 configurations has a larger error after settling than the observer alone")
     rows.loc[worse, "rmse"] = np.inf
     assert "osqp, 2 QPs per sample, cap 2 (RMSE ∞); daqp" in texts(rows)[0]["Worse than no QP"]
 

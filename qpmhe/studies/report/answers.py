@@ -148,18 +148,19 @@ class Case:
                     ratio = error / float(alone[name]) if alone[name] > 0 else np.inf
                     times = f", {number(ratio)} times" if np.isfinite(ratio) else ""
                     text = f"{configuration_words(row)} ({words} {number(error)}{times})"
-                    found.append((np.nan_to_num(ratio, nan=np.inf), text))
+                    found.append((np.nan_to_num(ratio, nan=np.inf), text, name == "rmse"))
                     break
         if not found:
             return Answer(question, "No configuration.")
         found.sort(key=lambda one: -one[0])
-        named = [text for _, text in found[:_MOST_NAMED]]
+        named = [text for _, text, _ in found[:_MOST_NAMED]]
         more = f"; and {len(found) - len(named)} more" if len(found) > len(named) else ""
-        are = "configuration has" if len(found) == 1 else "configurations have"
+        are = f"configuration{'s' * (len(rows) != 1)} {'has' if len(found) == 1 else 'have'}"
+        over = "" if any(early for _, _, early in found) else "after settling "
         return Answer(
             question,
-            f"{len(found)} of {len(rows)} {are} a larger error than the observer alone, although J "
-            f"is never above the candidate's: {'; '.join(named)}{more}.",
+            f"{len(found)} of {len(rows)} {are} a larger error {over}than the observer alone, "
+            f"although J is never above the candidate's: {'; '.join(named)}{more}.",
         )
 
     def _failed(self) -> Answer:
