@@ -48,7 +48,7 @@ class Jacobian:
         What to do about a given Jacobian that is wrong.
     """
 
-    remedy = "Correct it, or leave it out to have it computed."
+    remedy = "Correct it, or leave it out to compute it automatically."
 
     def __init__(
         self,

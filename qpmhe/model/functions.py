@@ -328,7 +328,7 @@ class BatchedFunction:
         except Exception as error:
             raise ModelError(
                 f"{self.name} raised {type(error).__name__}: {error} at the initial state "
-                f"{x.tolist()}; it must be defined where the estimation starts."
+                f"{x.tolist()}; it must be defined there."
             ) from error
         if value.shape != self.shape:
             raise ModelError(
@@ -338,7 +338,7 @@ class BatchedFunction:
         if not np.isfinite(value).all():
             raise ModelError(
                 f"{self.name} is {value.tolist()} at the initial state {x.tolist()}; "
-                "expected finite numbers. Start elsewhere or bound the states."
+                "expected finite numbers. Change the initial state or bound the states."
             )
 
 
@@ -363,9 +363,8 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
     for q in parameters:
         if q.kind is q.KEYWORD_ONLY and (q.default is q.empty or (q.name == "u" and inputs > 0)):
             raise ModelError(
-                f"{name} takes {q.name} by keyword only, but is called as {name}(x) or "
-                f"{name}(x, u); make it the second positional parameter, or bind it with "
-                "functools.partial."
+                f"{name} takes {q.name} by keyword only, but is called as {name}(x) or {name}(x, "
+                "u); make it the second positional parameter, or bind it with functools.partial."
             )
     required = sum(q.default is q.empty for q in positional)
     if required > 1 + (inputs > 0):

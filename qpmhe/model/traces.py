@@ -232,7 +232,7 @@ class ModelTrace:
 def warn_of(fault: str, stacklevel: int = 6) -> None:
     """Warn that a trace is given up, and its function evaluated as it is written."""
     warnings.warn(
-        f"{fault}. It is evaluated as it is written.", EngineWarning, stacklevel=stacklevel
+        f"{fault}. It is now evaluated as written.", EngineWarning, stacklevel=stacklevel
     )
 
 

@@ -400,7 +400,7 @@ def difference(
         result = "an error" if theirs is None else str(theirs.tolist())
         return (
             f"it returns {result} at {_shown(arguments)}, but the same expression of symbols is "
-            f"{mine.tolist()}: it depends on more than its arguments, or on their type"
+            f"{mine.tolist()}: it depends on more than its arguments, or on their types"
         )
     return ""
 

@@ -333,7 +333,7 @@ def test_bad_holds_are_refused():
         ({0: "stiff"}, InvalidInputError, ["hold is 'stiff'"]),
         ([0.1], ShapeError, ["expected one number, or (2,)"]),
         ([[0.1, 0.1]], ShapeError, ["shape (1, 2)"]),
-        ({1: 0.1}, InvalidInputError, ["key 1, which is no estimated parameter", "[0, 2]"]),
+        ({1: 0.1}, InvalidInputError, ["key 1, which is not an estimated parameter", "[0, 2]"]),
         ({"inertia": 0.1}, InvalidInputError, ["key 'inertia'"]),
         ({True: 0.1}, InvalidInputError, ["key True"]),
         ({-1: 0.1}, InvalidInputError, ["key -1"]),
