@@ -801,7 +801,7 @@ def _inside(
         return state  # `Observer.check` then reports the wrong size
     inside = nearest(state, inverse(weight)).point
     warnings.warn(
-        f"{name} is {state.tolist()}, outside the state set {system.states!r}; the estimator "
+        f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the estimator "
         f"starts at the nearest point of the set, {inside.tolist()}.",
         ObserverWarning,
         stacklevel=5,

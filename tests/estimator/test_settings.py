@@ -77,7 +77,7 @@ def test_a_horizon_beyond_the_memory(monkeypatch):
         raise MemoryError("Unable to allocate 745. GiB")
 
     monkeypatch.setattr("qpmhe.estimation.estimator.engine_for", exhausted)
-    words = ["horizon is 10000000", "745. GiB", "take a shorter one"]
+    words = ["horizon is 10000000", "745. GiB", "take a shorter horizon"]
     check(OptionError, words, lambda: estimator(horizon=10_000_000))
 
 
