@@ -328,7 +328,7 @@ def test_bad_holds_are_refused():
     for hold, kind, text in (
         (0.0, InvalidInputError, ["hold is 0.0", "above 0"]),
         ([0.1, np.nan], InvalidInputError, ["hold is nan"]),
-        ([0.1, np.inf], InvalidInputError, ["hold is inf", "leave it out"]),
+        ([0.1, np.inf], InvalidInputError, ["hold is inf", "omit it"]),
         (True, InvalidInputError, ["hold is True"]),
         ({0: "stiff"}, InvalidInputError, ["hold is 'stiff'"]),
         ([0.1], ShapeError, ["expected one number, or (2,)"]),
