@@ -162,7 +162,7 @@ def test_a_claim_is_not_judged_by_what_the_solver_left_of_the_problem():
         assert solution.residuals.dual == np.abs(QP.gradient).max()
         assert solution.message.startswith("it wrote into ")
         assert name in solution.message
-        assert "read only" in solution.message
+        assert "read-only" in solution.message
 
 
 def test_who_scribbles_is_named_unless_right():
