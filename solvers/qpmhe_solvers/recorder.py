@@ -233,7 +233,7 @@ def _writable(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(
-            f"cannot create the folder {folder}: {error.strerror}; give another one."
+            f"cannot make the folder {folder}: {error.strerror}; give another one."
         ) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InvalidInputError(f"the folder {folder} cannot be written to; give another one.")
