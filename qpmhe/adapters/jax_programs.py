@@ -1,4 +1,4 @@
-"""Programs that JAX compiles of a model, for one state and for many."""
+"""JAX programs compiled from a model, for one state and for many."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rows that hold an estimate: active inequalities, noise-free directions, soft rows."""
+"""The active rows of an estimate: inequalities, noise-free directions, soft rows."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class HeldRows:
             np.add.at(bent, at, bend[:, None, None] * rows[:, :, None] * rows[:, None, :])
 
     def settle(self, blocks: Callable[[], Blocks], gradient: Callable[[Array], Array]) -> None:
-        """Find the multipliers, and release the rows that do not hold the estimate.
+        """Compute the multipliers, and release the rows that are not active.
 
         ``blocks`` gives a positive definite Hessian, ``gradient`` that of J with multipliers.
         """

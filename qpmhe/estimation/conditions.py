@@ -1,4 +1,4 @@
-"""What a sample is taken with: weights, bounds, sensors and parameters, where they may change."""
+"""The conditions of a sample: weights, bounds, sensors and parameters, which may change."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SIDES = ("lower", "upper", "row_lower", "row_upper")
 
 
 class Conditions(NamedTuple):
-    """What holds at a sample, or usually; None where nothing else than usual does.
+    """The conditions of a sample, or the usual ones; None where nothing differs from usual.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Conditions(NamedTuple):
     sampled : (p,) bool array or None
         The components of y that were sampled; None for all. The others are not missing.
     parameters : (k,) array or None
-        The last inputs; only of usual conditions: a sample has them among its inputs.
+        The last inputs, only in the usual conditions; a sample has them among its inputs.
     """
 
     noise_weight: Array | None = None
@@ -53,17 +53,17 @@ class Conditions(NamedTuple):
         return not all(one is None for one in (self.states, self.disturbances, self.noises))
 
     def over(self, usual: Conditions) -> Conditions:
-        """These conditions, and the usual ones where these say nothing."""
+        """These conditions, with the usual ones where these are None."""
         pairs: Any = zip(self, usual, strict=True)
         return Conditions(*(b if a is None else a for a, b in pairs))
 
     def without(self, others: Conditions) -> Conditions:
-        """These conditions where the others say nothing."""
+        """These conditions, only where the others are None."""
         pairs: Any = zip(self, others, strict=True)
         return Conditions(*(a if b is None else None for a, b in pairs))
 
     def applied(self, system: System, cost: Cost) -> tuple[System, Cost]:
-        """The system with these sets and the cost with these weights, where they say something."""
+        """The system with these sets and the cost with these weights, where they are not None."""
         if self.has_bounds:
             sets = {name: getattr(self, name) for name in SET_NAMES}
             system = system.with_sets({n: one for n, one in sets.items() if one is not None})
@@ -84,7 +84,7 @@ USUAL = Conditions()
 
 
 class ConditionReader:
-    """Validates what a user gives with a sample.
+    """Validates the arguments of a sample.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ class ConditionReader:
                 )
 
     def sensors(self, sensors: Any) -> tuple[NDArray[np.intp], Conditions | None]:
-        """Indices of the sensors in the order given, and conditions; None if they are all."""
+        """Indices of the sensors in the given order, and conditions; None if all are sampled."""
         key: Any = None
         if type(sensors) is list:
             key = *sensors, *map(type, sensors)  # True is 1 otherwise
@@ -257,7 +257,7 @@ class ConditionReader:
         return vector("parameters", given, usual.parameters.size)
 
     def load(self, saved: dict[str, Any], usual: Conditions) -> Conditions:
-        """The conditions that `Conditions.state_dict` described; raises anything if damaged."""
+        """The conditions from `Conditions.state_dict`; raises any exception if damaged."""
         if not isinstance(saved, dict):
             raise TypeError(f"conditions are {saved!r}")
         p, values, found = self._system.p, dict(saved), dict[str, Any]()

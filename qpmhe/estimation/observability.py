@@ -67,7 +67,7 @@ def observability(
 def window_information(
     transitions: Sequence[Array] | Array, information: Sequence[Array] | Array, disturbance: Array
 ) -> Array:
-    """What the data of windows say about their first states, (..., n, n).
+    """Information of the windows' data on their first states, (..., n, n).
 
     ``transitions`` and ``information`` are, stage by stage, those of `observability`, (..., n, n).
     """
@@ -84,7 +84,7 @@ def prior_shares(
     transitions: Array, information: Array, disturbance: Array, prior: Array, longest: int,
     most: int = 100,
 ) -> Array:
-    r"""How much the prior still matters to the newest estimate, for windows of each length.
+    r"""The prior's share in the newest estimate, for windows of each length.
 
     With G the derivative of the estimate with respect to the prior's mean, the share of state
     i is :math:`(G \Pi G^\top)_{ii} / \Sigma_{ii}`: what an error of the prior with the
@@ -97,7 +97,7 @@ def prior_shares(
     longest : int
         The largest horizon.
     most : int
-        Windows to take the median of, spread over the run.
+        Number of windows for the median, spread over the run.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def prior_shares(
 
 
 def prior_units(covariance: Array) -> tuple[Array, Array]:
-    """L with L L^T the covariance, and its inverse, or what is nearest to one."""
+    """L with L L^T the covariance, and its inverse, regularised if singular."""
     units = np.sqrt(covariance.diagonal())
     units = np.where(units > 0.0, units, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.multiply.outer(units, units))

@@ -22,7 +22,7 @@ _SOLVER_TOLERANCE = 1e-7
 
 @dataclass(frozen=True)
 class Settings:
-    """Options of `MovingHorizonEstimator`, where each is explained."""
+    """Options of `MovingHorizonEstimator`, which documents each."""
 
     horizon: int
     backend: str | Solver = "auto"

@@ -1,4 +1,4 @@
-"""Snapshots: how they are written down, and whether they fit the estimator that reads them."""
+"""Snapshots: writing them, and checking that they fit the estimator that reads them."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def written(memory: dict[str, Any]) -> dict[str, Any]:
 
 
 def read(state: Any) -> dict[str, Any]:
-    """The memory that `written` wrote down; arrays may have become lists."""
+    """The memory that `written` saved; arrays may have become lists."""
     if not isinstance(state, Mapping):
         raise InvalidInputError(
             f"the state is a {type(state).__name__}; expected the dict that state_dict returned."
@@ -195,7 +195,7 @@ class _MisfitError(InvalidInputError):
 
 
 def mismatch(what: str) -> InvalidInputError:
-    """The error to raise where the estimators differ in ``what``."""
+    """The error for estimators that differ in ``what``."""
     return _MisfitError(
         f"the state is from an estimator with another {what}, or damaged; create this estimator "
         "with the arguments of that one."

@@ -24,12 +24,12 @@ Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 class EvaluationError(QpmheError):
     """A model function ended the program, or returned no value, at some state.
 
-    It never leaves an estimator: the step falls back.
+    It never escapes from an estimator: the step falls back.
     """
 
 
 class Trusted(NamedTuple):
-    """A function of this package that takes (..., n) as well as (n,) and writes into nothing."""
+    """A function of this package that takes (..., n) as well as (n,) and modifies no argument."""
 
     function: Callable[..., Any]
 
@@ -53,7 +53,7 @@ class Parametric(NamedTuple):
 
 
 def contained(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Foreign code that may raise an Exception or be interrupted, and nothing else."""
+    """Contain foreign code: it can only raise an Exception or be interrupted."""
 
     def call(*arguments: Any) -> Any:
         try:
@@ -314,7 +314,7 @@ class BatchedFunction:
 
     @property
     def plain(self) -> bool:
-        """Whether the user's function can be called as it is, on (..., n) and all inputs."""
+        """Whether the user's function can be called directly, on (..., n) and all inputs."""
         takes_all = self.takes_input or self._inputs == 0
         return self.mode == "batched" and takes_all and self._returns_array and not self._short
 
@@ -395,7 +395,7 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
 
 
 def check_inputs(m: int, **takes_input: bool) -> None:
-    """Refuse inputs that no function of the model takes."""
+    """Reject inputs that no function of the model takes."""
     if m and not any(takes_input.values()):
         names = list(takes_input)
         raise ModelError(

@@ -513,7 +513,7 @@ class System:
             self.kernel = evaluator
 
     def use_functions(self) -> None:
-        """Evaluate f and h as they are written from now on, if a trace stands in their place."""
+        """Evaluate f and h as written from now on, if a trace replaces them."""
         written, self._as_written, self._pinned = self._as_written, None, None
         self._pins = False
         if written is not None:
@@ -666,7 +666,7 @@ class System:
 
     @property
     def extensions(self) -> tuple[str, ...]:
-        """What it has beyond hard convex sets: soft sets and nonlinear constraints, in words."""
+        """Its soft sets and nonlinear constraints, in words."""
         found = [f"a soft set of {name}" for name in self.soft]
         return (*found, "nonlinear constraints") if self.constraints else tuple(found)
 

@@ -290,9 +290,9 @@ class KalmanType(Observer):
 
 
 def covariance_of(weight: Array | None, usual: Array) -> Array:
-    """The covariance of a sample's own weight, or the usual one, from which rounding is no change.
+    """The covariance of a sample's weight; the usual one if both are equal up to rounding.
 
-    A weight that was computed from the usual covariance must lead to the same digits as none.
+    A weight computed from the usual covariance then gives the same digits as none.
     """
     if weight is None:
         return usual

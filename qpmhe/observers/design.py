@@ -118,7 +118,7 @@ def linearize(
 ) -> tuple[Array, Array, Array]:
     """The Jacobians A (n, n) and C (p, n) at a point, and the point (n,).
 
-    A covariance of the disturbance, (n, n), says how large the states are: many times it.
+    A covariance of the disturbance, (n, n), sets the states' magnitudes: a multiple of it.
     """
     point = vector("at", at, system.n)
     if u is None and system.m:

@@ -30,7 +30,7 @@ LONGEST = 10
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The observer's covariance, and what it says of the q outputs that are there.
+    """The observer's covariance, and its prediction of the q available outputs.
 
     Parameters
     ----------
@@ -62,18 +62,18 @@ class Prediction:
 
 
 class Verdict(NamedTuple):
-    """What an observer corrects by.
+    """The data of an observer's correction.
 
     Parameters
     ----------
     covariance : (n, n) array or None
         A larger P; None for the one that it has.
     kept : (q,) bool array or None
-        Which of the outputs that are there correct; None for all.
+        Which of the available outputs correct; None for all.
     noise : (q, q) array or None
         Covariance of the noise of all outputs that are there; None for the one that it has.
     rejections : (s,) int array or None
-        For each sensor how often in a row it has failed, this sample included.
+        Consecutive failures of each sensor, this sample included.
     """
 
     covariance: Array | None = None
@@ -97,7 +97,7 @@ class Innovation(ABC):
 
     @abstractmethod
     def sensors(self, outputs: int) -> tuple[tuple[int, ...], ...]:
-        """The outputs of each sensor, of so many outputs."""
+        """The outputs of each sensor, for this number of outputs."""
 
     @abstractmethod
     def limits(self, outputs: int) -> Array:
@@ -118,7 +118,7 @@ class Innovation(ABC):
         observed : (p,) bool array
             Which outputs are there.
         rejections : (s,) int array
-            For each sensor how often in a row it has failed before this sample.
+            Consecutive failures of each sensor before this sample.
         """
 
     def _judged(

@@ -184,7 +184,7 @@ def _judged(solver: Solver, qp: QP, what: str) -> tuple[Array | None, list[str]]
         if not np.array_equal(getattr(qp, array), values):
             faults.append(f"{what}: it wrote into {array}")
     faults += [
-        f"{what}: it wrote into {array}, which is to be read only; copy before scaling in place"
+        f"{what}: it wrote into {array}, which is read-only; copy before scaling in place"
         for array in solver._wrote
     ]
     return solution.d, faults
@@ -207,7 +207,7 @@ def _as_fresh(
         yield from faults
         anew = fresh[k]
         if anew is None or found is None or np.abs(anew - found).max() > _SAME:
-            yield f"{what} {k}: not the solution of a solver made anew"
+            yield f"{what} {k}: differs from the solution of a new solver"
 
 
 def _each(qps: Callable[[Bounds, Sides], dict[str, QP]]) -> _Check:
