@@ -212,7 +212,7 @@ def run(
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         if out != "-":
-            console.print("interrupted; continue by --resume.", highlight=False)
+            console.print("interrupted; continue with --resume.", highlight=False)
         raise
     most_failed = 2 * summary.failed > summary.samples + summary.inserted
     is_broken = summary.model_is_wrong or most_failed

@@ -81,7 +81,7 @@ def tune(
 
     if out.exists() and not overwrite:
         raise OptionError(
-            f"{out} exists already; give another --out, or replace it by --overwrite."
+            f"{out} exists already; give another --out, or replace it with --overwrite."
         )
     make_folder(out.parent)
     wanted, started, source = _integers("--horizons", horizons), _starts(parameter), find(model)

@@ -58,7 +58,7 @@ def with_arguments(model: str, parameters: dict[str, float]) -> str:
         return model
     if model.endswith(")"):
         raise ModelError(
-            f"model {model!r} has arguments already; give the tuned ones by --parameter only, and "
-            "the others as defaults of the function."
+            f"model {model!r} has arguments already; give the tuned ones with --parameter only, "
+            "and the others as defaults of the function."
         )
     return f"{model}({arguments_of(parameters)})"

@@ -163,7 +163,8 @@ def test_truth_and_several_records(folder):
 @pytest.mark.parametrize(("arguments", "error", "text"), [
     (["--truth", "position"], OptionError, "--truth has 'position'.* a name of x1, x2"),
     (["--truth", "x3=position"], OptionError, "--truth has 'x3=position'.* a name of x1, x2"),
-    (["--truth", "x1=WRONG"], RecordError, r"name it by --truth x1=COLUMN, or leave it out: then"),
+    (["--truth", "x1=WRONG"], RecordError,
+     r"name it with --truth x1=COLUMN, or leave it out: then"),
     (["--truth", "x1="], OptionError, "--truth leaves all true states out"),
     (["--held-out", "0.9"], OptionError, r"--held-out is 0\.9"),
     (["--parameter", "k=0"], InvalidInputError, "--parameter k starts at 0"),
