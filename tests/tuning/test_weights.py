@@ -94,7 +94,7 @@ def test_a_file_without_weights_is_refused(tmp_path, text):
     ("horizon = 0", "horizon is 0; expected an integer"),
     ("horizon = 2.5", r"horizon is 2\.5; expected an integer"),
     ("discount = 3", "discount is 3; expected a number"),
-    ("horison = 3", r"it has 'horison', which is no field of them\)"),
+    ("horison = 3", r"it has 'horison', which weights do not have\)"),
     ("threshold = -1", "threshold"),
 ])  # fmt: skip
 def test_a_field_that_is_wrong_is_named_with_the_file(tmp_path, line, text):
