@@ -59,7 +59,7 @@ def estimate(
     bound: Annotated[
         bool,
         typer.Option("--bound", help="Write the proved set around the observer that contains the "
-                                     "true state, and the bound of the estimate's error."),
+                                     "true state, and the bound on the estimate's error."),
     ] = False,
     bound_box: Annotated[
         str | None,

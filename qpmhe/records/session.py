@@ -155,7 +155,7 @@ def estimate_record(
         What to write of the covariances; whether to write the seconds of each step.
     bound : BoundOptions or bool
         Whether to write, for each predicted state, the sides of the proved set around the
-        observer and the bound of the estimate's error, blank once they no longer hold. The model
+        observer and the bound on the estimate's error, blank once they no longer hold. The model
         and its scenario supply what the options leave out.
     resume, overwrite : bool
         Whether to resume from the checkpoint beside ``out``, if there is one; whether to replace
