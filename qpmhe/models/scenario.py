@@ -134,7 +134,7 @@ class Scenario:
         dimension("horizon", self.horizon, 1)
         dimension("steps", self.steps, 1)
         if not isinstance(self.labels, (tuple, list)) or len(self.labels) != n:
-            raise OptionError(f"labels is {shown(self.labels)}; expected {n} names, one a state.")
+            raise OptionError(f"labels is {shown(self.labels)}; expected {n} names, one per state.")
         settling = finite(self.settling_time)
         if settling is None or settling < 0.0:
             raise OptionError(

@@ -169,7 +169,7 @@ class Output:
             self.offset = offset
         except FileNotFoundError as error:
             raise CheckpointError(
-                f"{self.path} is gone, but its checkpoint {self.checkpoint} is there; {again}"
+                f"{self.path} is missing, but its checkpoint {self.checkpoint} exists; {again}"
             ) from error
         except OSError as error:
             raise self._failed(error) from error

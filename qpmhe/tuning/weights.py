@@ -92,7 +92,7 @@ class Weights:
         ]
         if self.threshold is not None:
             lines.append(f"threshold = {float(self.threshold)!r}")
-        lines += ["", "# In squared units, a row a line.", "[covariances]"]
+        lines += ["", "# In squared units, one row per line.", "[covariances]"]
         for kind in KINDS:
             rows = ",\n".join(f"  {row}" for row in getattr(self, kind).tolist())
             lines.append(f"{kind} = [\n{rows},\n]")

@@ -123,7 +123,7 @@ class Case:
         observer = rows.iloc[0]
         ratio = observer[self.by] / other[self.by] if other[self.by] > 0.0 else np.inf
         words = configuration_words(other)
-        text = f"{self._value(observer)}, {number(ratio)} times that of {words}"
+        text = f"{self._value(observer)}, {number(ratio)} times the value of {words}"
         if np.isfinite(observer["time_median"]):
             share = observer["time_median"] / other["time_median"]
             text += (
