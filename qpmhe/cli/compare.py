@@ -23,9 +23,9 @@ _JOBS = typer.Option(min=1, help="Cells to run in parallel, default all cores; t
                                  "times, give 1.")
 _SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
 _FAILING = typer.Option(metavar="DIR", help="Folder for QPs on which a backend failed or gave "
-                                             "up without a cap, for qpmhe solve-qp; cells that "
-                                             "the store has do not run again.")
-_RETRY = typer.Option("--retry-failed", help="Run the cells again that failed before.")
+                                             "up without a cap, for qpmhe solve-qp; stored "
+                                             "cells do not run again.")
+_RETRY = typer.Option("--retry-failed", help="Rerun failed cells.")
 
 
 def compare(
@@ -63,11 +63,11 @@ def compare(
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 20,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, help="Samples of each record; if left out, the model's own, and 100 "
-                     "where no model is named."),
+        typer.Option(min=1, help="Samples of each record; default is the model's own, or 100 if no "
+                                 "model is named."),
     ] = None,
     measure: Annotated[
-        Measure, typer.Option(help="What to measure; times alone run one cell after the other.")
+        Measure, typer.Option(help="What to measure; for times alone, one cell runs at a time.")
     ] = "both",
     deadline: Annotated[
         float | None, typer.Option(help="Deadline of a step in seconds; the report shows how "
@@ -80,7 +80,7 @@ def compare(
         float, typer.Option(help="Seconds after which a cell is stopped.")
     ] = 60.0,
     store: Annotated[
-        Path, typer.Option(help="File of the results; a run that was stopped resumes from it.")
+        Path, typer.Option(help="File of the results; a stopped study resumes from it.")
     ] = Path("results/compare.sqlite"),
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("results/compare"),
     jobs: Annotated[int | None, _JOBS] = None,
@@ -135,7 +135,7 @@ def study(
     retry_failed: Annotated[bool, _RETRY] = False,
     keep_failing: Annotated[Path | None, _FAILING] = None,
 ) -> None:
-    """Run the study of a file; if it is stopped, the same command resumes it."""
+    """Run the study in a file; if it is stopped, the same command resumes it."""
     target = file.with_suffix(".sqlite") if store is None else store
     _run(
         Study.from_toml(file), target,
@@ -172,7 +172,7 @@ def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
     _show_kept(console, options["keep_failing"])
     if 0 < len(failed) == len(cells):
         raise StudyError(
-            f"no cell of the study finished, {len(failed)} failed; the first because of: "
+            f"no cell of the study finished, {len(failed)} failed; the first reason: "
             f"{failed['reason'].iloc[0].rstrip('.')}. Correct that, then give the same command "
             "with --retry-failed."
         )

@@ -47,8 +47,8 @@ def tune(
     ] = None,
     objective: Annotated[
         Literal["auto", "likelihood", "prediction", "truth"],
-        typer.Option(help="What to minimise after the likelihood; auto is the error where "
-                          "--truth is given."),
+        typer.Option(help="What to minimise after the likelihood; auto: the state error if --truth "
+                          "is given."),
     ] = "auto",
     truth: options.Truth = None,
     time: options.Time = None,
@@ -71,7 +71,7 @@ def tune(
         Path | None, typer.Option(help="PNG of the weights and the held-out scores.")
     ] = None,
 ) -> None:
-    """Choose the weights of an estimator from records; if it is stopped, the same call resumes."""
+    """Choose the weights of an estimator from records; if stopped, the same command resumes."""
     from ..plots import save
     from ..records.arrays import read_record
     from ..records.record_model import load_record_model
@@ -81,7 +81,7 @@ def tune(
 
     if out.exists() and not overwrite:
         raise OptionError(
-            f"{out} exists already; give another --out, or replace it by --overwrite."
+            f"{out} exists already; give another --out, or replace it with --overwrite."
         )
     make_folder(out.parent)
     wanted, started, source = _integers("--horizons", horizons), _starts(parameter), find(model)

@@ -10,7 +10,7 @@ from ..model.sets import Box
 
 
 def read_box(option: str, text: str, width: int | None = None, kind: str = "components") -> Box:
-    """The box of an option, of so many components where that is known."""
+    """The box of an option; `width` is its number of components, if known."""
     pairs = [item.split(":") for item in text.split(",")]
     try:
         many = len(pairs) if width is None else width
@@ -32,7 +32,7 @@ def read_state(text: str) -> NDArray[np.float64]:
 
 
 def read_numbers(option: str, text: str) -> NDArray[np.float64]:
-    """Numbers between commas."""
+    """Comma-separated numbers."""
     try:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:
@@ -58,7 +58,7 @@ def with_arguments(model: str, parameters: dict[str, float]) -> str:
         return model
     if model.endswith(")"):
         raise ModelError(
-            f"model {model!r} has arguments already; give the tuned ones by --parameter only, and "
-            "the others as defaults of the function."
+            f"model {model!r} has arguments already; give the tuned ones with --parameter only, "
+            "and the others as defaults of the function."
         )
     return f"{model}({arguments_of(parameters)})"

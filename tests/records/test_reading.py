@@ -94,8 +94,8 @@ NO_SAMPLES = [
     (b"PK\x03\x04" + bytes(100), "spreadsheet"), (b"BZh91AY" + bytes(100), "bzip2"),
     (b"\xfd7zXZ\0" + bytes(100), "xzcat"), (b"\x28\xb5\x2f\xfd" + bytes(100), "zstd"),
     (GOOD.replace("\n", "\r").encode(), "end lines in LF"),
-    (f"# logger v1\n{GOOD}".encode(), "Skip lines above the header by --skip-lines"),
-    (f"Logger,v1\n\nserial,77\n{GOOD}".encode(), "Skip lines above the header by --skip-lines"),
+    (f"# logger v1\n{GOOD}".encode(), "Skip lines above the header with --skip-lines"),
+    (f"Logger,v1\n\nserial,77\n{GOOD}".encode(), "Skip lines above the header with --skip-lines"),
     (",".join(f"channel {k:04d} {'x' * 500}" for k in range(500)).encode(), "and 460 more"),
 ]
 

@@ -63,7 +63,7 @@ def test_fastest_near_the_best_the_observer_and_failures():
     assert found["Failures"] == "Never: daqp and proxqp. Failed: osqp: 2 of 6 runs failed."
     rows = frame()
     rows["reasons"] = [{"SOLVER_FAILED": 4} if one == "osqp" else {} for one in rows.backend]
-    words = "osqp, 2 QPs per sample, cap 2: no run, but 10 % of the steps"
+    words = "osqp, 2 QPs per sample, cap 2: 10 % of the steps, but no run"
     assert words in texts(rows)[0]["Failures"]
 
 
@@ -397,7 +397,7 @@ def test_the_terminals_room_is_used(width):
     assert {"RMSE", "conv.", "median", "impr."} <= headings
     assert ("99 %" in headings) == (width >= 120)
     assert ({"95 %", "kept", "back", "hits", "max"} <= headings) == (width == 200)
-    assert ("No room here, but in the report" in " ".join(text.split())) == (width < 200)
+    assert ("Only in the report, for want of room" in " ".join(text.split())) == (width < 200)
     assert not {"late", "NEES"} & headings
     # What was asked for is shown at any width: generic backends, two starts, failed runs.
     rows = frame().query("horizon == 10")

@@ -123,7 +123,7 @@ class Case:
         observer = rows.iloc[0]
         ratio = observer[self.by] / other[self.by] if other[self.by] > 0.0 else np.inf
         words = configuration_words(other)
-        text = f"{self._value(observer)}, {number(ratio)} times that of {words}"
+        text = f"{self._value(observer)}, {number(ratio)} times the value of {words}"
         if np.isfinite(observer["time_median"]):
             share = observer["time_median"] / other["time_median"]
             text += (
@@ -173,7 +173,7 @@ class Case:
                 failures.append(f"{backend}: {failed} of {cells} runs failed")
             elif share > 0:
                 worst = configuration_words(mine.loc[mine["failed_steps"].idxmax()])
-                failures.append(f"{worst}: no run, but {percent(share)} of the steps")
+                failures.append(f"{worst}: {percent(share)} of the steps, but no run")
             else:
                 never.append(str(backend))
         if not failures:
@@ -215,10 +215,10 @@ def file_name(title: str) -> str:
 
 
 def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
-    """The fastest configuration near the best, and the most accurate, of equals the fastest.
+    """The fastest configuration near the best, and the most accurate, among equals the fastest.
 
-    The first is None where there are no times; all is None where no configuration finished all
-    its runs.
+    The first is None if there are no times; the result is None if no configuration finished all its
+    runs.
     """
     rows, by = _whole(summary), measure(summary)
     if rows.empty:
@@ -258,7 +258,7 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
     seeds = int(summary["seeds"].max())
     notes = [
         "A time covers a whole update: the observer's step, building the QPs, the solver, and the "
-        "verdict on its iterate.",
+        "check of its iterate.",
         _RMSE if measure(summary) == "rmse" else _NO_TRUTH,
         f"Values within {percent(TOLERANCE)} count as equal on the Pareto front.",
     ]

@@ -130,11 +130,11 @@ def write_report(
     Parameters
     ----------
     source : Store, path or (frame, meta)
-        A store or its file; or its frame and meta alone, then without trajectories.
+        A store or its file; or only its frame and meta, then without trajectories.
     out : path
         The folder; it is made.
     width : {"single", "double"} or float, optional
-        For a paper: the figures are PDF files, too, of this width; see `qpmhe.plots.save`.
+        For a paper: also write the figures as PDF of this width; see `qpmhe.plots.save`.
 
     Returns
     -------
@@ -144,8 +144,8 @@ def write_report(
     Raises
     ------
     StoreError, InvalidInputError, OptionError
-        If the store cannot be read or has no finished cell, the folder cannot be made, a library
-        is missing, or the width is neither.
+        If the store cannot be read or has no finished cell, the folder cannot be made, a library is
+        missing, or the width is invalid.
     """
     check_libraries()
     inches = inches_of(width)
@@ -155,7 +155,7 @@ def write_report(
     frame, meta = held if isinstance(held, tuple) else (held.frame(), held.meta())
     if not len(frame):
         raise InvalidInputError(
-            "the study has no finished cell, so that there is nothing to report; run it first."
+            "the study has no finished cell to report; run it first."
         )
     folder = make_folder(out)
     summary = summarise(frame)
@@ -431,7 +431,7 @@ def _page(
 
 
 def embedded(value: Any) -> str:
-    """JSON for a script element, which no text in it can end or lengthen."""
+    """JSON for a script element that no text in it can end or extend."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
