@@ -329,7 +329,7 @@ def test_success_that_is_none():
         np.zeros(20), np.zeros(22), 0.0, np.full(21, np.nan), np.full(21, np.inf), "none",
         ["a"] * 21, [[0.0], [0.0, 1.0]], {}, object(), [1j] * 21,
     ],
-    ids=str,
+    ids=lambda one: type(one).__name__,
 )
 @pytest.mark.parametrize("which", ["bound_duals", "row_duals"])
 def test_unusable_multipliers_are_dropped(which, duals):
