@@ -36,7 +36,7 @@ def test_discrete_time_inputs_and_constants():
         (["(", X[1]], [X[0]], "expected SymPy expressions"),
         ([X[0] > 0, X[1]], [X[0]], "f contains x1 > 0; expected SymPy expressions"),
         (X, [], "h is empty"),
-        ([X[0] * sympy.Symbol("t"), X[1]], [X[0]], "f contains t, .* varying quantities inputs"),
+        ([X[0] * sympy.Symbol("t"), X[1]], [X[0]], "f contains t, .*varying quantities inputs"),
         ([X[0], sympy.Symbol("x2", real=True)], [X[0]], "x2 has the name .* real=True"),
         ([sympy.Function("g")(X[0]), X[1]], [X[0]], r"f contains g\(.*unknown functions"),
         ([sympy.I * X[0], X[1]], [X[0]], "finite real value"),

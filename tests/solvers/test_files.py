@@ -174,7 +174,7 @@ class Trap:
         return pytest.fail, ("a pickle was run",)
 
 
-FOREIGN, DAMAGED = "no QP file.*qpmhe.solvers.dump", "damaged"
+FOREIGN, DAMAGED = "not a QP file.*qpmhe.solvers.dump", "damaged"
 
 
 def test_files_of_another_kind_are_refused(tmp_path):
