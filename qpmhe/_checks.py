@@ -220,8 +220,8 @@ def check_problem(state: Any, mine: tuple[int, ...]) -> None:
         or tuple(found) != mine
     ):
         raise InvalidInputError(
-            f"the snapshot is of another problem: (n, p, m, horizon) = {shown(found)}; expected "
-            f"{shown(list(mine) if isinstance(found, list) else mine)}."
+            "the state is a snapshot of another problem: (n, p, m, horizon) = "
+            f"{shown(tuple(found) if isinstance(found, list) else found)}; expected {mine}."
         )
 
 

@@ -512,7 +512,7 @@ def _inputs(value: ArrayLike | None, shape: tuple[int, ...], call: str) -> Array
     """Inputs of the shape (K, ..., m), the same for all members if given without K."""
     m, common = shape[-1], shape[1:]
     if value is None and m:
-        raise InvalidInputError(f"U is missing; the system has {m} inputs: {call}.")
+        raise InvalidInputError(f"U is missing; the system has {m} input{'s' * (m != 1)}: {call}.")
     if value is None:
         return np.zeros(shape)
     if m == 0:

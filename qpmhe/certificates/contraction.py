@@ -295,6 +295,13 @@ class Synthesis:
     observer: Luenberger
     stability: ObserverStability
 
+    def __str__(self) -> str:
+        gain = " ".join(np.array2string(self.observer.gain, precision=4, separator=", ").split())
+        return (
+            f"Constant gain {gain}: the error contracts at the rate {self.stability.rho:.4g} a "
+            f"sample ({self.stability.evidence}); {'; '.join(self.stability.notes)}."
+        )
+
 
 def synthesise_gain(
     system: System, region: ConvexSet | Region | None = None, *, rho: float | None = None,

@@ -136,9 +136,9 @@ def _table(
     best = {
         one.name: _best(rows.loc[case.whole.index], one.name, one.less) for one in columns
     }
-    drawn, caption = rows, (
-        "*: best; among equals, the fastest. front: Pareto front. Times: Python step."
-    )
+    drawn, caption = rows, "*: best."
+    if rows["time_median"].notna().any():
+        caption = "*: best; among equals, the fastest. front: Pareto front. Times: Python step."
     if len(rows) > _MOST_ROWS:
         drawn = rows.loc[sorted(_selection(case) | {one for one in best.values() if one >= 0})]
         caption = (

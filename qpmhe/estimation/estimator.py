@@ -444,7 +444,7 @@ class MovingHorizonEstimator:
         if u is None:
             if count:
                 raise InvalidInputError(
-                    f"u is missing; the system has {count} inputs: update(y, u)."
+                    f"u is missing; the system has {count} input{'s' * (count != 1)}: update(y, u)."
                 )
         elif count == 0:
             beside = " beside its parameters" if self.system.m else ""

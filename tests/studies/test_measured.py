@@ -244,6 +244,8 @@ def test_the_command_counts_kept_qps_and_a_record_model_alone_names_the_remedy(h
     text = command("compare", "--model", "mine.py:make", "--record", "log.csv", *GRID,
                    "--store", "kept.sqlite", "--out", "out", "--keep-failing", "failing")
     assert "failing has no QPs" in text
+    page = (Path("out") / "index.html").read_text(encoding="utf-8")
+    assert "configurations, up to 40 steps each" in page  # no seeds
     (Path("failing") / "cell").mkdir()
     (Path("failing") / "cell" / "one.npz").touch()
     text = command("compare", "--model", "mine.py:make", "--record", "log.csv", *GRID,

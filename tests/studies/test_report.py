@@ -19,7 +19,7 @@ from qpmhe.plots.style import _resized
 from qpmhe.studies.report import cases, write_report
 from qpmhe.studies.report.answers import failures, limitations
 from qpmhe.studies.report.drawing import styles
-from qpmhe.studies.report.figures import profiles, spreads
+from qpmhe.studies.report.figures import anytime, profiles, spreads
 from qpmhe.studies.report.page import Part, choose_runs, files
 from qpmhe.studies.report.words import configuration_words, number, percent, seconds
 from qpmhe.studies.summary import summarise
@@ -90,6 +90,13 @@ def test_what_is_worse_than_no_qp_is_named():
         "1 of 6 configurations has a larger error after settling than the observer alone")
     rows.loc[worse, "rmse"] = np.inf
     assert "osqp, 2 QPs per sample, cap 2 (RMSE ∞); daqp" in texts(rows)[0]["Worse than no QP"]
+
+
+def test_one_backend_at_one_cap_is_not_drawn():
+    rows = summarise(frame())
+    assert anytime(rows[rows["solver_iterations"].isna()]) is not None
+    assert anytime(rows[rows["solver_iterations"].isna() & (rows["backend"] != "osqp")
+                        & (rows["backend"] != "proxqp")]) is None
 
 
 def test_most_of_what_is_worse_is_counted():

@@ -73,10 +73,10 @@ def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing
 def anytime(summary: DataFrame) -> Drawing | None:
     """RMSE and cost ratio against the cap, a line for each backend and number of QPs per sample.
 
-    Without the cost ratio where the study has none.
+    Without the cost ratio where the study has none, and nothing of one backend at one cap.
     """
     rest = summary[(summary["backend"] != "observer") & (summary["failures"] == 0)]
-    if rest.empty:
+    if len(rest[["backend", "solver_iterations"]].drop_duplicates()) < 2:
         return None
     observer = summary[summary["backend"] == "observer"]
     caps = sorted({int(cap) for cap in rest["solver_iterations"] if not missing(cap)})

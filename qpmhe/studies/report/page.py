@@ -397,11 +397,15 @@ def _page(
     }
     done, seeds = int((frame["outcome"] == "done").sum()), frame["seed"].nunique()
     models = listed([str(model) for model in dict.fromkeys(frame["model"])])
+    study = dict(meta.get("study") or {})
+    if study.get("records"):  # they have neither
+        study = {key: one for key, one in study.items() if key not in ("seeds", "noise_levels")}
+    several = "" if study.get("records") else f"{seeds} seed{'s' * (seeds != 1)}, "
     return jinja.get_template("page.html.j2").render(
         title=f"Backends compared: {models}",
         subtitle=f"{len(frame)} runs ({done} finished, {len(frame) - done} failed) of "
         f"{sum(len(case.summary) for case in found)} configurations, "
-        f"{seeds} seed{'s' * (seeds != 1)}, up to {int(frame['steps'].max())} steps each.",
+        f"{several}up to {int(frame['steps'].max())} steps each.",
         css=(here / "page.css").read_text(encoding="utf-8"),
         script=(here / "page.js").read_text(encoding="utf-8"),
         plotly=get_plotlyjs(),
@@ -420,7 +424,7 @@ def _page(
         left_out=sum(part.runs.left_out for part in parts),
         limitations=limitations(frame, summary),
         failures=failures(frame),
-        settings=_flat(meta.get("study") or {}),
+        settings=_flat(study),
         environments=[_flat(one) for one in meta.get("environments") or []],
         machines=_machines(meta, summary),
         sweeps=listed([
