@@ -192,7 +192,7 @@ def _horizons(text: str | None) -> list[int]:
     except ValueError:
         found = []
     if not found or min(found) < 1:
-        raise OptionError(f"--horizon is {text!r}; expected integers >= 1 between commas.")
+        raise OptionError(f"--horizon is {text!r}; expected integers >= 1 separated by commas.")
     return found
 
 

@@ -44,18 +44,18 @@ def compare(
         typer.Option(help="QP backend; may be repeated. All installed ones if left out."),
     ] = None,
     qps: Annotated[
-        str, typer.Option(help="QPs per sample, between commas; 0 is the observer, none iterates "
-                          "to convergence.")
+        str, typer.Option(help="QPs per sample, separated by commas; 0 is the observer, none "
+                          "iterates to convergence.")
     ] = "0,1,2,5,none",
     solver_iterations: Annotated[
-        str, typer.Option(help="Caps on the iterations inside each QP, between commas.")
+        str, typer.Option(help="Caps on the iterations inside each QP, separated by commas.")
     ] = "1,2,5,10,none",
     horizons: Annotated[
-        str, typer.Option(help="Horizons N, between commas; default is the model's own.")
+        str, typer.Option(help="Horizons N, separated by commas; default is the model's own.")
     ] = "default",
     noise_levels: Annotated[
         str, typer.Option(help="Factors on the standard deviations of the simulated disturbance "
-                               "and noise, between commas.")
+                               "and noise, separated by commas.")
     ] = "1",
     start: Annotated[
         list[str] | None, typer.Option(help="candidate or best; may be repeated.")
@@ -201,7 +201,7 @@ def _numbers(name: str, text: str) -> list[int | None]:
         except ValueError as error:
             option = name.replace("_", "-")
             raise OptionError(
-                f"--{option} has {word!r}; expected integers >= {least} between commas, or "
+                f"--{option} has {word!r}; expected integers >= {least} separated by commas, or "
                 f"{WORDS[name]!r}."
             ) from error
     return found

@@ -11,7 +11,7 @@ Model = Annotated[
 ]
 Horizon = Annotated[int | None, typer.Option(min=1, help="Horizon N; default is the model's.")]
 InitialState = Annotated[
-    str | None, typer.Option(help="Initial estimate, numbers between commas; default is the "
+    str | None, typer.Option(help="Initial estimate, numbers separated by commas; default is the "
                                   "model's.")
 ]
 Time = Annotated[str | None, typer.Option(help="Column of the time.")]

@@ -58,7 +58,7 @@ def tune(
     held_out: Annotated[float, typer.Option(help="Share of the blocks held out to judge the "
                                                  "result.")] = 0.25,
     horizons: Annotated[
-        str | None, typer.Option(help="Horizons to compare afterwards, between commas.")
+        str | None, typer.Option(help="Horizons to compare afterwards, separated by commas.")
     ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Starting points of the search.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the starting points.")] = 0,
@@ -181,4 +181,4 @@ def _integers(option: str, text: str | None) -> list[int]:
     try:
         return [int(item) for item in text.split(",")] if text else []
     except ValueError:
-        raise OptionError(f"{option} is {text!r}; expected integers between commas.") from None
+        raise OptionError(f"{option} is {text!r}; expected integers separated by commas.") from None

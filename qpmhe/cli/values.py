@@ -20,7 +20,7 @@ def read_box(option: str, text: str, width: int | None = None, kind: str = "comp
     except ValueError as error:
         whom = "each component" if width is None else f"each of {width} {kind}"
         raise OptionError(
-            f"{option} is {text!r}; expected low:high for {whom}, between commas, as in "
+            f"{option} is {text!r}; expected low:high for {whom}, separated by commas, as in "
             "0.1:9,-1:9."
         ) from error
     return Box(low, high)
@@ -36,7 +36,7 @@ def read_numbers(option: str, text: str) -> NDArray[np.float64]:
     try:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:
-        raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None
+        raise OptionError(f"{option} is {text!r}; expected numbers separated by commas.") from None
 
 
 def read_width(text: str | None) -> str | float | None:
