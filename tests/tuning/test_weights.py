@@ -165,7 +165,7 @@ def test_truth_and_several_records(folder):
     (["--truth", "x3=position"], OptionError, "--truth has 'x3=position'.* a name of x1, x2"),
     (["--truth", "x1=WRONG"], RecordError,
      r"name it with --truth x1=COLUMN, or leave it out: then"),
-    (["--truth", "x1="], OptionError, "--truth leaves all true states out"),
+    (["--truth", "x1="], OptionError, "--truth leaves out all true states"),
     (["--held-out", "0.9"], OptionError, r"--held-out is 0\.9"),
     (["--parameter", "k=0"], InvalidInputError, "--parameter k starts at 0"),
     (["--parameter", "k"], OptionError, "NAME=START"),
