@@ -165,5 +165,5 @@ def test_options_that_do_not_fit(here):
             estimate(DISCRETE, **options)
         assert not Path("out.csv").exists(), options
     put("record.csv", lines(3))
-    with pytest.raises(OptionError, match="own step"):
+    with pytest.raises(OptionError, match="model's step is"):
         estimate(CONTINUOUS, dt=0.2)
