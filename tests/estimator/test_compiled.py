@@ -175,12 +175,6 @@ def test_the_same_estimates_whatever_comes(name):
             assert (mhe.engine, mhe.time) == ("compiled", STEPS)
 
 
-def test_measurements_in_other_forms():
-    for y in ([1.0, None, 0.5], (None, None, None), np.ma.array([1.0, 2.0, 0.5], mask=[0, 1, 1]),
-              [1, 2, 3], np.array([1, 2, 3], np.float32), np.arange(6.0)[::2]):
-        agree(*(mhe.update(y) for mhe in both(made("wide"))), 1e-10)
-
-
 def test_a_discount_that_underflows_within_the_window():
     """The oldest stages then weigh nothing: no reason for the factorisation to fail."""
     system, estimates = system_of(lambda x: 0.9 * x, lambda x: x + 0.1 * x**3, n=1), []
@@ -221,31 +215,6 @@ def quotient():
 
 
 FRAGILE = {"logarithm": logarithm, "quotient": quotient}
-
-
-@pytest.mark.parametrize("way", range(4))
-@pytest.mark.parametrize("name", FRAGILE)
-def test_a_model_that_is_not_finite_everywhere(name, way):
-    one, generator, failed = made(name), np.random.default_rng(1), 0
-    for _ in range(2):
-        pair, twins = both(one, **WAYS[way]), both(one, **WAYS[way])
-        for t, sample in enumerate(one.samples):
-            y = np.array(sample["y"])
-            if name != "quotient" and generator.random() < 0.2:
-                y += generator.choice([-40.0, -400.0, 300.0, -2000.0])
-            for mhe, twin in zip(pair, twins, strict=True):
-                loaded(mhe, twin)
-            expected, found = (mhe.update(**sample | {"y": y}) for mhe in pair)
-            # Far away from the data rounding grows from step to step.
-            agree(expected, found, 1e-7)
-            for twin, estimate in zip(twins, (expected, found), strict=True):
-                equal(twin.update(**sample | {"y": y}), estimate)
-            assert np.isfinite(found.trajectory).all()
-            failed += not np.isfinite(found.candidate_cost)
-            if t % 3 == 2:
-                when = max(t - 1, t + 1 - one.options["horizon"])
-                agree(*(mhe.amend(when, one.samples[when]["y"]) for mhe in pair), 1e-7)
-    assert failed > 3
 
 
 def test_an_outage_longer_than_the_window():
@@ -351,28 +320,6 @@ def test_sets_of_almost_no_width(flat):
         costs.append([estimate.cost for estimate in estimates])
     assert sum(estimate.improved for estimate in estimates) > 6
     np.testing.assert_allclose(costs[1], costs[0], rtol=1e-6)
-
-
-@pytest.mark.parametrize(("name", "kind"), [("stirred_tank", "tight"), ("van_der_pol", "polytope")])
-def test_no_unit_matters(name, kind):
-    """A compiler may contract the model's operations in other ways: the same up to rounding."""
-    generator = np.random.default_rng(5)
-    one, usual = estimator_in(name, kind, max_qps=3)
-    Y, flags = one.record(0, 30), Status(0)
-    expected = [usual.update(y) for y in Y]
-    S, T = (2.0 ** generator.integers(-30, 31, size) for size in (one.n, one.p))
-    _, other = estimator_in(name, kind, x_unit=S, y_unit=T, max_qps=3)
-    for y, before in zip(Y, expected, strict=True):
-        estimate = other.update(y * T)
-        size = np.abs(before.trajectory).max()
-        np.testing.assert_allclose(
-            estimate.trajectory / S, before.trajectory, rtol=1e-9, atol=1e-9 * size
-        )
-        assert estimate.cost == pytest.approx(before.cost, rel=1e-10)
-        for field in ("status", "qps", "nearest_points", "dropped"):
-            assert getattr(estimate, field) == getattr(before, field), field
-        flags |= estimate.status
-    assert Status.CANDIDATE_OUTSIDE in flags
 
 
 @pytest.mark.parametrize("backend", ["auto", "banded"])  # the latter knows no inequalities

@@ -71,6 +71,8 @@ def test_an_interrupted_step_was_not_taken(name, stride):
         if t in (2, 9, 20):
             both(lambda one, t=t: one.amend(t - 1, [0.3]))
             np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
+        if t == 22:
+            both(lambda one: one.set(noise_weight=[[2.0]]))
         if t == 24:
             state = estimator(engine, **options).state_dict()
             both(lambda one, state=state: one.load_state_dict(state))

@@ -13,7 +13,6 @@ from qpmhe import Status
 from qpmhe.errors import InvalidInputError
 
 from .spoil import check, cost_of, estimator, system_of, unharmed
-from .untraced import untraced
 
 NAT = np.datetime64("NaT")
 NOTHING = [
@@ -84,24 +83,6 @@ def test_a_missing_component_is_not_judged_against_its_set():
     estimate = mhe.update([None, mhe.state[1] + 30.0])
     assert Status.CANDIDATE_OUTSIDE in estimate.status
     assert estimate.dropped == (("noises", 1, "upper", 6),)
-
-
-def test_the_model_is_called_once_at_the_candidate_all_the_same():
-    calls = []
-
-    def counting(x):
-        calls.append(x.ndim)
-        return 0.9 * x
-
-    mhe = two(qpmhe.System(
-        untraced(counting), lambda x: x, n=2, p=2,
-        f_jacobian=lambda x: np.broadcast_to(0.9 * np.eye(2), (*x.shape, 2)),
-    ))
-    mhe.update([1.0, 2.0])
-    for y in (None, [np.inf, 0.7]):
-        calls.clear()
-        mhe.update(y)
-        assert calls.count(1) == 1
 
 
 DATE, DURATION = np.datetime64("2026-01-01T00:00:05"), np.timedelta64(5, "s")

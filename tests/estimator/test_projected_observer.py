@@ -217,32 +217,6 @@ def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
         assert sum(projected for _, projected in found) > 0.09 * runs * steps
 
 
-def test_the_candidates_disturbance_is_bounded_where_kappa_does_not_bound_it():
-    """|L(t)| <= |e(t+1)| + L_f |e(t)| + |w(t)|; and the plain one's |L|_M where f(z) is in X."""
-    rng, seen = np.random.default_rng(4), {True: 0, False: 0}
-    for _ in range(40):
-        closed, gain, c, metric, _ = certified(rng, 2)
-        a, box = closed + gain @ c, qpmhe.Box([0.0, -1.0], [2.0, 1.0])
-        mhe = estimator(linear(a, c, box), in_own_metric(gain, metric), start=[1.0, 0.0])
-        x, z = np.array([1.0, 0.5]), mhe.state
-        for _ in range(20):
-            v, following = 0.3 * rng.standard_normal(1), rng.uniform(box.lower, box.upper)
-            estimate = mhe.update(c @ x + v)
-            applied, plain = estimate.disturbances[-1], gain @ (c @ (x - z) + v)
-            bound = sum(
-                np.linalg.norm(one) for one in (following - estimate.state, following - a @ x)
-            ) + np.linalg.norm(a, 2) * np.linalg.norm(x - z)
-            assert np.linalg.norm(applied) <= bound * (1 + 1e-9)
-            if Status.OBSERVER_PROJECTED in estimate.status:
-                stays = box.violation(a @ z) == 0.0
-                seen[stays] += 1
-                if stays:
-                    assert applied @ metric @ applied <= plain @ metric @ plain * (1 + 1e-9)
-                assert (Status.PREDICTION_OUTSIDE in estimate.status) is not stays
-            x, z = following, estimate.state
-    assert min(seen.values()) > 10
-
-
 CLOSED = np.array([[1.2, 1.0], [-1.0, -0.5]])
 K, C = np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
 
@@ -291,25 +265,6 @@ def pressures(steps=30):
         found.append([x.sum() + 0.1 * rng.standard_normal()])
         x = reaction(x)
     return np.array(found)
-
-
-def test_without_projection_the_observer_is_the_papers():
-    gain, ys = np.array([[0.8], [-0.3]]), pressures(8)
-    expected = [np.array([0.1, 4.5])]
-    for y in ys:
-        expected.append(reaction(expected[-1]) + gain @ (y - expected[-1].sum()))
-    plain = estimator(
-        reactor(), qpmhe.Luenberger(gain), start=[0.1, 4.5], project_observer=False
-    ).run(ys)
-    np.testing.assert_allclose(plain.states, expected, rtol=1e-12)
-    assert (plain.states < 0.0).any()
-    assert plain.share(Status.OBSERVER_PROJECTED) == 0.0
-    # Within the set nothing changes.
-    near = [
-        estimator(reactor(bounded), qpmhe.Luenberger([0.05, 0.05]), start=[3.0, 1.0], max_qps=2)
-        for bounded in (True, False)
-    ]
-    np.testing.assert_array_equal(*(mhe.run(ys).states for mhe in near))
 
 
 # First guesses, noise-free components, degenerate sets
@@ -363,24 +318,6 @@ def test_the_roll_out_restores_a_moved_noise_free_component():
 
 
 # A prediction that says nothing
-
-
-def test_the_exothermic_reactor_settles_from_far_away_as_from_near():
-    system, observer, cost, scenario = qpmhe.models.cstr()
-    error = scenario.initial_estimate - scenario.initial_state
-    states, measurements, inputs = scenario.simulate(0)
-    settled = []
-    for factor in (1.0, 3.0, 5.0):
-        start = np.clip(
-            scenario.initial_state + factor * error, system.states.lower, system.states.upper
-        )
-        run = estimator(system, observer, start=start, cost=cost, horizon=20).run(
-            measurements, inputs
-        )
-        late = ((run.states - states) / [0.3, 5.0])[100:]
-        settled.append(np.sqrt(np.mean(late**2)))
-    assert settled == pytest.approx([settled[0]] * 3, rel=1e-3)
-    assert settled[0] < 0.12
 
 
 def test_a_prediction_beyond_the_sets_width_does_not_drown_the_correction():

@@ -40,34 +40,7 @@ def record(samples, missing=0.0):
     return np.array(ys)
 
 
-# As they are given, and their definitions.
-COSTS = {
-    "huber": (
-        (qpmhe.Huber(P, 0.1), qpmhe.Huber(Q, 0.2), qpmhe.Huber(R, 0.3)),
-        (plain.huber(0.1), plain.huber(0.2), plain.huber(0.3)),
-    ),
-    "power": (
-        (P, qpmhe.Power(Q, 1.5), qpmhe.Power(R, 3.0)),
-        (plain.quadratic, plain.power(1.5), plain.power(3.0)),
-    ),
-    "redescending": (
-        (P, qpmhe.Cauchy(Q, 0.7, graduation=1.0), qpmhe.GemanMcClure(R, 0.9, graduation=1.0)),
-        (plain.quadratic, plain.barron(0.0, 0.7), plain.geman_mcclure(0.9)),
-    ),
-    "graduated": (
-        (P, qpmhe.Cauchy(Q, 0.7), qpmhe.GemanMcClure(R, 0.9, graduation=5.0)),
-        (plain.quadratic, plain.barron(0.0, 0.7), plain.geman_mcclure(0.9)),
-    ),
-    "mixed": (
-        (qpmhe.Quadratic(P), qpmhe.Power(Q, 1.2), qpmhe.Huber(np.diag([4.0, 9.0]), 0.4, True)),
-        (plain.quadratic, plain.power(1.2), plain.each(plain.huber(0.4))),
-    ),
-}
 TERMS = ("prior", "disturbance", "noise")
-
-
-def cost_of(name, **options):
-    return qpmhe.RobustCost(**dict(zip(TERMS, COSTS[name][0], strict=True)), **options)
 
 
 def estimator(cost, **options):
@@ -95,29 +68,6 @@ def test_matrices_stand_for_quadratic_losses(prior):
     for run in runs[1:]:
         np.testing.assert_allclose(run.states, runs[0].states, rtol=1e-9, atol=1e-10)
         np.testing.assert_allclose(run.costs, runs[0].costs, rtol=1e-9)
-
-
-@pytest.mark.parametrize("name", COSTS)
-def test_majorising_weights_have_the_slopes_of_the_losses(name):
-    cost, generator = cost_of(name), np.random.default_rng(4)
-    weights = [getattr(one, "weight", one) for one in COSTS[name][0]]
-    residuals = generator.standard_normal((20, 4)) * 10.0 ** generator.uniform(-1, 1, (20, 1))
-    of_x, of_w, of_v = (
-        lambda s, loss=loss, weight=weight: loss(s, weight)
-        for loss, weight in zip(COSTS[name][1], weights, strict=True)
-    )
-    joint = cost.majorise(residuals, cost.stage_weight)
-    assert not joint[:, :2, 2:].any()
-    assert not joint[:, 2:, :2].any()
-    for residual, weight in zip(residuals, joint, strict=True):
-        slope = plain.differences(lambda r: of_w(r[:2]) + of_v(r[2:]), residual)
-        np.testing.assert_allclose(2.0 * weight @ residual, slope, rtol=1e-9, atol=1e-9)
-        offset = residual[:2]
-        assert cost.prior_cost(offset, P) == pytest.approx(of_x(offset), rel=1e-12)
-        prior_weight = cost.majorise_prior(offset, P)
-        slope = plain.differences(of_x, offset)
-        np.testing.assert_allclose(2.0 * prior_weight @ offset, slope, rtol=1e-9)
-    assert cost.prior_cost(np.zeros(2), P) == 0.0
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 3.0])

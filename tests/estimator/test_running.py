@@ -9,7 +9,7 @@ import qpmhe
 from qpmhe import Status
 
 from .plain import spd
-from .same import Interruption, assert_same
+from .same import assert_same
 from .untraced import untraced
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
@@ -191,30 +191,6 @@ def test_one_call_of_the_model_advances_all_observers():
         calls.clear()
         mhe.update([0.1 * t, 1.0])
         assert calls == [(20, 2)]
-
-
-@pytest.mark.parametrize("sets", ["free", "box"])
-def test_another_sample_after_an_interrupt(sets):
-    generator = np.random.default_rng(1)
-    system = random_system(generator, "discrete", sets)
-    cost = random_cost(generator, system)
-    gain = 0.3 * np.linalg.pinv(system.h_jacobian(np.zeros(system.n), np.zeros(system.m)))
-    mhe, twin = (estimator(system, gain, cost, 3, max_qps=0) for _ in range(2))
-    interrupts = 0
-    for _ in range(8):
-        for after in generator.integers(1, 250, 8):
-            arguments, own = random_sample(generator, system)
-            with Interruption(after) as interruption:
-                try:
-                    mhe.update(*arguments, **own)
-                except KeyboardInterrupt:
-                    interrupts += 1
-                else:  # it was done before
-                    assert interruption.count < after
-                    twin.update(*arguments, **own)
-        arguments, own = random_sample(generator, system)
-        assert_same(mhe.update(*arguments, **own), twin.update(*arguments, **own))
-    assert interrupts > 20
 
 
 def test_all_observers_forget_a_measurement_that_is_huge():

@@ -155,15 +155,6 @@ def test_files_without_pickle_keep_every_bit(engine, tmp_path):
         same(feed(other, 15, 20), expected)
 
 
-def test_a_long_window_keeps_no_views_and_is_the_same(monkeypatch):
-    kept = made(candidate="reinitialized")
-    monkeypatch.setattr("qpmhe.estimation.stages._KEPT", 3)
-    fresh = made(candidate="reinitialized")
-    assert isinstance(kept._engine._window._stage_views, list)
-    assert not isinstance(fresh._engine._window._stage_views, list)
-    same(feed(fresh, 0, 30), feed(kept, 0, 30))
-
-
 # States of other estimators
 
 
@@ -350,19 +341,6 @@ def test_damage_that_was_seen():
         with pytest.raises(InvalidInputError, match="the state is"):
             mhe._engine.load_state_dict(replaced(state, path, value))
         assert leaves(mhe.state_dict()) == before
-
-
-def test_altered_costs_of_stages_are_refused():
-    for engine in {"untraced", "compiled"} & set(ENGINES):
-        mhe = fed(15, engine)
-        for factor in (0.0, 1.0 + 1e-4, np.inf, -1.0):
-            state = mhe.state_dict()
-            if engine == "compiled":
-                state["memory"].view(mhe._engine._memory.dtype)[0]["stages"]["cost"][2] *= factor
-            else:
-                state["window/costs"][2] *= factor
-            with pytest.raises(InvalidInputError):
-                mhe.load_state_dict(state)
 
 
 def test_what_is_no_state_is_refused_with_what_is_missing():

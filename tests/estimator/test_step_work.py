@@ -122,15 +122,3 @@ def test_a_casadi_model_is_called_twice_in_a_step():
     for y in MEASUREMENTS[:30]:
         mhe.update(y)
     assert (calls.count("stage"), calls.count("residuals")) == (30, 30)
-
-
-def test_memory_is_in_proportion_to_the_horizon():
-    taken = []
-    for horizon in (50, 75, 300):  # the first only for what is imported late
-        tracemalloc.start()
-        mhe = estimator(horizon=horizon)
-        for k in range(horizon + 20):
-            mhe.update(MEASUREMENTS[k % 60])
-        taken.append(tracemalloc.get_traced_memory()[0])
-        tracemalloc.stop()
-    assert taken[2] < 6 * taken[1]
