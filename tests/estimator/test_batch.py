@@ -167,16 +167,13 @@ def test_a_large_measurement_is_missing_only_where_its_cost_overflows():
 
 
 def test_every_way_of_saying_that_nothing_was_measured():
-    for expected, *others in (
-        ([[1.0, 2.0], [NAN, NAN]], [[1.0, 2.0], None], [[1.0, 2.0], [None, None]],
-         ([1.0, 2.0], [np.inf, 1e300]), np.ma.masked_invalid([[1.0, 2.0], [NAN, NAN]])),
-        ([[NAN, NAN]] * 2, None, [None, None], np.full((2, 2), -np.inf)),
+    for expected, other in (
+        ([[1.0, 2.0], [NAN, NAN]], [[1.0, 2.0], None]), ([[NAN, NAN]] * 2, None),
         ([[1.0, NAN], [NAN, 3.0]], [[1.0, None], [None, 3.0]]),
     ):
         one = parts(h=lambda x: x, p=2)
-        states = [batch_of(one, 2).update(value).trajectories for value in (expected, *others)]
-        for other in states[1:]:
-            np.testing.assert_array_equal(other, states[0])
+        found = [batch_of(one, 2).update(value).trajectories for value in (expected, other)]
+        np.testing.assert_array_equal(*found)
     batch = batch_of(parts(), 2)
     assert batch.update([1.0, None]).statuses[1] & Status.MISSING
     assert batch.update([[None], None]).statuses[0] & Status.MISSING

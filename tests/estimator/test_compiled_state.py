@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import threading
 
 import numpy as np
 import pytest
@@ -20,24 +19,6 @@ pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
     pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
 ]
-
-
-def test_two_estimators_in_two_threads():
-    one = case("reactor")
-    Y, found = np.resize([sample["y"] for sample in one.samples], (2000, 1)), [None, None]
-    expected = [one.estimator("compiled", max_qps=k).run(Y).states for k in (2, 0)]
-
-    def follow(k):
-        mhe = one.estimator("compiled", max_qps=2 * (1 - k))
-        run = mhe.run(Y[:1000]).states
-        found[k] = np.vstack((run, [mhe.update(y).state for y in Y[1000:]]))
-
-    threads = [threading.Thread(target=follow, args=(k,)) for k in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    np.testing.assert_array_equal(found, expected)
 
 
 @both_engines

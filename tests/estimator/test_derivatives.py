@@ -76,24 +76,9 @@ NOT_COMPLEX = {
         lambda x: np.abs(x) * x[..., ::-1],
         lambda a, b: [[np.sign(a) * b, abs(a)], [abs(b), np.sign(b) * a]],
     ),
-    "real": (lambda x: np.real(x) ** 2, lambda a, b: [[2 * a, 0], [0, 2 * b]]),
-    "norm": (
-        lambda x: [np.linalg.norm(x), x[0]],
-        lambda a, b: [[a / math.hypot(a, b), b / math.hypot(a, b)], [1, 0]],
-    ),
     "float": (lambda x: [float(x[0]) ** 2, x[1]], lambda a, b: [[2 * a, 0], [0, 1]]),
-    "dtype": (
-        lambda x: np.array([x[0] * x[1], x[1] ** 2], dtype=float),
-        lambda a, b: [[b, a], [0, 2 * b]],
-    ),
-    "astype": (lambda x: x.astype(float) ** 2, lambda a, b: [[2 * a, 0], [0, 2 * b]]),
     "into a real array": (real_array, lambda a, b: [[2 * a, 0], [b, a]]),
-    "arctan2": (
-        lambda x: [np.arctan2(x[0], x[1]), x[0]],
-        lambda a, b: [[b / (a * a + b * b), -a / (a * a + b * b)], [1, 0]],
-    ),
     "sign": (lambda x: np.sign(x) * x**2, lambda a, b: [[2 * abs(a), 0], [0, 2 * abs(b)]]),
-    "conjugate": (lambda x: np.conj(x) * x, lambda a, b: [[2 * a, 0], [0, 2 * b]]),
     "interpolation": (
         lambda x: [np.interp(x[0], [-9.0, 9.0], [-18.0, 18.0]), x[1]],
         lambda a, b: [[2, 0], [0, 1]],

@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import re
-import warnings
 from operator import and_
 
 import numpy as np
@@ -13,7 +11,6 @@ import qpmhe
 from qpmhe.errors import (
     InvalidInputError,
     ModelError,
-    ObserverWarning,
     OptionError,
     SetError,
     ShapeError,
@@ -91,27 +88,6 @@ def test_initial_states():
         check(kind, text, mhe.reset, state)
         assert mhe.time == 1
         np.testing.assert_array_equal(mhe.state, before)
-
-
-def test_an_initial_state_outside_of_the_state_set_is_projected():
-    box, rows, given = qpmhe.Box([-5.0, -1.0], [9.0, 5.0]), qpmhe.Polytope([[1, 1]], [5]), [2, 7]
-    for states, nearest, project in (
-        (box, [2.0, 5.0], True), (rows, [0.0, 5.0], False), (box & rows, [0.0, 5.0], True)
-    ):
-        words = f"is [2.0, 7.0], outside of the state set {states!r}; the estimator starts at"
-        with pytest.warns(ObserverWarning, match=re.escape(words)):
-            mhe = estimator(
-                system_of(states=states), initial_state=given, project_observer=project
-            )
-        np.testing.assert_allclose(mhe.state, nearest, rtol=1e-12, atol=1e-12)
-        mhe.update([1.0])
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            with pytest.raises(ObserverWarning):
-                mhe.reset(given)
-        assert mhe.time == 1  # as it was
-    mhe.reset([3.0, 2.0])  # on the boundary
-    np.testing.assert_array_equal(mhe.state, [3.0, 2.0])
 
 
 BAD_MATRICES = [

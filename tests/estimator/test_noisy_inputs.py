@@ -159,8 +159,3 @@ def test_a_system_with_noisy_inputs_is_augmented_with_its_sampling_time(second):
             found = one.timed.f(z, np.append(known, step))
             np.testing.assert_allclose(found, np.append(expected, kept), rtol=1e-14)
         np.testing.assert_allclose(one.f(z, np.array(known)), one.timed.f(z, np.append(known, 0.1)))
-    system = qpmhe.augment_parameters(noisy, nominal=[0.5, 3.0])  # all inputs are parameters
-    z, expected = np.array([0.3, -0.2, 0.1, 0.5, 3.0]), plant.f(z[:2], np.array([0.6, 3.0]))
-    found = system.f(z, np.zeros(0))
-    np.testing.assert_allclose(found, np.append(expected, [0.0, 0.5, 3.0]), rtol=1e-14)
-    assert system.dt == 0.1

@@ -117,26 +117,6 @@ def test_output_injection():
 # Kalman-type observers
 
 
-def test_one_observer_serves_several_estimators():
-    plant, Y = Plant(8), np.random.default_rng(8).standard_normal((20, 2))
-    prior = plant.P.copy()
-    for observer in (
-        ExtendedKalman(prior=prior, **plant.covariances),
-        SteadyStateKalman(plant.system, plant.start, **plant.covariances, prior=prior),
-    ):
-        first = estimator(plant.system, observer, plant.start)
-        expected = first.run(Y).states
-        second = estimator(plant.system, observer, plant.start)
-        first.reset(plant.start + 5.0)
-        for y in Y:
-            first.update(y)
-            second.update(y)
-        np.testing.assert_array_equal(second.state, expected[-1])
-        prior[...] = np.nan  # of which there is a copy
-        np.testing.assert_array_equal(observer.initial_covariance(), plant.P)
-        prior[...] = plant.P
-
-
 def test_the_steady_gain_is_the_limit_of_the_extended_kalman_observer():
     for n, p, radius in ((1, 1, 1.2), (2, 1, 0.7), (4, 3, 1.0)):
         plant = Plant(n, n, p, radius)

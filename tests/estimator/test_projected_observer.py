@@ -9,7 +9,6 @@ from scipy.optimize import nnls
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import SetError, ShapeError, WeightError
 from qpmhe.estimation.snapshot import read
 from qpmhe.observers.projection import NearestPoint
@@ -286,9 +285,15 @@ def test_a_first_guess_outside_is_projected_with_a_warning():
         # min 2 + 2 s + s^2 over xi = (0, 1 + s) is at s = -1.
         np.testing.assert_allclose(mhe.initial_state, [0.0, 0.0], atol=1e-12)
         np.testing.assert_array_equal(mhe.state, mhe.initial_state)
+    mhe.update([1.0])
+    with pytest.raises(qpmhe.ObserverWarning, match="outside of the state set"):
+        mhe.reset([1.0, -2.0])
+    assert mhe.time == 1  # as it was
     with pytest.warns(qpmhe.ObserverWarning, match="outside of the state set"):
         mhe.reset([1.0, -2.0])
     assert mhe.state.min() >= 0.0
+    mhe.reset([0.0, 1.0])  # on the boundary
+    np.testing.assert_array_equal(mhe.state, [0.0, 1.0])
 
 
 def test_the_roll_out_restores_a_moved_noise_free_component():
@@ -343,7 +348,7 @@ def test_a_snapshot_is_read_while_states_of_another_metric_are_in_the_window():
         own = 0.9 * x[..., 0] + 0.3
         return np.stack([own, (1.5 - 0.5 * x[..., 0]) * x[..., 1] + 0.3 * x[..., 0]], axis=-1)
 
-    def made(engine):
+    def made():
         system = qpmhe.System(
             f, lambda x: x[..., :1], n=2, p=1, states=qpmhe.Box([0.0, 0.0], [INF, 1.0])
         )
@@ -352,22 +357,17 @@ def test_a_snapshot_is_read_while_states_of_another_metric_are_in_the_window():
         )
         return estimator(
             system, qpmhe.Luenberger([0.2, 0.5]), start=[0.2, 0.9], max_qps=1, horizon=8, cost=cost,
-            engine=engine,
+            engine="python",
         )
 
     rng, x, ys = np.random.default_rng(0), np.array([0.3, 0.9]), []
     for _ in range(12):
         ys.append(x[:1] + 0.3 * rng.standard_normal(1))
         x = f(x)
-    candidates = []
-    for engine in ("python", "compiled") if find_compiler() else ("python",):
-        mhe = made(engine)
-        for y in ys:
-            estimate, again = mhe.update(y), made(engine)
-            again.load_state_dict(mhe.state_dict())
-            np.testing.assert_array_equal(again.state, mhe.state)
-            assert Status.OBSERVER_PROJECTED in estimate.status
-        if engine == "python":
-            assert read(mhe.state_dict())["window"]["metric"][1]
-        candidates.append(estimate.candidate)
-    np.testing.assert_allclose(candidates[-1], candidates[0], atol=1e-9)
+    mhe = made()
+    for y in ys:
+        estimate, again = mhe.update(y), made()
+        again.load_state_dict(mhe.state_dict())
+        np.testing.assert_array_equal(again.state, mhe.state)
+        assert Status.OBSERVER_PROJECTED in estimate.status
+    assert read(mhe.state_dict())["window"]["metric"][1]

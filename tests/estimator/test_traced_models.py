@@ -309,7 +309,7 @@ def test_threads_make_the_expressions_of_a_system_at_once():
     sys.setswitchinterval(1e-6)  # threads take turns in the midst of everything
     try:
         with ThreadPoolExecutor(6) as pool:
-            for _ in range(8):
+            for _ in range(2):
                 for states in pool.map(begin, [Plant().system()] * 6):
                     np.testing.assert_array_equal(states, expected)
     finally:

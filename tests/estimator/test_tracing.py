@@ -84,33 +84,6 @@ def test_a_function_with_a_branch_is_called_state_by_state(way):
     np.testing.assert_array_equal(found, [f(x) for x in states])
 
 
-def filled(x):
-    out = np.empty_like(x)
-    out[..., 0], out[..., 1] = x[..., 1], np.clip(x[..., 0], -1.0, 1.0)
-    return out
-
-
-STRAIGHT = {
-    "stack": ("batched", lambda x: np.stack((x[..., 1], np.exp(-x[..., 0] ** 2)), axis=-1)),
-    "where": ("batched", lambda x: np.where((x > 0.0) & (x < 9.0), x, 2.0 * x)),
-    "maximum": ("batched", lambda x: np.maximum(x, 0.0) + np.minimum(x, 1.0)),
-    "select": ("batched", lambda x: np.select([x < 0.0, x > 3.0], [x, 3.0 + 0.0 * x], 1.0)),
-    "interp": ("batched", lambda x: np.interp(x, np.arange(4.0), [0.0, 1.0, 4.0, 9.0])),
-    "sum": ("batched", lambda x: x + x.sum(axis=-1, keepdims=True)),
-    "filled": ("batched", filled),
-    "asarray": ("batched", lambda x: np.asarray(x) * 2.0 + 1.0),
-}
-
-
-def test_a_function_without_branches_is_called_once_for_many_states():
-    for way, (mode, f) in STRAIGHT.items():
-        system = qpmhe.System(f, lambda x: x, n=2, p=2)
-        assert (system.f.mode, system.f.reads_only) == (mode, True), way
-        states = 20.0 * np.random.default_rng(0).standard_normal((5, 2))
-        found = system.f.batch(states, np.zeros((5, 0)))
-        np.testing.assert_allclose(found, [np.asarray(f(x)) for x in states], rtol=1e-14)
-
-
 def test_a_function_that_mixes_states_is_no_function_of_many():
     for mixing in (
         lambda x: x - x.mean(axis=0), lambda x: x + 0.0 * x[..., :1].sum(axis=0),
@@ -190,8 +163,7 @@ def copying(function):
 @pytest.mark.parametrize(
     ("way", "options"),
     [
-        *((f, options) for f in (clipped, clipped_beyond)
-          for options in ({}, {"warm_start": True}, {"candidate": "reinitialized"})),
+        (clipped, {"warm_start": True}), (clipped_beyond, {"candidate": "reinitialized"}),
         (overwritten_input, {}), (writing, {}), ("rate", {}),
     ],
 )
