@@ -8,10 +8,9 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.errors import InvalidInputError
-from qpmhe.estimation.snapshot import read, written
 
 from .plain import Record, huber, is_minimum, quadratic, spd
+from .systems import swing
 
 GENERATOR = np.random.default_rng(1)
 P, Q, R = 0.05 * spd(GENERATOR, 2), 5.0 * spd(GENERATOR, 2), spd(GENERATOR, 1)
@@ -24,12 +23,6 @@ OPTIONS = [
 ]
 SMOOTHED = {"arrival": "smoothed"}
 each_option = pytest.mark.parametrize("options", OPTIONS, ids=lambda one: str([*one.values()]))
-
-
-def swing(x):
-    return np.stack(
-        [x[..., 0] + 0.2 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
-    )
 
 
 def seen(x):
@@ -201,22 +194,6 @@ def test_late_measurements_and_what_is_set_keep_the_windows_prior():
             kept.R, kept.noise_weights = 3.0 * R, [3.0 * R] * len(kept.ys)
             estimate = mhe.set(noise_weight=3.0 * R)
         kept.check(estimate)
-
-
-@pytest.mark.parametrize("stop", [3, 9])
-def test_snapshots_of_another_arrival_or_without_its_prior_are_refused(stop):
-    mhe = estimator(**SMOOTHED)
-    mhe.run(record(stop))
-    state = read(mhe.state_dict())
-    with pytest.raises(InvalidInputError, match="another arrival"):
-        estimator().load_state_dict(written(state))
-    prior = state["window"]["smoothed_prior"]
-    assert (prior is None) == (stop == 3)
-    for damaged in (None if prior is not None else START, np.full(2, NAN), START[:1]):
-        state["window"]["smoothed_prior"] = damaged
-        with pytest.raises(InvalidInputError, match="damaged"):
-            mhe.load_state_dict(written(state))
-    assert np.isfinite(mhe.update([0.1]).trajectory).all()
 
 
 def test_a_prior_that_the_loss_cannot_weigh_is_not_taken():

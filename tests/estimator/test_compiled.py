@@ -94,7 +94,7 @@ MODELS = {
 
 @functools.cache
 def made(name):
-    return (MODELS | FRAGILE)[name]()
+    return MODELS[name]()
 
 
 def both(one, **options):
@@ -192,31 +192,6 @@ def test_a_discount_that_underflows_within_the_window():
         np.testing.assert_allclose(long.state, short.state, rtol=1e-9)
 
 
-# Models that are not finite everywhere, with outliers that drive the observer there.
-
-
-def logarithm():
-    return case_of(system_of(
-        lambda x: [0.8 * x[0] + 0.2 * casadi.log(x[1] + 1.0), 0.9 * x[1] + 0.1 * x[0]],
-        lambda x: x[0], n=2,
-    ), [[0.1], [0.2]], [1.0, 1.0], 5, delay=1)
-
-
-def quotient():
-    """Not finite in one output alone, for some of the inputs."""
-    one = case_of(system_of(
-        lambda x, u: [0.9 * x[0] + 0.1 * u[0], 0.8 * x[1] + 0.1],
-        lambda x, u: [x[0] + x[1], 1.0 / (x[0] * u[0])], n=2, m=1,
-    ), [[0.1, 0.0], [0.1, 0.0]], [1.0, 0.5], 1)
-    for t, sample in enumerate(one.samples):
-        sample["u"] = [{3: 0.0, 4: NAN, 9: INF, 10: 1e-320}.get(t % 12, 1.0)]
-        sample["y"] = np.array([0.6, NAN if t % 5 == 0 else 2.0])
-    return one
-
-
-FRAGILE = {"logarithm": logarithm, "quotient": quotient}
-
-
 def test_an_outage_longer_than_the_window():
     """The observer waits where the model last worked, however long that is ago."""
     system = system_of(lambda x, u: x * u[0], lambda x, u: x, n=1, m=1)
@@ -258,30 +233,22 @@ def test_jacobians_that_are_not_finite_at_the_start():
 # Sets
 
 
-def estimator_in(name, kind, engine="compiled", sets=None, x_unit=1.0, y_unit=1.0, **options):
-    """A problem of the oracles, and an estimator of it in other units or sets."""
+def estimator_in(name, kind, engine="compiled", sets=None, **options):
+    """A problem of the oracles, and an estimator of it, with tight sets or sets of its own."""
     one = reactor() if name == "reactor" else SYSTEMS[name]()
-    S, T = x_unit * np.ones(one.n), y_unit * np.ones(one.p)
+    functions = one.symbolic()
     if sets is None:
-        sets = one.sets["box" if kind == "tight" else kind][1:]
-    width, functions = 0.5 if kind == "tight" else 1.0, one.symbolic()
-    system = system_of(
-        lambda x: S * functions["f"](x / S), lambda x: T * functions["h"](x / S), n=one.n, **{
-            label: each and qpmhe.model.sets.ConvexSet(
-                each.lower * unit * width, each.upper * unit * width, each.matrix / unit,
-                each.row_lower, each.row_upper,
-            )
-            for label, each, unit in zip(("disturbances", "noises"), sets, (S, T), strict=True)
-        },
-    )
-    cost = qpmhe.QuadraticCost(
-        prior=one.cost.prior / np.outer(S, S), disturbance=one.cost.disturbance / np.outer(S, S),
-        noise=one.cost.noise / np.outer(T, T),
-    )
-    gain = options.pop("gain", one.gain)
+        sets = one.sets["box"][1:]
+        sets = [
+            each and qpmhe.model.sets.ConvexSet(
+                0.5 * each.lower, 0.5 * each.upper, each.matrix, each.row_lower, each.row_upper
+            ) for each in sets
+        ] if kind == "tight" else one.sets[kind][1:]
+    labelled = dict(zip(("disturbances", "noises"), sets, strict=True))
+    system = system_of(functions["f"], functions["h"], n=one.n, **labelled)
     return one, qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(gain * S[:, None] / T), cost, horizon=one.horizon,
-        initial_state=one.start * S, engine=engine, **options,
+        system, qpmhe.Luenberger(options.pop("gain", one.gain)), one.cost, horizon=one.horizon,
+        initial_state=one.start, engine=engine, **options,
     )
 
 

@@ -116,18 +116,6 @@ def test_weights_and_covariances():
             check(kind, [f"{name} covariance ", *words], build, **covariances)
 
 
-@pytest.mark.parametrize("build", [qpmhe.QuadraticCost, qpmhe.QuadraticCost.from_covariances])
-def test_weights_of_other_sizes(build):
-    matrices = {"prior": np.eye(1), "disturbance": np.eye(2), "noise": np.eye(1)}
-    check(ShapeError, ["prior has shape (1, 1)", "expected (2, 2)"], build, **matrices)
-    system = qpmhe.System(lambda x: x, lambda x: x[..., 0], n=3, p=1)
-    check(
-        ShapeError, ["for 2 disturbances; expected 3", "disturbance_matrix"],
-        estimator, system, qpmhe.Luenberger(np.zeros((3, 1))),
-        build(**matrices | {"prior": np.eye(3)}), initial_state=np.zeros(3),
-    )
-
-
 def test_sets():
     Box, Polytope, empty = qpmhe.Box, qpmhe.Polytope, ["the set is empty", "no point satisfies all"]
     quarter = Polytope([[1.0, 0.0]], [0.0]) & Polytope([[0.0, -1.0]], [0.0])

@@ -51,12 +51,6 @@ def test_every_way_of_saying_that_something_is_missing(ways, plainly):
         found.reset()
 
 
-def test_the_only_output_is_missing():
-    mhe = estimator()
-    for way in (None, pd.NA, pd.NaT, NAT, [pd.NaT], np.array([NAT])):
-        assert np.isnan(mhe.update(way).noises).all()
-
-
 def test_records_with_gaps():
     frame = pd.DataFrame({"a": pd.array([1, pd.NA, 3]), "b": pd.array([pd.NA, 0.5, None])})
     found, expected = two().run(frame), two().run([[1, np.nan], [np.nan, 0.5], [3, np.nan]])

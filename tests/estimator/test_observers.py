@@ -20,14 +20,10 @@ from qpmhe.observers import (
 
 from .plain import spd
 from .spoil import check, cost_of
+from .systems import linear
 
 DT = 0.05
 NONE = np.zeros(0)
-
-
-def linear(A, C, **options):
-    A, C = np.array(A, dtype=float), np.array(C, dtype=float)
-    return qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=len(A), p=len(C), **options)
 
 
 def estimator(system, observer, start, **options):

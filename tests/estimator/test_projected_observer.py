@@ -13,6 +13,8 @@ from qpmhe.errors import SetError, ShapeError, WeightError
 from qpmhe.estimation.snapshot import read
 from qpmhe.observers.projection import NearestPoint
 
+from .systems import linear
+
 INF = math.inf
 
 
@@ -23,10 +25,6 @@ def estimator(system, observer, *, start, max_qps=0, horizon=4, cost=None, **opt
     return qpmhe.MovingHorizonEstimator(
         system, observer, cost, horizon=horizon, initial_state=start, max_qps=max_qps, **options
     )
-
-
-def linear(a, c, states):
-    return qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=len(a), p=len(c), states=states)
 
 
 # The projection
@@ -139,7 +137,7 @@ def worst_excess(rng, steps, observer_of, bound_of):
     lower[0] = 0.0
     corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(n, -1).T
     mhe = estimator(
-        linear(a, c, qpmhe.Box(lower, upper)), observer_of(gain, metric),
+        linear(a, c, states=qpmhe.Box(lower, upper)), observer_of(gain, metric),
         start=corners[rng.integers(len(corners))],
     )
     x, z, worst, projected = corners[rng.integers(len(corners))], mhe.state, -INF, 0
@@ -222,7 +220,7 @@ K, C = np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
 
 def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilises():
     def sizes(metric):
-        system = linear(CLOSED + K @ C, C, qpmhe.Box([0.0, 0.0], [INF, INF]))
+        system = linear(CLOSED + K @ C, C, states=qpmhe.Box([0.0, 0.0], [INF, INF]))
         mhe = estimator(system, qpmhe.Luenberger(K, metric=metric), start=[1.0, 0.0])
         return np.linalg.norm(mhe.run(np.zeros((60, 1))).states, axis=1)
 
@@ -233,7 +231,7 @@ def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilise
 
 
 def test_metrics_are_checked():
-    system = linear(CLOSED, C, qpmhe.Box([0.0, 0.0], [INF, INF]))
+    system = linear(CLOSED, C, states=qpmhe.Box([0.0, 0.0], [INF, INF]))
     for kind in (
         lambda metric: qpmhe.Luenberger(K, metric=metric),
         lambda metric: qpmhe.OutputInjection(lambda z, v: K @ v, metric=metric),
@@ -336,7 +334,7 @@ def test_a_prediction_beyond_the_sets_width_does_not_drown_the_correction():
     assert Status.PREDICTION_OUTSIDE in estimate.status
     np.testing.assert_allclose(estimate.state, [2.0])  # 3, the nearest to 1e30, and K v
     # Outside but near, f(z) = 5, it is projected once: 5 - 3 is inside, and stays.
-    doubling = linear(np.array([[2.0]]), np.eye(1), box)
+    doubling = linear([[2.0]], np.eye(1), states=box)
     near = estimator(doubling, qpmhe.Luenberger([1.5]), start=[2.5])
     np.testing.assert_allclose(near.update([0.5]).state, [2.0])
 

@@ -56,12 +56,6 @@ def test_settings_are_kept_and_frozen():
     assert given.items() <= dataclasses.asdict(settings).items()
     with pytest.raises(dataclasses.FrozenInstanceError):
         settings.horizon = 5
-    defaults = {
-        "infeasible": "drop_rows", "warm_start": False, "project_observer": True, "delay": 0,
-        "candidate": "observer", "time_budget": None, "max_qps": 1,
-    }
-    assert defaults.items() <= dataclasses.asdict(estimator().settings).items()
-
 
 def test_a_horizon_beyond_the_memory(monkeypatch):
     def exhausted(*_):

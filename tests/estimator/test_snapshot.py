@@ -173,7 +173,7 @@ def others(engine):
         "model": {"system": system_of(engine, swing=1.001)},
         "(h)": {"system": system_of(engine, bend=0.1001)},
         "candidate": {"candidate": "reinitialized"},
-        "expected": {"horizon": 5},
+        "expected": {"horizon": 5}, "another arrival": {"arrival": "smoothed"},
     }
 
 
@@ -293,7 +293,8 @@ def mutated(state, generator):
 
 @pytest.mark.parametrize(
     ("engine", "name"),
-    [(engine, name) for engine in ENGINES for name in ("plain", "reinitialized", "kalman", "robust")
+    [(engine, name) for engine in ENGINES
+     for name in ("plain", "reinitialized", "kalman", "robust", "smoothed")
      if engine != "compiled" or name in ("plain", "reinitialized")],
 )
 def test_damaged_states_are_refused_whole_or_harmless(engine, name):

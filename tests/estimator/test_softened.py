@@ -242,10 +242,6 @@ def test_what_does_not_have_them_says_so_by_name(name, words):
     assert words in uncovered(system, observer, COST, Settings(N, "auto", 1))
     with pytest.raises(InvalidInputError, match=words):
         checked_ingredients(system, observer, COST)
-    with pytest.raises(InvalidInputError, match=words):
-        qpmhe.noisy_inputs(qpmhe.System.from_ode(
-            rate, h, dt=0.1, n=2, p=2, m=1, **{name: SOFT[name]}
-        ))
     pytest.importorskip("casadi")
     with pytest.raises(InvalidInputError, match=words):
         IpoptEstimator(
