@@ -64,10 +64,13 @@ def watched(mhe):
     return found
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("way", ["f nan", "f raise", "h nan", "h raise"])
-def test_the_candidate_is_that_of_a_replay(way, seed):
+def test_the_candidate_is_that_of_a_replay():
     """Where the model fails; elsewhere the fuzzers of properties compare each candidate."""
+    for way, seed in (("f nan", 1), ("f raise", 0), ("h nan", 1), ("h raise", 0)):
+        compare_with_replay(way, seed)
+
+
+def compare_with_replay(way, seed):
     generator, start = np.random.default_rng(seed), np.ones(1)
     cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=0.3)
     options = {"initial_state": start, "max_qps": seed, "warm_start": bool(seed)}
