@@ -1,15 +1,15 @@
 """Model predictive control on estimates that must keep a deadline: a pendulum held upright.
 
-A motor turns a pendulum's axis; beyond 0.8 rad its torque cannot hold it any more. Measured is the
-angle alone, with noise, and one measurement in thirty is grossly wrong. An unknown load acts on
+A motor turns a pendulum's axis; beyond 0.8 rad its torque cannot hold it any more. Only the angle
+is measured, with noise, and one measurement in thirty is grossly wrong. An unknown load acts on
 the axis and changes halfway; the estimators find it as a third state. The controller is CasADi's:
 one nonlinear program, built once and started at its former solution.
 
-Each sample goes as it would at the machine. u(t) is at work and y(t) comes in; the estimator
+Each sample runs as on the machine. u(t) is applied and y(t) arrives; the estimator
 predicts x(t+1), and from it the controller finds u(t+1), for which the simulation waits. An
-estimate that is late is not used: the controller then goes on from what the model predicts of the
-former one. So moving horizon estimation (MHE) does as many QPs as its time budget, half of the
-deadline, lets it: the rest is for a QP under way when the budget ends.
+estimate that is late is not used: the controller then continues from the model's prediction of
+the former one. So moving horizon estimation (MHE) solves as many QPs as its time budget, half of
+the deadline, allows: the rest is for a QP under way when the budget ends.
 
 The same controller runs on a constant-gain observer, on an extended Kalman filter (without a test
 that throws outliers away), on MHE over that observer, and on a state measured without error.
@@ -183,7 +183,7 @@ def tabulate(loops: dict[str, list[Loop]], deadline: float) -> Table:
     table = Table(
         title=f"Closed loop, {len(loops['MHE'])} records; deadline {1e3 * deadline:g} ms",
         caption=f"cost: mean of a sample; upright: share of samples within {UPRIGHT:g} rad;\n"
-        "RMSE: of what the controller started from; times: median and 99th percentile",
+        "RMSE: of the states that the controller started from; times: median and 99th percentile",
         box=box.SIMPLE, collapse_padding=True, pad_edge=False,
     )
     table.add_column("state from", no_wrap=True)
@@ -248,7 +248,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=250, help="samples of a record")
     parser.add_argument("--seeds", type=int, default=3, help="number of records")
-    parser.add_argument("--deadline", type=float, default=10.0, help="of an estimate, in ms")
+    parser.add_argument("--deadline", type=float, default=10.0,
+                        help="deadline of an estimate, in ms")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the figure")
     arguments, console = parser.parse_args(), Console()
     deadline = 1e-3 * arguments.deadline

@@ -2,13 +2,13 @@
 
 Three discs hang on a shaft between two motors, joined by springs; x holds the angles of the discs
 (rad), their speeds (rad/s) and the angles of the motors (rad), which follow their setpoints u.
-Measured are the discs' angles, and the inertia of the first disc is unknown. Model and data are
+The discs' angles are measured, and the inertia of the first disc is unknown. Model and data are
 those of do-mpc's documentation (S. Lucia, A. Tatulea-Codrean, C. Schoppmeyer, S. Engell, Rapid
 development of modular and sustainable nonlinear model predictive control solutions, Control
-Engineering Practice 60, 2017), with disturbances of the speeds added.
+Engineering Practice 60, 2017), with added disturbances of the speeds.
 
-Both get the same record, right-hand side, horizon and covariances. docs/do-mpc.md tells what
-differs all the same. Without do-mpc (``pip install do-mpc``), its row is left out.
+Both get the same record, right-hand side, horizon and covariances. docs/do-mpc.md lists
+the remaining differences. Without do-mpc (``pip install do-mpc``), its row is left out.
 """
 
 import argparse

@@ -2,11 +2,11 @@
 
 About one measurement in twenty is off by 8, more than the output itself. Both
 costs have the same weights, start, horizon and number of QPs; they differ in the noise's loss.
-All errors of the first seconds come from the wrong start, with and without outliers, so that the
-settled ones are reported beside those of all times.
+All errors of the first seconds come from the wrong start, with and without outliers, so the script
+reports the settled errors beside those of all times.
 
-The outliers also hit the auxiliary observer, whose state z(t-N) is the prior. So a second
-observer is tried, which takes a fitting error v up to 1 in full and of the rest a fifth:
+The outliers also hit the auxiliary observer, whose state z(t-N) is the prior. So the script tries
+a second observer, which applies a fitting error v up to 1 in full and a fifth of the rest:
 L(z, v) = K phi(v), with v^2 / 5 <= v phi(v) <= v^2. It is an output injection with
 L(z, 0) = 0, and |L(z, v)| <= |K| |v|, so it keeps the bound (eq:kappa) of the constant gain.
 A plain clip of v would keep that, too. But the reactor has a mode that does not decay by itself,
@@ -114,7 +114,7 @@ report("MHE, Huber", "saturating", "Huber", arguments.qps)
 clean, _ = report(
     "MHE, quadratic, no outliers", "constant gain", "quadratic", arguments.qps, clean=True
 )
-print("In units of the quadratic cost's, with the constant gain:")
+print("Relative to the quadratic cost with the constant gain:")
 print(f"{'MHE, Huber':<44}{huber[0] / quadratic[0]:9.2f}{huber[1] / quadratic[1]:12.2f}")
 print(f"{'no outliers':<44}{clean[0] / quadratic[0]:9.2f}{clean[1] / quadratic[1]:12.2f}")
 

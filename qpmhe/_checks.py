@@ -220,7 +220,8 @@ def check_problem(state: Any, mine: tuple[int, ...]) -> None:
         or tuple(found) != mine
     ):
         raise InvalidInputError(
-            f"the state is of a problem with (n, p, m, horizon) = {found!r}; expected {mine}."
+            "the state is a snapshot of another problem: (n, p, m, horizon) = "
+            f"{shown(tuple(found) if isinstance(found, list) else found)}; expected {mine}."
         )
 
 

@@ -36,28 +36,28 @@ Index = NDArray[np.intp]
 class BatchEstimator:
     """K independent estimators of one system, for Monte Carlo studies and fleets.
 
-    Each member estimates as a `qpmhe.MovingHorizonEstimator` with the same arguments does, and
-    falls back by itself. Threads share the members of the compiled step; otherwise the members
-    take turns. ``engine="auto"`` chooses as for a single estimator.
+    Each member gives the estimates of a `qpmhe.MovingHorizonEstimator` with the same arguments, and
+    falls back independently. With the compiled step, threads share the members; otherwise the
+    members run one after another. ``engine="auto"`` chooses as for a single estimator.
 
     Parameters
     ----------
     system, observer, cost
-        Of all members.
+        Shared by all members.
     members : int
         K >= 1.
     initial_states : (n,) or (K, n) array_like
         Initial estimate of all members, or of each.
     threads : int, optional
-        Number of threads of the compiled step; one for each processor if left out.
+        Number of threads of the compiled step; by default one per processor.
     **options
-        Of `qpmhe.MovingHorizonEstimator`, such as the horizon; each member has the whole time
-        budget.
+        Options of `qpmhe.MovingHorizonEstimator`, such as the horizon. The time budget applies to
+        each member.
 
     Raises
     ------
     InvalidInputError
-        If anything does not fit; subclasses say what (see `qpmhe.errors`).
+        If an argument is invalid; the subclass says how (see `qpmhe.errors`).
 
     Examples
     --------
@@ -90,7 +90,7 @@ class BatchEstimator:
             )
         if "parameters" in options:
             raise UnknownOptionError(
-                "BatchEstimator has no option 'parameters'; give them among the inputs of each "
+                "BatchEstimator has no option 'parameters'; pass them as the last inputs of each "
                 "member."
             )
         states = _starts(initial_states, self.members, system.n)
@@ -109,7 +109,7 @@ class BatchEstimator:
         except MemoryError as error:
             raise OptionError(
                 f"{self.members} members with a horizon of {options.get('horizon')} need more "
-                f"memory than there is ({error}); take a shorter horizon, or fewer members at once."
+                f"memory than available ({error}); take a shorter horizon, or fewer members."
             ) from error
 
     def _checked(self, states: Array) -> Array:
@@ -144,12 +144,12 @@ class BatchEstimator:
 
     @property
     def engine(self) -> str:
-        """What runs the steps: ``python`` or ``compiled``, also where ``engine="auto"`` chose."""
+        """The engine in use, ``python`` or ``compiled``, also with ``engine="auto"``."""
         return self.settings.engine
 
     @property
     def mode(self) -> str:
-        """``compiled``, or ``looped`` for a loop over Python's estimators."""
+        """``compiled``, or ``looped`` for a loop over Python estimators."""
         return "compiled" if self.settings.engine == "compiled" else "looped"
 
     @property
@@ -164,17 +164,17 @@ class BatchEstimator:
 
     @property
     def horizon(self) -> int:
-        """N."""
+        """The horizon N."""
         return self.settings.horizon
 
     def reset(self, initial_states: ArrayLike | None = None) -> None:
-        """Forget all measurements and start again, at the former initial states if none are given.
+        """Forget all measurements and restart, at the former initial states if none are given.
 
         Parameters
         ----------
         initial_states : (n,) or (K, n) array_like, optional
-            New initial estimates. If they do not fit, an `InvalidInputError` is raised and the
-            estimator left as it was.
+            New initial estimates. Invalid ones raise an `InvalidInputError` and leave the estimator
+            unchanged.
         """
         before = states = self._initial_states
         if initial_states is not None:
@@ -194,8 +194,8 @@ class BatchEstimator:
     def update(self, Y: ArrayLike | None, U: ArrayLike | None = None) -> BatchEstimate:
         """Take the measurements y(t) and inputs u(t) of all members, and estimate x(t+1).
 
-        See `MovingHorizonEstimator.update`. An interrupted update (Ctrl+C) has taken the samples
-        of no member; in compiled code, of all or of none: see ``time``.
+        See `MovingHorizonEstimator.update`. An update interrupted by Ctrl+C takes no member's
+        sample; in compiled code it takes all or none: see ``time``.
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ class BatchEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If an argument does not fit; the estimator is left as it was.
+            If an argument is invalid; the estimator stays unchanged.
         """
         y = _measurements(Y, self.members, self.system.p)
         return self._step(y, _inputs(U, (self.members, self.system.m), "update(Y, U)"))
@@ -229,15 +229,14 @@ class BatchEstimator:
         return self._step(y, u)
 
     def run(self, Y: ArrayLike, U: ArrayLike | None = None) -> BatchRun:
-        """Take whole records, starting at the present states.
+        """Process whole records, starting at the current states.
 
         Parameters
         ----------
         Y : (K, T, p) array_like
-            y(t), ..., y(t+T-1) of each member; (K, T) if p is 1. Fill up shorter records with
-            NaN.
+            y(t), ..., y(t+T-1) of each member; (K, T) if p is 1. Pad shorter records with NaN.
         U : (K, T, m) or (T, m) array_like, optional
-            The inputs of the same times, of each member or of all.
+            The inputs at the same times, of each member or of all.
 
         Returns
         -------
@@ -247,7 +246,7 @@ class BatchEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If an argument does not fit, before any sample is taken.
+            If an argument is invalid; then no sample has been processed.
         """
         remedy = f"a record for each member, with a row for each sample. {_MISSING}"
         ys = _shaped("Y", Y, ((self.members, None, self.system.p),), remedy)
@@ -371,7 +370,7 @@ class _Looped:
 
 @dataclass(eq=False, repr=False)
 class BatchEstimate:
-    """The results of one `BatchEstimator.update`: those of `Estimate`, with an axis of members.
+    """The results of one `BatchEstimator.update`: an `Estimate` with a leading member axis.
 
     Attributes
     ----------
@@ -380,19 +379,19 @@ class BatchEstimate:
     trajectories, candidates : (K, N_t + 1, n) array
         Estimates of all states in the windows, and the candidates.
     costs, candidate_costs : (K,) array
-        True cost J of both.
+        True cost J of each.
     flags, qps : (K,) int array
-        Values of the statuses, and QPs solved.
+        Status values, and numbers of QPs solved.
     filtered : (K, n) array
         Estimates of x(t).
     observer_states : (K, n) array
-        The states from which the observers go on.
+        The observers' states z(t+1), from which they continue.
     rejected_sensors : (K, s) bool array
-        Whether the gates of the observers rejected each of their s sensors; s is 0 without a gate.
+        Whether each observer's gate rejected each of its s sensors; s is 0 without a gate.
     delayed : (K, n) array or None
         Estimates of x(t+1-k) for the estimator's delay k.
     engine : str
-        What ran the step: ``python`` or ``compiled``.
+        The engine that ran the step: ``python`` or ``compiled``.
     """
 
     time: int
@@ -424,7 +423,7 @@ class BatchEstimate:
 
     @property
     def improved(self) -> NDArray[np.bool_]:
-        """Whose estimate is better than the candidate, (K,)."""
+        """Which members' estimates are better than their candidates, (K,)."""
         return np.asarray((self.flags & Status.IMPROVED.value) != 0)
 
     def __len__(self) -> int:
@@ -439,24 +438,25 @@ class BatchEstimate:
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class BatchRun:
-    """Results of T consecutive updates of K members: those of `Run`, with an axis of members.
+    """Results of T consecutive updates of K members: a `Run` with a leading member axis.
 
     Attributes
     ----------
     states : (K, T + 1, n) array
-        Estimates of x(0), ..., x(T); that of x(t) is made before y(t).
+        Estimates of x(0), ..., x(T); the estimate of x(t) does not use y(t).
     observer_states : (K, T + 1, n) array
         The observers' own states z(0), ..., z(T).
     filtered, delayed : (K, T, n) array
-        Estimates of x(t) made with y(t); delayed ones, NaN until the windows reach the delay.
+        Estimates of x(t) that use y(t), and delayed estimates, NaN until the windows reach the
+        delay.
     costs, candidate_costs : (K, T) array
         True cost J of estimates and candidates.
     statuses, qps : (K, T) int array
-        Values of the statuses (``Status(value)`` makes a flag), and QPs solved.
+        Status values (``Status(value)`` makes a flag), and numbers of QPs solved.
     rejected_sensors : (K, T, s) bool array
-        Whether the gates of the observers rejected each of their s sensors.
+        Whether each observer's gate rejected each of its s sensors.
     engine : str
-        What ran the steps: ``python`` or ``compiled``.
+        The engine that ran the steps: ``python`` or ``compiled``.
     """
 
     states: Array
@@ -512,7 +512,7 @@ def _inputs(value: ArrayLike | None, shape: tuple[int, ...], call: str) -> Array
     """Inputs of the shape (K, ..., m), the same for all members if given without K."""
     m, common = shape[-1], shape[1:]
     if value is None and m:
-        raise InvalidInputError(f"U is missing; the system has {m} inputs: {call}.")
+        raise InvalidInputError(f"U is missing; the system has {m} input{'s' * (m != 1)}: {call}.")
     if value is None:
         return np.zeros(shape)
     if m == 0:
@@ -521,7 +521,7 @@ def _inputs(value: ArrayLike | None, shape: tuple[int, ...], call: str) -> Array
     return np.array(np.broadcast_to(_shaped("U", value, (common, shape), remedy), shape))
 
 
-_MISSING = "NaN stands for what was not measured; fill up with it."
+_MISSING = "Use NaN for missing measurements."
 
 
 def _shaped(

@@ -1,4 +1,4 @@
-"""Exceptions: those of the QP layer, and what else can be wrong with an estimation problem."""
+"""Exceptions of the QP layer and of estimation problems."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 
 
 class ModelError(InvalidInputError):
-    """A model that cannot be loaded, or a function of it with a wrong value or an error."""
+    """A model that cannot be loaded, or whose functions fail or return wrong values."""
 
 
 class WeightError(InvalidInputError):
@@ -40,12 +40,12 @@ class SetError(InvalidInputError):
 
 
 class CompilationError(QpmheError):
-    """C code that could not be compiled or loaded here."""
+    """C code that cannot be compiled or loaded on this machine."""
 
 
 class ObserverWarning(UserWarning):
-    """An observer that the estimates cannot rely on, or that had to be moved into its set."""
+    """An unreliable observer, or an initial state that was projected onto the state set."""
 
 
 class EngineWarning(UserWarning):
-    """A slower means than the one asked for is in use; the results are the same."""
+    """A slower engine than the requested one is in use; the results are the same."""

@@ -191,7 +191,7 @@ def empty():
     ("options", "error", "words"),
     [
         ({"labels": ["a"]}, ShapeError, r"labels are \['a'\]; expected 2"),
-        ({"labels": ["a", "b", "c"]}, ShapeError, "expected 2, one a state"),
+        ({"labels": ["a", "b", "c"]}, ShapeError, "expected 2, one per state"),
         ({"labels": []}, ShapeError, r"labels are \[\]; expected 2"),
         ({"labels": "ab"}, InvalidInputError, r"labels are 'ab'; expected a sequence"),
         ({"labels": [1, 2]}, InvalidInputError, "sequence of strings"),

@@ -128,7 +128,7 @@ def test_nothing_is_cut_off_on_a_narrow_screen(stored):
         ({"max_iterations": 0}, OptionError, "max_iterations is 0"),
         ({"tolerance": -1.0}, OptionError, "absolute_tolerance is -1"),
         ({"paths": ["none.npz"]}, InvalidInputError, "no file none.npz"),
-        ({"paths": [__file__]}, InvalidInputError, "is no QP file"),
+        ({"paths": [__file__]}, InvalidInputError, "is not a QP file"),
     ],
 )
 def test_bad_arguments_are_told_before_anything_is_solved(

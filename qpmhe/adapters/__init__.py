@@ -1,1 +1,1 @@
-"""Systems from models that are written for other packages, one function for each package."""
+"""Systems from models written for other packages, one function per package."""

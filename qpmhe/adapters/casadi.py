@@ -57,28 +57,27 @@ def from_casadi(
         (x) or (x, u) to a column: functions of CasADi, or Python functions that take
         symbolic columns and return one column or a list of entries.
     dt : float, optional
-        Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit
-        of time, which is discretised with u held over the step.
+        Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit of time,
+        discretised with u held over the step.
     method : {"rk4", "euler"}
         Runge-Kutta of order 4, or one explicit Euler step.
     n, p, m : int, optional
-        Numbers of states, outputs and inputs; n (and m, if there are inputs) are needed
-        where f is not a casadi.Function.
+        Numbers of states, outputs and inputs; n (and m, if there are inputs) are required if f is
+        not a casadi.Function.
     compiled : bool, optional
-        Whether to compile the functions. The default compiles them where there is a C
-        compiler.
+        Whether to compile the functions. The default compiles them if there is a C compiler.
     **options
         Sets and scales, as for `qpmhe.System`.
 
     Returns
     -------
     System
-        It pickles, whatever f and h were. With dt, it takes steps of other lengths.
+        It always pickles. With dt, it takes steps of other lengths.
 
     Raises
     ------
     ModelError, SetError, OptionError
-        If a function, size, set or option does not fit; the message names it.
+        If a function, size, set or option is invalid; the message names it.
     InvalidInputError
         If n is missing.
     CompilationError

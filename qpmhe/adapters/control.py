@@ -1,4 +1,4 @@
-"""Systems from those of python-control."""
+"""Systems from python-control."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ def from_control(
     method: str | None = None,
     **options: Unpack[SystemOptions],
 ) -> System:
-    """Make a system from one of python-control, with the same inputs.
+    """Make a system from a python-control system, with the same inputs.
 
     Parameters
     ----------
     system : control.StateSpace or control.NonlinearIOSystem
-        Taken as it is in discrete time, and discretised in continuous time. It must not
-        depend on time.
+        Used as it is in discrete time, discretised in continuous time. It must be time-invariant.
     dt : float, optional
-        Sampling time of a system in continuous time, which needs it.
+        Sampling time, required for a system in continuous time.
     method : {"zoh", "rk4", "euler"}, optional
         Discretisation of a system in continuous time. The default is ``zoh``, exact for a
         held input, for linear systems and ``rk4`` for nonlinear ones.
@@ -44,12 +43,12 @@ def from_control(
     Returns
     -------
     System
-        It pickles where its functions do; a linear one always does.
+        It pickles if its functions do; a linear system always does.
 
     Raises
     ------
     ModelError, SetError, OptionError
-        If the system, a set or an option does not fit; the message names it.
+        If the system, a set or an option is invalid; the message names it.
     InvalidInputError
         If python-control is not installed.
     """
@@ -61,7 +60,7 @@ def from_control(
             "control.NonlinearIOSystem. Convert transfer functions by control.ss."
         )
     if not system.nstates:
-        raise ModelError("system has no states; there is nothing to estimate.")
+        raise ModelError("system has no states to estimate.")
     if system.isctime(strict=True) or (system.dt is None and dt is not None):
         if dt is None:
             raise OptionError(
@@ -90,7 +89,7 @@ def _real(name: str, matrix: Any) -> Array:
     if np.iscomplexobj(matrix):
         raise ModelError(
             f"{name} of the system is {np.asarray(matrix).tolist()}; expected real numbers. "
-            "Transform the system to real states: real and imaginary parts, say."
+            "Transform the system to real states, such as real and imaginary parts."
         )
     return numbers(f"{name} of the system", matrix)
 
@@ -198,8 +197,8 @@ def _check_no_time(system: Any, made: System, dt: float | None) -> None:
                         f"the {name} of the system at x = {x.tolist()}, u = {u.tolist()} is "
                         f"{first.tolist()} at time 0 and "
                         f"{'an error' if then is None else then.tolist()} at time {time:g}; "
-                        "expected a system that does not depend on time. Make what does an "
-                        "input, whose value is known at each sample."
+                        "expected a time-invariant system. Make "
+                        "time-varying quantities inputs, whose values are known at each sample."
                     )
 
 

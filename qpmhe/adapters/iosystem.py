@@ -1,4 +1,4 @@
-"""An estimator as a block of python-control."""
+"""An estimator as a python-control block."""
 
 from __future__ import annotations
 
@@ -28,21 +28,20 @@ def to_iosystem(
     control_labels: Labels = "u[{i}]",
     estimate_labels: Labels = "xhat[{i}]",
 ) -> control.NonlinearIOSystem:
-    r"""Make a discrete-time block of python-control: :math:`y(t), u(t)` in, :math:`\hat x(t)` out.
+    r"""Make a discrete-time python-control block: :math:`y(t), u(t)` in, :math:`\hat x(t)` out.
 
-    Its state and its output are :math:`\hat x(t)`, which has used the measurements before t, so
-    that the block has no direct feedthrough and closes a loop without an algebraic one. Its
-    initial state is the initial estimate.
+    Its state and output are :math:`\hat x(t)`, which uses the measurements before t, so the block
+    has no direct feedthrough and causes no algebraic loop. Its initial state is the initial
+    estimate.
 
     Parameters
     ----------
     mhe : MovingHorizonEstimator
-        It remembers its window beside the block's state. A simulation that starts, or any
-        state but the one it is in, resets it with that state as the initial estimate. Use it
-        nowhere else meanwhile.
+        It keeps its window besides the block's state. The start of a simulation, or any state other
+        than its current one, resets it with that state as the initial estimate. Do not use it
+        elsewhere meanwhile.
     dt : float, optional
-        Sampling time. The default is the system's own where `System.from_ode` made it, and
-        unspecified for others.
+        Sampling time. The default is the system's if `System.from_ode` made it, else unspecified.
     name : str
         Name of the block.
     measurement_labels, control_labels, estimate_labels : str or sequence of str
@@ -59,9 +58,9 @@ def to_iosystem(
     Raises
     ------
     InvalidInputError
-        If ``mhe`` is no estimator, or python-control is not installed.
+        If ``mhe`` is not an estimator, or python-control is not installed.
     OptionError
-        If dt is not positive or not the system's, or the labels are not as many as the signals.
+        If dt is not positive or not the system's, or the number of labels is wrong.
 
     Examples
     --------

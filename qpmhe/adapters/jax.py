@@ -46,10 +46,10 @@ def from_jax(
     Parameters
     ----------
     f : callable
-        f(x) or f(x, u) of one state: x of shape (n,) and u of (m,) to (n,), an array or a
-        list of its components. With dt, the rate, in units of x per unit of time.
+        f(x) or f(x, u) of one state: maps x (n,) and u (m,) to (n,), an array or a list of
+        components. With dt, f is the rate, in units of x per unit of time.
     h : callable
-        h(x) or h(x, u), likewise, to (p,). A scalar will do where p is 1.
+        h(x) or h(x, u), likewise, to (p,), or to a scalar if p is 1.
     n, p : int
         Number of states and of outputs, at least 1.
     m : int
@@ -64,16 +64,16 @@ def from_jax(
     Returns
     -------
     System
-        With values and exact Jacobians by JAX. It pickles where f and h do, and is compiled
-        anew where it is loaded. With dt, it takes steps of other lengths.
+        With values and exact Jacobians by JAX. It pickles if f and h do, and is compiled again
+        where it is loaded. With dt, it takes steps of other lengths.
 
     Raises
     ------
     InvalidInputError
         If JAX is not installed, or has no CPU device.
     ModelError
-        If JAX cannot trace a function, or it returns the wrong shape, or less than double
-        precision, or it indexes out of range at one of a few points in the set X.
+        If JAX cannot trace a function, or the function returns the wrong shape or less than double
+        precision, or indexes out of range at one of a few points in the set X.
     OptionError
         If a size or dt is out of range, or the method unknown.
     SetError
@@ -81,26 +81,24 @@ def from_jax(
 
     Notes
     -----
-    Everything is compiled for the CPU and in double precision, whatever JAX's defaults are:
-    double precision is switched on in a context of the calling thread, for the time of a
-    call, and the process's configuration is never touched. What was in single precision
-    before stays so: constants that f and h hold as ``jax.numpy`` arrays were rounded when
-    they were made, so make them with NumPy.
+    Everything is compiled for the CPU in double precision, regardless of JAX's defaults: double
+    precision is enabled in the calling thread during each call, and the process's configuration
+    stays unchanged. Single-precision constants stay rounded: create the constants of f and h with
+    NumPy, not as ``jax.numpy`` arrays.
 
-    A call into a compiled program costs several microseconds, however little it computes.
-    So one call gives f and h, or both Jacobians, or all of them for a stage that enters the
-    window, and the last results are kept for who asks for the other half of them. Arrays
-    come back as read-only views.
+    A call into a compiled program costs several microseconds, however little it computes. So one
+    call computes f and h, or both Jacobians, or all of them for a stage that enters the window, and
+    the last results are cached. Returned arrays are read-only views.
 
-    Programs for batches are compiled when a batch of their size first occurs, 16 and its
-    doubles; the last state fills the batch up. That takes some tenths of a second each. An
-    estimator compiles those of its windows when it is made.
+    Programs for batches are compiled when a batch of their size, 16 times a power of two, first
+    occurs; copies of the last state pad the batch. Each takes some tenths of a second. An estimator
+    compiles the programs for its windows when it is made.
 
-    JAX hands programs of a thousand floating-point operations and more to a thread of its
-    own, which can cost more than they do; a loop counts as one turn of it. So the states of
-    a batch and the stages of RK4 are taken one by one where that keeps below. With larger
-    models, ``jax.config.update("jax_cpu_enable_async_dispatch", False)``, before JAX
-    computes anything in a process, saves the way to that thread and back.
+    JAX runs programs of a thousand or more floating-point operations in another thread, which can
+    cost more than the computation; a loop counts as one iteration. So the states of a batch and the
+    stages of RK4 are evaluated one by one if that stays below this limit. For larger models,
+    ``jax.config.update("jax_cpu_enable_async_dispatch", False)``, before JAX computes anything in a
+    process, avoids the thread switch.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A function for JAX as one that NumPy's functions compute, and so symbols of a trace, too."""
+"""Convert a JAX function to NumPy operations, which also accept the symbols of a trace."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ _CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 
 class NoExpressionError(NotTraceableError):
-    """A program for JAX has no expression; the text says why."""
+    """A JAX program has no expression; the message gives the reason."""
 
 
 def numpy_function(program: Any) -> Callable[..., Any]:
-    """A program (a closed jaxpr) as a function of arrays, one for each argument, of NumPy.
+    """Convert a program (a closed jaxpr) to a function of NumPy arrays, one per argument.
 
     It raises `NoExpressionError` for what is not a fixed sequence of NumPy's operations.
     """

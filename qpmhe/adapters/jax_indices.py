@@ -1,4 +1,4 @@
-"""Indices out of range in functions for JAX, which reads another entry there without an error."""
+"""Detect indices out of range, for which JAX silently reads another entry."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _FOUND = re.compile(
 
 
 def check_indices(jax: Any, name: str, function: Callable[..., Any], probes: Probes) -> None:
-    """Refuse a function that indexes an array out of its range at a probe.
+    """Reject a function that indexes an array out of range at a probe.
 
-    Indices are checked where the user's own code uses them: not within the compiled
-    functions of JAX's libraries (``jnp.interp``, ``jnp.take``), and not where a mode says
-    what such an index means. A branch that no probe takes is not checked.
+    Only indices in the user's code are checked, not those within compiled functions of JAX's
+    libraries (``jnp.interp``, ``jnp.take``), nor those with a mode that defines such an index.
+    Branches that no probe takes are not checked.
     """
     traced = jax.make_jaxpr(function)(*probes[0])
     if not _indexes(jax, traced.jaxpr):

@@ -1,4 +1,4 @@
-"""Programs that JAX compiles of a model, for one state and for many."""
+"""JAX programs compiled from a model, for one state and for many."""
 
 from __future__ import annotations
 
@@ -154,8 +154,8 @@ class Programs:
                 )
             if value.dtype != np.float64 and not np.issubdtype(value.dtype, np.integer):
                 raise ModelError(
-                    f"{name} returned {value.dtype} where x is float64; expected float64. "
-                    "Leave out what converts, such as a dtype."
+                    f"{name} returned {value.dtype} where x is float64; expected "
+                    "float64. Remove conversions, such as a dtype."
                 )
             return value.astype(np.float64).reshape(size)
 

@@ -37,10 +37,10 @@ def from_sympy(
     f, h : sequence of expressions, or a matrix
         Entries of the next state (or of its rate, with dt) and of the output.
     x, u : symbol, or sequence of symbols or functions of time
-        The states and the inputs; taken as real.
+        The states and the inputs, assumed real.
     dt : float, optional
-        Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit
-        of time, which is discretised with u held over the step.
+        Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit of time,
+        discretised with u held over the step.
     method : {"rk4", "euler"}
         Runge-Kutta of order 4, or one explicit Euler step.
     **options
@@ -49,13 +49,13 @@ def from_sympy(
     Returns
     -------
     System
-        With n states for the n symbols in x, and an input for each symbol in u.
+        With one state per symbol in x, and one input per symbol in u.
 
     Raises
     ------
     ModelError, SetError, OptionError
-        If an expression, symbol, set or option does not fit, for example a symbol that is
-        neither state nor input.
+        If an expression, symbol, set or option is invalid, such as a symbol that is neither state
+        nor input.
     InvalidInputError
         If SymPy is not installed.
     """
@@ -187,15 +187,15 @@ def _in_real_symbols(
         raise ModelError(
             f"{name} contains {words}, which is neither among the states {state} nor the inputs "
             f"{given}; " + (
-                f"{', '.join(sorted(namesakes))} has the name of one, but not its assumptions, "
-                "such as real=True: make each symbol once, and use it throughout."
+                f"{', '.join(sorted(namesakes))} has the name of one, but not its "
+                "assumptions, such as real=True: create each symbol once and reuse it."
                 if namesakes else
-                "put numbers in place of parameters, expressions in place of unknown functions, "
-                "and make what depends on time an input."
+                "replace parameters by numbers and unknown functions by "
+                "expressions, and make time-varying quantities inputs."
             )
         )
     if found.has(sympy.I, sympy.zoo, sympy.nan):
-        raise ModelError(f"{name} is {list(column)}; expected expressions of finite real value.")
+        raise ModelError(f"{name} is {list(column)}; expected expressions with finite real values.")
     return found
 
 
@@ -220,8 +220,8 @@ def _jacobian(
     for entry in found.atoms(sympy.Derivative, sympy.Subs):
         raise ModelError(
             f"{name} has the derivative {entry.xreplace(names)}, for which SymPy has no "
-            f"expression; write {name} without it (sympy.Piecewise will do), or give f and h to "
-            "qpmhe.System as Python functions."
+            f"expression; write {name} without it (for example with sympy.Piecewise), or pass f "
+            "and h to qpmhe.System as Python functions."
         )
     return found
 

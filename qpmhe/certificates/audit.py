@@ -20,7 +20,7 @@ from .regions import Region
 
 @dataclass(frozen=True, eq=False)
 class Assumption:
-    """Whether an assumption of the theorem holds, and what that rests on.
+    """Whether an assumption of the theorem holds, and the evidence for it.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class Assumption:
     holds : bool or None
         None where it is not examined in advance.
     evidence : Evidence or None
-        What the answer rests on.
+        The evidence for the answer.
     text : str
         What was found, in words.
     value : float or None
@@ -47,7 +47,7 @@ class Assumption:
 def about_slope(
     system: System, region: Region, function: Literal["f", "h"], deadline: Deadline
 ) -> Assumption:
-    """L_h; or L_f, which takes the place of kappa where the observer is projected."""
+    """L_h; or L_f, which replaces kappa where the observer is projected."""
     slope = lipschitz(system, region, function, deadline)
     name, label = {
         "h": ("output Lipschitz", "ass:lipschitz"), "f": ("model Lipschitz", "in place of eq:kappa")
@@ -108,8 +108,8 @@ def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:
     checked_system(system)
     if system.extensions:
         raise CertificateError(
-            f"the system has {' and '.join(system.extensions)}, which the theorem's cost and sets "
-            "do not; certify the system without them."
+            f"the system has {' and '.join(system.extensions)}, which the theorem does not cover; "
+            "certify the system without them."
         )
     if not isinstance(observer, Observer):
         raise InvalidInputError(
@@ -123,9 +123,9 @@ def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:
     if system.disturbance_matrix is not None or cost.disturbance_factor is not None:
         raise CertificateError(
             "the system has a disturbance_matrix, or the cost a singular covariance of the "
-            "disturbance; expected a disturbance of each state. Its constants grow with the "
-            "horizon where corrections are no such disturbances, which certificates do not cover: "
-            "give each state a small disturbance of its own."
+            "disturbance; expected a disturbance of each state. Certificates do not cover "
+            "corrections that are no such disturbances, whose constants grow with the horizon: "
+            "give each state its own small disturbance."
         )
     if (cost.n, cost.p) != (system.n, system.p):
         raise ShapeError(

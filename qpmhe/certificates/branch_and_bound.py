@@ -27,7 +27,7 @@ _TOLERANCE = 1e-3  # of a Lipschitz constant, beside the largest norm seen
 
 
 class Cells:
-    """The cells of a region that remain, each with the bound of the cell that it is a part of.
+    """The remaining cells of a region, each with the bound of the cell that it is a part of.
 
     Iteration is over chunks of those with the largest bounds, which decide the result. It ends
     when none is left, or after ``most``, or when the time is over, but not before one was taken.
@@ -141,7 +141,7 @@ def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:
 
 
 class LipschitzConstant(NamedTuple):
-    """L_h or L_f, with what it rests on."""
+    """L_h or L_f, with its evidence."""
 
     value: float  # in units of the output, or of the state, per unit of the state
     evidence: Evidence  # PROVED for an upper bound, SAMPLED for the largest value seen

@@ -1,4 +1,4 @@
-"""From system, observer, cost and horizon to a certificate, and to bounds of the error."""
+"""From system, observer, cost and horizon to a certificate, and to bounds on the error."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ASSUMED = (
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is proved of an observer, and of an estimator beside it, on a set of states.
+    """What is proved about an observer, and an estimator that uses it, on a set of states.
 
     Made by `certify`; one that is made or changed by hand is assumed.
 
@@ -51,20 +51,20 @@ class Certificate:
     region : Region
         Where it holds.
     sizes : Sizes
-        For which disturbances and noises the bounds are stated.
+        The disturbances and noises for which the bounds are stated.
     observer_bound : ObserverBound or None
-        The observer's own bound, and with it the set around the observer that holds the truth.
+        The observer's own bound, which gives the set around the observer that contains the true
+        state.
     assumptions : tuple of Assumption
-        What was found of the theorem's assumptions about cost, output and corrections.
+        The findings on the theorem's assumptions about cost, output and corrections.
     detectability, stability : optional
         Detectability and the observer's stability; None for what could not be shown.
     constants : mapping of int to TheoremConstants
-        The theorem's for each horizon; empty where it does not apply.
+        The theorem's constants for each horizon; empty where it does not apply.
     errors : mapping of str to QpmheError
         What could not be certified, and why.
     evidence : Evidence
-        The weakest that the theorem's constants rest on; where there are none, the observer's
-        bound.
+        The weakest evidence for the theorem's constants or, without any, for the observer's bound.
     """
 
     system: System
@@ -82,7 +82,7 @@ class Certificate:
 
     @property
     def diameter(self) -> float:
-        """The largest distance of two states of the region, or a little more."""
+        """The largest distance between two states of the region, or a little more."""
         return self.region.diameter
 
     @property
@@ -99,11 +99,11 @@ class Certificate:
         self, run: Run, disturbances: Size | None = None, noises: Size | None = None, *,
         initial_error: Size,
     ) -> Array:
-        """The bound of the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
+        """The bound on the error |x(t) - x_hat(t)| along a run at t = 0, ..., T, (T + 1,).
 
         The distance to the farthest point of the set around the observer that holds the true
-        state, NaN from where the run shows that it no longer does; arguments and errors are those
-        of `ObserverBound.along`. An `OptionError` is raised if there is no bound of the observer.
+        state, NaN once the run shows that it no longer does; arguments and errors are those of
+        `ObserverBound.along`. An `OptionError` is raised if there is no bound of the observer.
         """
         band = self.proved.along(run, disturbances, noises, initial_error=initial_error)
         return band.error
@@ -122,7 +122,7 @@ class Certificate:
         """The theorem's constants for a horizon N, which may be left out if there is only one.
 
         ``certificate.of(N).result.bound(...)`` is its bound (eq:RGES_result) along a run. An
-        `OptionError` says for which horizons there are some, or why there are none.
+        `OptionError` names the horizons that have constants, or states why there are none.
         """
         if not self.constants:
             raise OptionError(
@@ -139,9 +139,9 @@ class Certificate:
 
     @property
     def headline(self) -> str:
-        """The sharpest thing that is certified, in the states' units, in one line."""
+        """The sharpest certified bound, in the states' units, in one line."""
         if self.observer_bound is None:
-            return "No bound of the observer's error is proved."
+            return "No bound on the observer's error is proved."
         return self.observer_bound.headline
 
     def __str__(self) -> str:
@@ -167,7 +167,7 @@ class Certificate:
         return content
 
     def limits(self) -> list[tuple[TheoremConstants, float]]:
-        """What the theorem's bounds tend to for the sizes; vacuous from the diameter on."""
+        """Limits of the theorem's bounds for the sizes; vacuous from the diameter on."""
         sizes = self.sizes.largest
         return [(each, each.result.limit(*sizes)) for each in self.constants.values()]
 
@@ -186,8 +186,8 @@ def certify(
 ) -> Certificate:
     """Bound the observer's error on a set of states, then the estimator's by the theorem.
 
-    The observer comes first: its bound needs neither cost nor horizon nor detectability. What
-    else cannot be certified is in the certificate's ``errors``.
+    The observer comes first: its bound needs neither cost nor horizon nor detectability. The
+    certificate's ``errors`` say what else cannot be certified.
 
     Parameters
     ----------
@@ -206,8 +206,8 @@ def certify(
         Constants to take instead of looking for them, such as assumed ones, or those that
         were certified of this system and gain on a set that contains the region.
     seconds : float or Deadline
-        How long the search for constants may take, about, from when the solvers are loaded. What
-        is not proved when its share is over rests on samples, and says so.
+        Approximate time for the search for constants, after the solvers are loaded. What is not
+        proved within its share rests on samples, and says so.
 
     Raises
     ------

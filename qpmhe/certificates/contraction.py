@@ -28,8 +28,8 @@ _OTHER_GAIN = "another gain, such as synthesise_gain finds"
 _PAIR_STAYS = "it holds for trajectories that stay in the region, both of a pair, with equal inputs"
 _RUN_STAYS = "it holds while the states of system and observer stay in the region"
 _NOT_AFFINE = (
-    "h is not affine on the region, where the inequality with an output weight does not carry over "
-    "from states to averages of Jacobians; that with output injection does"
+    "h is not affine on the region: there the inequality with an output weight does not carry over "
+    "from states to averages of Jacobians; the one with output injection does"
 )
 
 
@@ -42,21 +42,21 @@ def certify_detectability(
 
     A constant P with one of the inequalities of `qpmhe.certificates.inequalities` is sought by
     semidefinite programs at some states of the region, and then verified on all of it, cell by
-    cell. Proved is what f and h are as written, in real arithmetic with the constants that they
-    have in double precision; how far their computed values are rounded belongs to the disturbance.
+    cell. The proof is about f and h as written, in real arithmetic with their constants in double
+    precision; the rounding of their computed values belongs to the disturbance.
 
     Parameters
     ----------
     system, region, inputs
         As for `certify`.
     eta : float, optional
-        The rate; left out, one is chosen between the smallest feasible one and 1 for which
-        lasting disturbances are bounded best.
+        The rate; left out, the one between the smallest feasible rate and 1 that bounds lasting
+        disturbances best.
     weights : (float, float)
-        How much the constants c_w and c_v matter, such as typical sizes of disturbance and
-        noise; the programs minimise the sum of squares of the products.
+        Weights of the constants c_w and c_v, such as typical sizes of disturbance and noise; the
+        programs minimise the sum of squares of the products.
     seconds : float or Deadline
-        How long this may take, about; the result is then what was found so far, if anything.
+        Approximate time limit; the result is then what was found so far, if anything.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def certify_detectability(
         range, or the Jacobians are not finite in the region.
     NotCertifiedError
         If there are no such constants, or none were found; the text gives the smallest feasible
-        rate and what is not detected. An `OutOfTimeError` says that it is not known which.
+        rate and what is not detected. An `OutOfTimeError` means that it is not known which.
     """
     first, second = vector("weights", np.asarray(weights), 2).tolist()
     search = Search(
@@ -109,8 +109,9 @@ def _undetectable(search: Search, text: str) -> NotCertifiedError:
             return NotCertifiedError(
                 "the system is not exponentially detectable by any constant P: at "
                 f"{np.round(point, 4).tolist()} the mode with eigenvalue {value:.6g}, along "
-                f"{np.round(direction, 4).tolist()}, does not decay and is not in the output",
-                ("measure something that this mode acts on",
+                f"{np.round(direction, 4).tolist()}, does not decay and does not appear in the "
+                "output",
+                ("measure an output that this mode affects",
                  "leave the mode out of the model if it is not to be estimated"),
             )
     steep = _steepest(search)
@@ -184,9 +185,9 @@ def certify_observer(
 ) -> ObserverStability:
     """Find and verify constants of RGES, (eq:RGES), for an observer with constant gain.
 
-    It serves linear and nonlinear outputs. Among all P, and all rates, it is the one for which
-    disturbances and noises of the given sizes leave the smallest error in the limit, in the size of
-    the region.
+    Outputs may be linear or nonlinear. Of all P and all rates, it returns those with the smallest
+    limit of the error for disturbances and noises of the given sizes, in units of the region's
+    size.
 
     Parameters
     ----------
@@ -198,7 +199,7 @@ def certify_observer(
         The rate; left out, the best one.
     sizes : (float or (r,) array_like, float or (p,) array_like)
         The largest disturbance w and noise v: each a length, or half-widths by component. The
-        certificate holds for any; for these, it is best.
+        certificate holds for all sizes; it is best for these.
 
     Raises
     ------
@@ -293,6 +294,13 @@ class Synthesis:
 
     observer: Luenberger
     stability: ObserverStability
+
+    def __str__(self) -> str:
+        gain = " ".join(np.array2string(self.observer.gain, precision=4, separator=", ").split())
+        return (
+            f"Constant gain {gain}: the error contracts at the rate {self.stability.rho:.4g} a "
+            f"sample ({self.stability.evidence}); {'; '.join(self.stability.notes)}."
+        )
 
 
 def synthesise_gain(

@@ -70,7 +70,7 @@ MOST_ACTIVE = 6
 
 @dataclass(frozen=True, eq=False)
 class Enclosure:
-    r"""The joint Jacobian :math:`J = [\partial f; \partial h]` over cells, or that of h alone.
+    r"""The joint Jacobian :math:`J = [\partial f; \partial h]` over cells, or that of h.
 
     On a cell with middle c, by the mean value theorem for J,
 
@@ -121,9 +121,9 @@ class Enclosure:
 class SmoothModel:
     """f and h of a system as one expression graph, to be enclosed over cells of states and inputs.
 
-    What is enclosed is f and h as expressions in real arithmetic, with the constants that they
-    have in double precision. Functions in NumPy are traced, under watch (`qpmhe.model.tracing`).
-    At samples of the region, the functions' values must lie where the expressions' values do.
+    It encloses f and h as expressions in real arithmetic, with their constants in double precision.
+    Functions in NumPy are traced, under watch (`qpmhe.model.tracing`). At samples of the region,
+    the functions' values must lie where the expressions' values do.
 
     States and inputs that the region fixes, such as known parameters, are numbers in the graph:
     Jacobians are of the other states, those in ``free``. ``moved`` are the states that the region
@@ -167,7 +167,7 @@ class SmoothModel:
         self.moved = fixed[~kept]
 
     def jacobians(self, points: Array) -> Array:
-        """The joint Jacobians at some points: the expressions', or the functions' own."""
+        """The joint Jacobians at some points: of the expressions, or of the functions."""
         parts = []
         for name in ("f", "h"):
             evaluated(name, getattr(self._system, name), points, self.n)  # steps may not see NaN
@@ -200,7 +200,7 @@ class SmoothModel:
         )
 
     def obstacle(self, lower: Array, upper: Array) -> str:
-        """What has no enclosure on a cell (N,), in words; blank if all has."""
+        """What has no enclosure on a cell (N,), in words; blank if everything has one."""
         parts = {**{f"{name} has": one for name, one in self._programs.items()},
                  "a derivative has": self._plan}
         for words, part in parts.items():

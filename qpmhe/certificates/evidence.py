@@ -1,4 +1,4 @@
-"""What a certified number rests on, and the errors where nothing can be certified."""
+"""The evidence for a certified number, and the errors where nothing can be certified."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..model.sets import ConvexSet
 
 
 class Evidence(Enum):
-    """What a constant rests on, best first."""
+    """The evidence for a constant, best first."""
 
     #: Holds on the whole stated set: shown in exact or outward-rounded arithmetic.
     PROVED = "proved"
@@ -29,7 +29,7 @@ class Evidence(Enum):
 
 
 def weakest(evidence: Iterable[Evidence]) -> Evidence:
-    """What a number rests on that is computed from others: the weakest of theirs."""
+    """The evidence for a number computed from others: the weakest of theirs."""
     return max(evidence, key=list(Evidence).index, default=Evidence.PROVED)
 
 
@@ -51,12 +51,12 @@ class NotCertifiedError(QpmheError):
     suggestions : sequence of str
         What may help; the text of the error lists them.
     smallest_rate : float, optional
-        The smallest rate that was found to be feasible, where the one asked for was not.
+        The smallest rate that was found feasible, if the requested one was not.
 
     Attributes
     ----------
     finding : str
-        The message without what may help.
+        The message without the suggestions.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class NotCertifiedError(QpmheError):
 
 
 class OutOfTimeError(NotCertifiedError):
-    """A search that was stopped before it found anything: nothing is known of the property."""
+    """A search that was stopped before it found anything: nothing is known about the property."""
 
 
 def json_ready(value: Any) -> Any:

@@ -10,12 +10,12 @@ encloses how far.
 
 Derivatives of nodes are nodes of the same graph. A choice has the derivatives of either side. This
 is rigorous for differences, which is what certificates need: along the segment between two states,
-every node is a Lipschitz function of the way, and so has a derivative at almost every point of it.
-There a choice v between a and b that is continuous equals a or b at points arbitrarily near by, so
-that v' is a' or b', the chain rule holds with what is enclosed, and differences are the integral.
-(Where a equals b on more than single points, a' is b' at almost all of these, so that v' is the
-derivative of the branch that the condition takes.) Second derivatives are only for cells on which
-no condition changes.
+every node is a Lipschitz function of the position, and so has a derivative at almost every point.
+There a choice v between a and b that is continuous equals a or b at points arbitrarily near by,
+so that v' is a' or b', the chain rule holds with what is enclosed, and differences are the
+integral. (Where a equals b on more than single points, a' is b' at almost all of these, so that v'
+is the derivative of the branch that the condition takes.) Second derivatives are only for cells on
+which no condition changes.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ _ROUNDING = 1e-6  # more than rounding makes of differences of f and h
 
 
 def norms(values: Array, weight: Array) -> Array:
-    """|s|_W of each row, or what it is at most for vectors of these lengths."""
+    """|s|_W of each row, or its maximum for vectors of these lengths."""
     if values.ndim == 1:
         top = float(np.linalg.eigvalsh(weight)[-1])
         return math.sqrt(max(0.0, top)) * values

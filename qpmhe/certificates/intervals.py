@@ -43,7 +43,7 @@ class Interval:
 
     @classmethod
     def of(cls, value: Any) -> Interval:
-        """The interval itself, or a number as one."""
+        """The interval itself, or a number as an interval."""
         return value if isinstance(value, Interval) else cls(value, value)
 
     def __getitem__(self, index: Any) -> Interval:

@@ -61,7 +61,7 @@ def certify_invariance(
     system: System, region: ConvexSet | Region | None = None, *, inputs: Box | None = None,
     disturbance: ArrayLike = 0.0, seconds: float | Deadline = PART_SECONDS,
 ) -> Invariance:
-    """Prove that a region is invariant, or say where the state leaves it.
+    """Prove that a region is invariant, or report where the state leaves it.
 
     Arguments and errors are those of `certify`; the ``disturbance`` is the largest w, a length or
     half-widths by component (r,), which acts on the state as G w.

@@ -1,4 +1,4 @@
-r"""Weights, discount and horizon from a Lyapunov function of detectability, and what they bound.
+r"""Weights, discount and horizon from a Lyapunov function of detectability, and their bounds.
 
 `docs/explanation/lyapunov.md` derives every inequality.
 """
@@ -55,7 +55,7 @@ class Design:
     Parameters
     ----------
     system, region
-        Of what, and where.
+        The system, and the region where the design holds.
     form : Form
         The inequality that was verified.
     discount : float
@@ -63,12 +63,12 @@ class Design:
     sizes : Sizes
         The largest disturbances and noises.
     horizon : int
-        The given one, or the least one whose limit for a minimiser is at most a tenth above the one
-        of endless horizons.
+        The given one, or the least one whose limit for a minimiser is at most a tenth above the
+        limit of infinite horizons.
     evidence : Evidence
-        What the inequality rests on.
+        The evidence for the inequality.
     notes : tuple of str
-        What else there is to say.
+        Further remarks.
     """
 
     system: System
@@ -111,7 +111,7 @@ class Design:
         return _least(self.discount, 0.25)
 
     def limit(self, horizon: int | None = None) -> float:
-        """What a minimiser's bound tends to for the design's largest disturbances and noises.
+        """Limit of a minimiser's bound for the design's largest disturbances and noises.
 
         Infinite where its error does not contract.
         """
@@ -150,17 +150,17 @@ class Design:
             The estimator that made it, with the design's `cost` and
             ``candidate="reinitialized"``. Its horizon is the bound's.
         initial_error : (n,) array_like, float or set
-            x(0) minus the first guess, a bound on its length, or a set that holds it.
+            x(0) minus the first guess, a bound on its length, or a set that contains it.
         disturbances, noises : optional
             w(t) and v(t), as in `ObserverBound.along`; left out, `sizes`.
         kind : {"measured", "minimiser"}
-            What bounds the estimate's cost: it is known, for any number of QPs; or it is at most
-            J(x), as for a global minimiser, which converged QPs do not prove.
+            The bound on the estimate's cost: its known value, for any number of QPs; or J(x), as
+            for a global minimiser, which converged QPs do not prove.
 
         Raises
         ------
         MismatchError
-            If the estimator has another system, cost, candidate or arrival than the bound is of.
+            If the estimator has another system, cost, candidate or arrival than the bound.
         ShapeError, OptionError, SetError
             If an argument does not fit.
         """
@@ -201,7 +201,7 @@ class Design:
         )
         if any(each.shape not in ((), (steps,)) for each in parts):
             raise ShapeError(
-                f"disturbances or noises are not of {steps} samples, as the run is; expected as "
+                f"disturbances or noises do not have {steps} samples, as the run has; expected as "
                 "many vectors, or bounds for all times."
             )
         return np.broadcast_to(parts[0] ** 2 + parts[1] ** 2, (steps,))
@@ -214,7 +214,7 @@ class Design:
             for name in ("prior", "disturbance", "noise")
         )
         for differs, text in (
-            (source.system is not self.system, "is of another system; design for its own"),
+            (source.system is not self.system, "has another system; make a design for that"),
             (not same or source.has_changed or settings.arrival != "observer",
              "has other weights, another discount, or arrival='smoothed'; make it with "
              "cost=design.cost() and leave arrival out"),
@@ -228,7 +228,7 @@ class Design:
                 raise MismatchError(f"the estimator {text}.")
 
     def code(self) -> str:
-        """Python that makes the cost and says which horizon and candidate belong to it."""
+        """Python code that makes the cost, with the horizon and candidate that belong to it."""
 
         def text(matrix: Array) -> str:
             rows = (", ".join(f"{value:.8g}" for value in row) for row in matrix)
@@ -288,8 +288,8 @@ def design(
     discount : float, optional
         gamma in (0, 1); left out, the one with the smallest limit of a minimiser's error.
     seconds : float or Deadline
-        How long this may take, about, from when the solvers are loaded. When it is over, the best
-        weights that were found by then are returned, proved or sampled, as their notes say.
+        Approximate time limit, after the solvers are loaded. It then returns the best weights found
+        so far, proved or sampled, as their notes say.
 
     Raises
     ------
@@ -297,7 +297,7 @@ def design(
         If an argument does not fit, or there are no sizes.
     NotCertifiedError
         If the system is not shown detectable with a Lyapunov function of this kind. An
-        `OutOfTimeError` says that no weights were found in time.
+        `OutOfTimeError` means that no weights were found in time.
     """
     checked_system(system)
     place, known = bounded_region(system, region, inputs), Sizes.of(sizes, system)

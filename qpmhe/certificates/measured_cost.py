@@ -1,4 +1,4 @@
-"""A bound of the estimate's error from the cost that came back."""
+"""A bound on the estimate's error from its measured cost."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SUMS = 1.0 + 1e-9  # covers the rounding of a sum over a window, and of roots
 
 
 class MeasuredCost:
-    r"""What detectability makes of an estimate's cost and of a bound of its prior's error.
+    r"""The error bound from detectability, an estimate's cost and a bound on its prior's error.
 
     With detectability's norms P and V, a trajectory of k stages with the cost B is at most
     :math:`\alpha_k \sqrt B` from one without disturbances and noises that starts at its prior's

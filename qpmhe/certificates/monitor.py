@@ -1,4 +1,4 @@
-"""At run time: what bounds the error beside each estimate, and the sample at which that ends."""
+"""At run time: a bound on the error of each estimate, and the sample at which it ends."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOVED = (
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What is known of the true state x(t+1) after a sample; NaN where nothing is.
+    """What is known about the true state x(t+1) after a sample; NaN where nothing is known.
 
     Attributes
     ----------
@@ -43,9 +43,9 @@ class Reading:
     lower, upper : (n,) array
         Sides of a box that holds x(t+1): the set around the observer, within the region.
     error : float
-        What |x(t+1) - x_hat(t+1)| is at most.
+        Upper bound on |x(t+1) - x_hat(t+1)|.
     kind : str
-        What gives the last: ``observer``, or ``measured`` where the measured cost gives less.
+        The source of ``error``: ``observer``, or ``measured`` where the measured cost gives less.
     lost, reason : int or None, and str
         The sample after which the bound no longer holds, and why.
     """
@@ -61,7 +61,7 @@ class Reading:
 
 
 class Monitor:
-    """Follows an estimator from sample to sample, with what is proved of it.
+    """Follows an estimator from sample to sample, with what is proved about it.
 
     It takes one evaluation of f and two of h a sample; for a `Certificate` with the theorem's
     constants, which need more, two for each sample of the window.
@@ -71,18 +71,18 @@ class Monitor:
     certified : Certificate or ObserverBound
         Of the estimator's system and observer; the bound of its observer is enough.
     estimator : MovingHorizonEstimator
-        Where the bound begins.
+        The estimator, as it is when the bound begins.
     initial_error : float, (n,) array_like or set
-        What bounds x - z there; see `ObserverBound.along`.
+        Bound on x - z there; see `ObserverBound.along`.
     sizes : Sizes, optional
-        What bounds w and v at all times; the bound's own if left out.
+        Bounds on w and v at all times; those of the bound if left out.
 
     Raises
     ------
     ShapeError, OptionError, SetError, InvalidInputError
         If an argument does not fit, or there is no bound of the observer.
     MismatchError
-        If what is certified is of another system or gain than the estimator's.
+        If the certificate is for another system or gain than the estimator's.
 
     Attributes
     ----------
@@ -125,8 +125,8 @@ class Monitor:
         own = certified.system if isinstance(certified, Certificate) else bound.stability.system
         if own not in (None, self._system):
             raise MismatchError(
-                "the bound is of another System object than the estimator's; certify the very "
-                "objects that the estimator is made of."
+                "the bound is for another System object than the estimator's; certify the same "
+                "objects that the estimator uses."
             )
         self.bound = bound.of_observer(estimator.observer, self._system)
         self.sizes = bound.sizes if sizes is None else sizes
@@ -170,11 +170,11 @@ class Monitor:
         Parameters
         ----------
         estimate : Estimate
-            An `InvalidInputError` is raised if it is none.
+            An `InvalidInputError` is raised if it is not one.
         u : (m,) array_like, optional
             The system's input of the sample, parameters included, or a `ShapeError`.
         dt : float, optional
-            Length of its step, if it had one of its own.
+            Length of its step, if it is not the usual one.
         """
         if not isinstance(estimate, Estimate):
             raise InvalidInputError(
@@ -216,7 +216,7 @@ class Monitor:
         if time in (self._time, self._time - 1):
             return ""
         if time < self._time:
-            return "the estimator began again (reset, or a snapshot)"
+            return "the estimator restarted (reset, or a snapshot)"
         return f"the samples from {self._time} to {time - 1} were not shown to the monitor"
 
     def _advance(self, estimate: Estimate, u: Array, dt: float | None) -> str:
@@ -314,7 +314,7 @@ class Monitor:
                 radius *= largest_ratio(mine, metric)
         except (KeyError, TypeError, ValueError) as error:
             raise InvalidInputError(
-                f"the state is of no monitor of this observer: {error}."
+                f"the state does not come from a monitor of this observer: {error}."
             ) from error
         self._time, self._z, self._radius, self.lost, self.reason = time, z, radius, lost, reason
 

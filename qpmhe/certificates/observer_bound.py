@@ -1,4 +1,4 @@
-r"""The proved bound of the observer's error, and the set around its state that holds the truth.
+r"""The proved bound on the observer's error, and the set around it that contains the true state.
 
 Where the observer is shown to contract on a region (`Form`), any two x, z of it have
 
@@ -48,8 +48,8 @@ _SLACKS = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 
 #: Of an estimator whose observer does not run on.
 REINITIALIZED = (
-    "the candidate comes from an observer that starts again at each sample, whose states this "
-    "bound is not about"
+    "the candidate comes from an observer that restarts at each sample, whose states this bound "
+    "does not cover"
 )
 #: Where the data contradict what is assumed.
 CONTRADICTION = (
@@ -58,8 +58,8 @@ CONTRADICTION = (
 )
 _EVENTS = {
     Status.MISSING: "a measurement was missing",
-    Status.MODEL_FAILED: "the model failed, and the observer started again",
-    Status.METRIC_SINGULAR: "the observer was projected in a metric of the projection's own",
+    Status.MODEL_FAILED: "the model failed, and the observer restarted",
+    Status.METRIC_SINGULAR: "the observer was projected in the projection's own metric",
 }
 _PROJECTED = (
     "the observer was projected onto X in another metric than the certified one, "
@@ -74,11 +74,11 @@ class Band:
     Attributes
     ----------
     radius : (T + 1,) array
-        b(t), which bounds |x(t) - z(t)|_P; NaN from where the bound no longer holds.
+        b(t), which bounds |x(t) - z(t)|_P; NaN once the bound no longer holds.
     lower, upper : (T + 1, n) array
         Sides of a box that holds the true state.
     error : (T + 1,) array
-        What |x(t) - x_hat(t)| is at most.
+        Upper bound on |x(t) - x_hat(t)|.
     lost : int or None
         The sample after which it no longer holds.
     reason : str
@@ -100,7 +100,7 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class ObserverBound:
-    """What is proved of the observer alone; it needs no cost, horizon or detectability.
+    """What is proved about the observer alone; it needs no cost, horizon or detectability.
 
     Parameters
     ----------
@@ -109,14 +109,14 @@ class ObserverBound:
     region : Region
         The set in which state and observer must stay.
     sizes : Sizes
-        What bounds w and v unless something else is passed.
+        Bounds on w and v unless others are passed.
     projection : ndarray or None
-        The metric in which the observer is projected onto X, if it has one of its own.
+        The metric in which the observer is projected onto X, if it has its own.
     invariance : Invariance or None
         Whether the true state stays in the region, for disturbances of these sizes.
     inner : Invariance or None
-        The same of a smaller region, around which the observer stays in the region: within
-        the bound's limit. None where there is no such region, or its invariance is not proved.
+        The same for a smaller region, around which the observer stays in the region: within the
+        bound's limit. None where there is no such region, or its invariance is not proved.
     """
 
     stability: ObserverStability
@@ -128,7 +128,7 @@ class ObserverBound:
 
     @property
     def evidence(self) -> Evidence:
-        """What it rests on."""
+        """The evidence for the bound."""
         return self.stability.evidence
 
     @property
@@ -154,7 +154,7 @@ class ObserverBound:
         return self.projection is not None and np.array_equal(self.projection, self.metric)
 
     def of_observer(self, observer: Observer, system: System) -> ObserverBound:
-        """The same of an observer with this gain, or a `MismatchError`; its metric may differ."""
+        """The same for an observer with this gain, or a `MismatchError`; its metric may differ."""
         gain = gain_if_constant(observer, system)
         if gain is None or not np.array_equal(gain, self.gain):
             theirs = "not constant" if gain is None else str(gain.tolist())
@@ -237,17 +237,17 @@ class ObserverBound:
         return min(reached + length, math.hypot(reached, root)) * OUTWARD
 
     def limit(self, disturbances: Size | None = None, noises: Size | None = None) -> float:
-        """What b(t) tends to as t grows, for bounds on w and v that hold at all times."""
+        """The limit of b(t) as t grows, for bounds on w and v that hold at all times."""
         entering = self.entering(disturbances, noises)
         if entering.ndim > 1:
             raise OptionError(
-                "disturbances and noises are of single samples; expected bounds for all times."
+                "disturbances and noises are given sample by sample; expected bounds for all times."
             )
         (length, root), rate = map(float, entering), self.rate * OUTWARD
         return min(length / (1.0 - rate), root / math.sqrt(1.0 - rate * rate)) * OUTWARD
 
     def components(self, radius: ArrayLike) -> Array:
-        """What each |x_i - z_i| is at most where |x - z|_P <= radius: (..., n) for (...)."""
+        """Upper bounds on |x_i - z_i| where |x - z|_P <= radius: (..., n) for (...)."""
         return np.multiply.outer(np.asarray(radius, np.float64), self.slopes) * OUTWARD
 
     def around(self, radius: ArrayLike, observer: Array) -> tuple[Array, Array]:
@@ -263,7 +263,7 @@ class ObserverBound:
     def farthest(
         self, radius: ArrayLike, offset: ArrayLike, observer: ArrayLike | None = None
     ) -> Array:
-        r"""What the distance of x_hat to the points of the set around z is at most, (...).
+        r"""Upper bound on the distance from x_hat to the points of the set around z, (...).
 
         With the offset :math:`o = \hat x - z` (..., n), the radius b and the longest half axis a of
         the set for b = 1,
@@ -304,7 +304,7 @@ class ObserverBound:
         ShapeError, OptionError, SetError, InvalidInputError
             If an argument does not fit.
         MismatchError
-            If the run knows its estimator, and that had another gain.
+            If the run's estimator is known, and had another gain.
         """
         if not isinstance(run, Run):
             raise InvalidInputError(
@@ -385,7 +385,7 @@ class ObserverBound:
         when = f" after {after} samples" if after else ""
         wide = " x ".join(f"{width:.3g}" for width in self._widths)
         vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self._widths))
-        nothing = f": it says nothing of {vacuous}" if vacuous else ""
+        nothing = f": it says nothing about {vacuous}" if vacuous else ""
         stays = self.invariance is not None and self.invariance.holds
         condition = "" if stays else " while x stays in the region"
         return f"{each}{when} ({self.evidence}{condition}), on a region {wide} wide{nothing}"
@@ -436,7 +436,7 @@ def bound_observer(
 def with_invariance(
     bound: ObserverBound, system: System, seconds: float | Deadline
 ) -> ObserverBound:
-    """The bound with what is found of whether state and observer stay in the region."""
+    """The bound, with the findings on whether state and observer stay in the region."""
     if system.disturbance_matrix is not None:
         return bound
     deadline, size, inner = Deadline.of(seconds), bound.sizes.extent[0], None
@@ -454,7 +454,7 @@ def initial_length(error: Size, weight: Array) -> float:
     """|e|_W from an initial error: a vector (n,), a bound on its length, or a set that holds it."""
     found = lengths_of("initial_error", error, weight)
     if found.ndim:
-        raise ShapeError("initial_error is of several samples; expected that of the first one.")
+        raise ShapeError("initial_error has several samples; expected the error at the first one.")
     return float(found)
 
 

@@ -98,7 +98,7 @@ class Program:
         return Interval(low, high)
 
     def obstacle(self, lower: Array, upper: Array) -> str:
-        """What is not defined on all of a cell (N,), in words; blank if all is."""
+        """What is not defined on all of a cell (N,), in words; blank if everything is."""
         values = self._held(lower[None], upper[None])
         place = self._place
         for k in self._roots:

@@ -1,4 +1,4 @@
-"""Constants of detectability and of the observer's stability, with what they rest on."""
+"""Constants of detectability and of the observer's stability, with their evidence."""
 
 from __future__ import annotations
 
@@ -62,19 +62,19 @@ class Detectability(_Certified):
     c_p, c_w, c_v : float
         The constants; c_v has units of the state per unit of the output.
     evidence : Evidence
-        What they rest on; made or changed by hand, they are assumed.
+        The evidence for them; constants made or changed by hand are assumed.
     region : Region or None
         The set in which both trajectories must stay; None for constants assumed everywhere.
     notes : tuple of str
-        What else there is to say.
+        Further remarks.
     P, V : (n, n) and (p, p) array or None
         Norms of the differences of states and of disturbances, and of outputs.
     form : str
         Which inequality was shown: ``output weight``, ``output injection``, or ``assumed``.
     cells : int
-        In how many pieces of the region the inequality was verified; 0 if in none.
+        Number of pieces of the region on which the inequality was verified; 0 if none.
     system : System or None
-        What it was certified of; None for constants made or changed by hand, or copied.
+        The certified system; None for constants made or changed by hand, or copied.
     """
 
     eta: float
@@ -164,7 +164,7 @@ Result = TypeVar("Result", "Detectability", "ObserverStability")
 
 
 def sealed(result: Result, system: System, evidence: Evidence) -> Result:
-    """The result itself, with its system and what it rests on; its arrays are fixed."""
+    """The result itself, with its system and its evidence; its arrays are fixed."""
     for name, value in vars(result).items():
         if isinstance(value, np.ndarray):
             vars(result)[name] = value = value.copy()
@@ -186,12 +186,12 @@ def fitting(part: Result, system: System, region: Region, gain: Array | None) ->
     if own is not None and (gain is None or not np.array_equal(own, gain)):
         theirs = "not constant" if gain is None else str(gain.tolist())
         raise MismatchError(
-            f"the {what} that was passed is of the gain {own.tolist()}; the observer's is "
+            f"the {what} that was passed is for the gain {own.tolist()}; the observer's is "
             f"{theirs}. Certify this observer."
         )
     if part.evidence is not Evidence.ASSUMED and part.system is not system:
         raise MismatchError(
-            f"the {what} that was passed is of another System object. Certify this system, or "
+            f"the {what} that was passed is for another System object. Certify this system, or "
             f"state the constants: {type(part).__name__}.assumed(...)."
         )
     return part

@@ -23,7 +23,7 @@ _MOST_CORNERS, _DIRECTIONS = 256, 32  # among samples; in which vertices are sou
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A bounded convex set of states, and the inputs that may act meanwhile.
+    """A bounded convex set of states, and the inputs that may act there.
 
     ``lower`` and ``upper``, (n + m,), are the sides of a box around states and inputs. It holds
     them all: for a polytope, they are proved by duality and rounded outward.
@@ -45,7 +45,7 @@ class Region:
 
     @property
     def diameter(self) -> float:
-        """The largest distance of two of its states, or a little more."""
+        """The largest distance between two of its states, or a little more."""
         return float(np.linalg.norm((self.upper - self.lower)[: self.n]))
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
@@ -106,7 +106,7 @@ def bounded_region(
     where = region if isinstance(region, Region) else _bounded(system, region, inputs)
     if where.n != system.n or where.lower.size != system.n + system.m:
         raise SetError(
-            f"the region is of {where.n} states and {where.lower.size - where.n} inputs; "
+            f"the region has {where.n} states and {where.lower.size - where.n} inputs; "
             f"expected {system.n} and {system.m}."
         )
     if where is region and inputs is not None:
@@ -132,7 +132,7 @@ def _bounded(system: System, region: ConvexSet | None, inputs: Box | None) -> Re
     if chosen is None:
         raise SetError(
             "there is no region: the system has no state set; pass region=qpmhe.Box(lower, "
-            "upper), the states for which the certificate is wanted."
+            "upper), the states on which to certify it."
         )
     if not isinstance(chosen, ConvexSet):
         raise SetError(f"region is {chosen!r}; expected a qpmhe.Box or a qpmhe.Polytope.")
@@ -141,7 +141,7 @@ def _bounded(system: System, region: ConvexSet | None, inputs: Box | None) -> Re
     if system.m and not (isinstance(inputs, Box) and inputs.dimension == system.m):
         raise SetError(
             f"inputs is {inputs!r}; expected a qpmhe.Box of dimension {system.m}: the system has "
-            "inputs, and what is certified holds for those within bounds only."
+            "inputs, and certificates hold only for inputs within bounds."
         )
     if not system.m and inputs is not None:
         raise SetError("inputs are bounded, but the system has none; leave inputs out.")

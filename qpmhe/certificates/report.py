@@ -31,7 +31,7 @@ _QPS = 2  # a sample, in the run on the simulated record
 
 
 class Report(NamedTuple):
-    """What was certified of a model, and its estimator's error on a simulated record."""
+    """What was certified about a model, and its estimator's error on a simulated record."""
 
     certificate: Certificate
     simulated: str
@@ -86,7 +86,7 @@ def _proved_observer(
         limit, says = limits(own)
         if says:
             return observer, own, ""
-        why = f"its bound, {np.round(limit, 3).tolist()}, says nothing of every state"
+        why = f"its bound, {np.round(limit, 3).tolist()}, is vacuous in some state"
     except (NotCertifiedError, CertificateError) as error:
         why = str(error.args[0]).split(". ")[0].split(" What may help")[0]
     try:
@@ -149,6 +149,6 @@ def sizes_of(system: System, cost: Cost, scenario: Scenario | None) -> Sizes:
 
 
 def initial_error(scenario: Scenario) -> Box:
-    """As far as the scenario's first state is from its first estimate, in each component."""
+    """Distance from the scenario's first state to its first estimate, in each component."""
     away = np.abs(scenario.initial_state - scenario.initial_estimate)
     return Box(-away, away)

@@ -239,7 +239,7 @@ class Search:
             raise OutOfTimeError(
                 f"{time}: a semidefinite program for {self.system.n} states takes about "
                 f"{expected:.2g} s, and {left:.2g} s were left",
-                ("more seconds", "a given rate, which spares the search for one",
+                ("more seconds", "a given rate, which saves the search for one",
                  "a smaller model"),
             )
         self._answers.append(answer)

@@ -1,4 +1,4 @@
-"""What bounds disturbances and noises: lengths, sets, or vectors at each sample."""
+"""Bounds on disturbances and noises: lengths, sets, or vectors at each sample."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _MOST_CORNERS = 4096
 
 @dataclass(frozen=True)
 class Sizes:
-    """What bounds disturbances and noises at all times.
+    """Bounds on disturbances and noises at all times.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Sizes:
         The largest |w| and |v|, or sets that hold w and v, such as ``qpmhe.Box``; of another set,
         the box around it is used. An error names one that is negative or not bounded.
     source : str
-        Where this comes from, for reports.
+        The origin of these sizes, for reports.
     """
 
     disturbance: float | ConvexSet = 1.0

@@ -79,7 +79,7 @@ class DecayingSums:
         return decay + self.rate * decaying_sums(self.rate, self.disturbance * w + self.noise * v)
 
     def limit(self, disturbance: float, noise: float) -> float:
-        """What the bound tends to as t grows, for lengths |w| and |v| up to these."""
+        """The limit of the bound as t grows, for lengths |w| and |v| up to these."""
         w, v = checked_length("disturbance", disturbance), checked_length("noise", noise)
         if not all(map(math.isfinite, self.constants)):
             return math.inf
@@ -131,7 +131,7 @@ class TheoremConstants:
     cost : CostConstants
         a and the constants of (eq:exp_bounds), from ``cost.constants``.
     kappa : float
-        Of (eq:kappa); 0 for an observer that never corrects.
+        The constant of (eq:kappa); 0 for an observer that never corrects.
     lipschitz : float
         L_h, in units of the output per unit of the state.
     horizon : int

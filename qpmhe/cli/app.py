@@ -72,11 +72,11 @@ def solvers() -> None:
     table = Table(
         title="QP backends",
         title_justify="left",
-        caption="version: own needs no package, none is not installed (pip install it by its "
-        "name). in-eq: handles bounds and rows. cap: honours max_iterations. at cap: has an "
-        "iterate to judge when capped. x0: uses a start. y0: starts from the last multipliers. "
-        "time: honours a time limit. inf: says so where a QP is infeasible. ws: keeps its "
-        "workspace from QP to QP.",
+        caption="version: own: needs no package; none: not installed (pip install its name). "
+        "in-eq: handles bounds and rows. cap: honours max_iterations. at cap: returns an "
+        "iterate when capped. x0: uses a start. y0: starts from the last multipliers. "
+        "time: honours a time limit. inf: detects infeasible QPs. ws: keeps its workspace from QP "
+        "to QP.",
         caption_justify="left",
         box=None,
         pad_edge=False,
@@ -104,7 +104,7 @@ def certify(
     ],
     box: Annotated[
         str | None, typer.Option(help="Region of the states, such as 0.1:9,-1:9. Default: the "
-                                      "model's own, else a box around a simulated record."),
+                                      "model's, else a box around a simulated record."),
     ] = None,
     horizon: Annotated[
         str | None, typer.Option(help="Horizons N, separated by commas. Default: the model's own.")
@@ -164,7 +164,7 @@ def solve_qp(
 
 
 def main() -> None:
-    """Entry point: our own errors are reported in a line, without a traceback."""
+    """Entry point: report our own errors in one line, without a traceback."""
     try:
         app()
     except QpmheError as error:

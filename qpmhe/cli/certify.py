@@ -1,4 +1,4 @@
-"""``qpmhe certify``: what is proved of a model's observer, and what follows for estimates."""
+"""``qpmhe certify``: what is proved about a model's observer, and what follows for estimates."""
 
 from __future__ import annotations
 
@@ -174,8 +174,8 @@ def _designed(
          f"minimiser; the least N is {made.least_horizon()}"),
         ("limit", "then "
          + ", ".join(f"|x{i + 1} - x_hat{i + 1}| <= {each:.3g}" for i, each in enumerate(limits))
-         + (f": it says nothing of {nothing}" if nothing else "")),
-        ("any QPs", "Design.along bounds the error by the J(estimate) that came back"),
+         + (f": it says nothing about {nothing}" if nothing else "")),
+        ("any QPs", "Design.along bounds the error by the J(estimate) that each step returns"),
         *(("note", each) for each in made.notes),
     ]
     _show(console, rows, f"Lyapunov design ({made.evidence})")
@@ -192,7 +192,7 @@ def _horizons(text: str | None) -> list[int]:
     except ValueError:
         found = []
     if not found or min(found) < 1:
-        raise OptionError(f"--horizon is {text!r}; expected integers >= 1 between commas.")
+        raise OptionError(f"--horizon is {text!r}; expected integers >= 1 separated by commas.")
     return found
 
 

@@ -22,9 +22,10 @@ from .values import read_numbers
 _JOBS = typer.Option(min=1, help="Cells to run in parallel, default all cores; to measure "
                                  "times, give 1.")
 _SCHEDULER = typer.Option(help="Address of a Dask scheduler whose workers run the cells.")
-_FAILING = typer.Option(metavar="DIR", help="Folder for QPs on which a backend failed, for qpmhe "
-                                             "solve-qp; keeps those of cells that run.")
-_RETRY = typer.Option("--retry-failed", help="Run the cells again that failed before.")
+_FAILING = typer.Option(metavar="DIR", help="Folder for QPs on which a backend failed or gave "
+                                             "up without a cap, for qpmhe solve-qp; stored "
+                                             "cells do not run again.")
+_RETRY = typer.Option("--retry-failed", help="Rerun failed cells.")
 
 
 def compare(
@@ -43,18 +44,18 @@ def compare(
         typer.Option(help="QP backend; may be repeated. All installed ones if left out."),
     ] = None,
     qps: Annotated[
-        str, typer.Option(help="QPs per sample, between commas; 0 is the observer, none iterates "
-                          "to convergence.")
+        str, typer.Option(help="QPs per sample, separated by commas; 0 is the observer, none "
+                          "iterates to convergence.")
     ] = "0,1,2,5,none",
     solver_iterations: Annotated[
-        str, typer.Option(help="Caps on the iterations inside each QP, between commas.")
+        str, typer.Option(help="Caps on the iterations inside each QP, separated by commas.")
     ] = "1,2,5,10,none",
     horizons: Annotated[
-        str, typer.Option(help="Horizons N, between commas; default is the model's own.")
+        str, typer.Option(help="Horizons N, separated by commas; default is the model's own.")
     ] = "default",
     noise_levels: Annotated[
         str, typer.Option(help="Factors on the standard deviations of the simulated disturbance "
-                               "and noise, between commas.")
+                               "and noise, separated by commas.")
     ] = "1",
     start: Annotated[
         list[str] | None, typer.Option(help="candidate or best; may be repeated.")
@@ -62,11 +63,11 @@ def compare(
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 20,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, help="Samples of each record; if left out, the model's own, and 100 "
-                     "where no model is named."),
+        typer.Option(min=1, help="Samples of each record; default is the model's own, or 100 if no "
+                                 "model is named."),
     ] = None,
     measure: Annotated[
-        Measure, typer.Option(help="What to measure; times alone run one cell after the other.")
+        Measure, typer.Option(help="What to measure; for times alone, one cell runs at a time.")
     ] = "both",
     deadline: Annotated[
         float | None, typer.Option(help="Deadline of a step in seconds; the report shows how "
@@ -79,7 +80,7 @@ def compare(
         float, typer.Option(help="Seconds after which a cell is stopped.")
     ] = 60.0,
     store: Annotated[
-        Path, typer.Option(help="File of the results; a run that was stopped resumes from it.")
+        Path, typer.Option(help="File of the results; a stopped study resumes from it.")
     ] = Path("results/compare.sqlite"),
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("results/compare"),
     jobs: Annotated[int | None, _JOBS] = None,
@@ -134,7 +135,7 @@ def study(
     retry_failed: Annotated[bool, _RETRY] = False,
     keep_failing: Annotated[Path | None, _FAILING] = None,
 ) -> None:
-    """Run the study of a file; if it is stopped, the same command resumes it."""
+    """Run the study in a file; if it is stopped, the same command resumes it."""
     target = file.with_suffix(".sqlite") if store is None else store
     _run(
         Study.from_toml(file), target,
@@ -168,12 +169,25 @@ def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
             highlight=False,
         )
     show_report(console, store, out)
+    _show_kept(console, options["keep_failing"])
     if 0 < len(failed) == len(cells):
         raise StudyError(
-            f"no cell of the study finished, {len(failed)} failed; the first because of: "
+            f"no cell of the study finished, {len(failed)} failed; the first reason: "
             f"{failed['reason'].iloc[0].rstrip('.')}. Correct that, then give the same command "
             "with --retry-failed."
         )
+
+
+def _show_kept(console: Console, folder: Path | None) -> None:
+    if folder is None:
+        return
+    count = sum(1 for _ in folder.glob("*/*.npz"))
+    console.print(
+        f"{folder} has {count} QP{'s' * (count != 1)} that a backend failed on or gave up without "
+        f"a cap. Solve them again: qpmhe solve-qp {folder} --all" if count
+        else f"{folder} has no QPs: every backend solved its QPs, or stopped at a cap.",
+        highlight=False, markup=False, soft_wrap=True,
+    )
 
 
 def _numbers(name: str, text: str) -> list[int | None]:
@@ -187,7 +201,7 @@ def _numbers(name: str, text: str) -> list[int | None]:
         except ValueError as error:
             option = name.replace("_", "-")
             raise OptionError(
-                f"--{option} has {word!r}; expected integers >= {least} between commas, or "
+                f"--{option} has {word!r}; expected integers >= {least} separated by commas, or "
                 f"{WORDS[name]!r}."
             ) from error
     return found

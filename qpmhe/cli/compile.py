@@ -23,7 +23,7 @@ def compile(  # noqa: A001 - the name of the command
         int | None, typer.Option(min=1, help="Horizon N; default is each model's own.")
     ] = None,
     initial_state: Annotated[
-        str | None, typer.Option(help="Initial estimate, numbers between commas; default is "
+        str | None, typer.Option(help="Initial estimate, numbers separated by commas; default is "
                                       "each model's own.")
     ] = None,
 ) -> None:

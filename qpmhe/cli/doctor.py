@@ -96,7 +96,7 @@ def _machine() -> Table:
     if command is None:
         wanted = os.environ.get("CC")
         add(False, "C compiler", "none (cc, gcc, clang): install one, or set CC to its path"
-            if wanted is None else f"CC is {wanted!r}, which is not there")
+            if wanted is None else f"CC is {wanted!r}, which does not exist")
     else:
         add(True, "C compiler", f"{' '.join(command)}: {_compiler_version(command)}")
         if casadi is not None:
@@ -146,7 +146,7 @@ def _code() -> tuple[bool, str, str]:
         )
     except QpmheError as error:
         return False, "its code", str(error)
-    text = f"right with {optimisation(made.path)}; a small step took {made.seconds:.2g} s"
+    text = f"correct with {optimisation(made.path)}; a small step took {made.seconds:.2g} s"
     return True, "its code", text + ("" if made.is_new else ", from the cache")
 
 

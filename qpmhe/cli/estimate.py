@@ -58,8 +58,8 @@ def estimate(
     ] = True,
     bound: Annotated[
         bool,
-        typer.Option("--bound", help="Write the proved set around the observer, which holds "
-                                     "the true state, and the bound of the estimate's error."),
+        typer.Option("--bound", help="Write the proved set around the observer that contains the "
+                                     "true state, and the bound on the estimate's error."),
     ] = False,
     bound_box: Annotated[
         str | None,
@@ -169,7 +169,7 @@ def _weighted(given: dict[str, Any]) -> dict[str, Any]:
         if not found.parameters:
             raise
         raise WeightsError(
-            f"{path} holds the parameters {', '.join(found.parameters)}, and with these "
+            f"{path} holds the parameters {', '.join(found.parameters)}, and with them "
             f"{str(error).rstrip('.')}; {remedy}"
         ) from error
     sizes = [len(each) for each in (found.prior, found.disturbance, found.noise)]
@@ -212,7 +212,7 @@ def run(
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         if out != "-":
-            console.print("interrupted; continue by --resume.", highlight=False)
+            console.print("interrupted; continue with --resume.", highlight=False)
         raise
     most_failed = 2 * summary.failed > summary.samples + summary.inserted
     is_broken = summary.model_is_wrong or most_failed

@@ -11,7 +11,7 @@ Model = Annotated[
 ]
 Horizon = Annotated[int | None, typer.Option(min=1, help="Horizon N; default is the model's.")]
 InitialState = Annotated[
-    str | None, typer.Option(help="Initial estimate, numbers between commas; default is the "
+    str | None, typer.Option(help="Initial estimate, numbers separated by commas; default is the "
                                   "model's.")
 ]
 Time = Annotated[str | None, typer.Option(help="Column of the time.")]
@@ -23,12 +23,11 @@ Step = Annotated[
     float | None, typer.Option(help="Usual step of a discrete-time model, in the model's unit "
                                     "of time.")
 ]
-TimeScale = Annotated[float, typer.Option(help="Length of the record's unit of time in the "
-                                               "model's: 0.001 for milliseconds and seconds.")]
+TimeScale = Annotated[float, typer.Option(help="The record's unit of time in the model's: 0.001 "
+                                               "for a record in ms and a model in s.")]
 Engine = Annotated[
     str | None,
-    typer.Option(help="python, compiled or auto, which takes the compiled step where qpmhe "
-                      "compile has made it."),
+    typer.Option(help="python, compiled, or auto: the compiled step if qpmhe compile has made it."),
 ]
 Truth = Annotated[
     str | None, typer.Option(help="Columns of true states: x1=COLUMN,x2=COLUMN.")
@@ -54,7 +53,7 @@ Missing = Annotated[
 ]
 Width = Annotated[
     str | None,
-    typer.Option(help="Write the figures as PDF, too, all this wide: single (84 mm), double "
+    typer.Option(help="Also write the figures as PDF, this wide: single (84 mm), double "
                       "(174 mm) or a number of inches."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]

@@ -103,9 +103,9 @@ def show_report(
 def show(console: Console, summary: DataFrame) -> None:
     """Print the answers and a table for each model and horizon, the best of a column marked.
 
-    Deadline and NEES are always shown where asked for, further columns as there is room. Of
-    more than 40 configurations, only the Pareto front, the answers, and each backend's fastest
-    near its best are shown.
+    Deadline and NEES are always shown if requested, further columns if they fit. Of more than 40
+    configurations, only the Pareto front, the answers, and each backend's fastest near its best are
+    shown.
     """
     for case in cases(summary):
         console.print()
@@ -136,14 +136,14 @@ def _table(
     best = {
         one.name: _best(rows.loc[case.whole.index], one.name, one.less) for one in columns
     }
-    drawn, caption = rows, (
-        "*: the best, of equals the fastest. front: Pareto front. Times are of the Python step."
-    )
+    drawn, caption = rows, "*: best."
+    if rows["time_median"].notna().any():
+        caption = "*: best; among equals, the fastest. front: Pareto front. Times: Python step."
     if len(rows) > _MOST_ROWS:
         drawn = rows.loc[sorted(_selection(case) | {one for one in best.values() if one >= 0})]
         caption = (
             f"{len(drawn)} of {len(rows)} configurations: the Pareto front, the best of each "
-            f"column, and of each backend the fastest near its best RMSE. {caption}"
+            f"column, and each backend's fastest near its best RMSE. {caption}"
         )
     if absent:
         left_out = [
@@ -151,7 +151,7 @@ def _table(
             + one.heading.replace("-\n", "").replace("\n", " ")
             for one in _COLUMNS if one.name in absent
         ]
-        caption += f" No room here, but in the report: {', '.join(left_out)}."
+        caption += f" Only in the report, for want of room: {', '.join(left_out)}."
     table = Table(
         box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=caption, caption_justify="left",
     )

@@ -22,7 +22,8 @@ from .values import read_width
 def reproduce(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     seeds: Annotated[
-        int, typer.Option(min=1, help="Seeds that the first table averages over, from --seed on.")
+        int, typer.Option(min=1, help="Number of seeds that the first table averages over, from "
+                                      "--seed on.")
     ] = 1,
     steps: Annotated[int, typer.Option(min=1, help="Number of measurements.")] = 150,
     backend: Annotated[str, typer.Option(help="QP backend of the first table.")] = "auto",
@@ -31,7 +32,7 @@ def reproduce(
         Literal["euler", "rk4"], typer.Option(help="Discretisation of the reactor.")
     ] = "euler",
     ipopt: Annotated[
-        bool, typer.Option("--ipopt", help="Run CasADi with Ipopt, the paper's tool, as well.")
+        bool, typer.Option("--ipopt", help="Also run CasADi with Ipopt, the paper's tool.")
     ] = False,
     width: options.Width = None,
 ) -> None:
@@ -62,7 +63,7 @@ def _paper_table(found: Reproduction) -> Table:
         f"N = {scenario.horizon}, QPs by {found.backend}",
         title_justify="left",
         caption=f"RMSE of the state, over all times and from t = {SETTLED:g} {scenario.time_unit} "
-        "on. Where it is not improved, the observer's candidate was the estimate. All runs are of "
+        "on. In steps that did not improve, the estimate is the observer's candidate. All runs use "
         "the Python step."
         + ("" if found.seeds == 1 else " RMSE: mean and 95 % confidence interval over the seeds."),
         caption_justify="left",
@@ -94,8 +95,8 @@ def _backend_table(found: Reproduction) -> Table:
     table = Table(
         title=f"Backends at i = 2, seed {found.study.seed}",
         title_justify="left",
-        caption="Cap: iterations inside each QP. J excess: mean true cost above the converged "
-        "one's, relative. Times include building the QP.",
+        caption="Cap: iterations inside each QP. J excess: relative excess of the mean true cost "
+                "over the converged one. Times include building the QP.",
         caption_justify="left",
     )
     table.add_column("backend", no_wrap=True)

@@ -36,7 +36,7 @@ _STYLES = {SolveStatus.SOLVED: "green", SolveStatus.FAILED: "red"}
 
 
 class Replay(NamedTuple):
-    """What came of one QP in one backend."""
+    """The result of one QP in one backend."""
 
     backend: str
     solution: Solution
@@ -192,8 +192,7 @@ def export_qps(
         Path, typer.Option(help="Folder of the test set.")
     ] = Path("results/qpbenchmark"),
     matrices: Annotated[
-        Matrices, typer.Option(help="Kind of matrices for solvers that take dense and sparse "
-                                    "ones.")
+        Matrices, typer.Option(help="Matrices for solvers that take both kinds.")
     ] = "sparse",
 ) -> None:
     """Write dumped QPs as a test set of qpbenchmark."""

@@ -47,8 +47,8 @@ def tune(
     ] = None,
     objective: Annotated[
         Literal["auto", "likelihood", "prediction", "truth"],
-        typer.Option(help="What to minimise after the likelihood; auto is the error where "
-                          "--truth is given."),
+        typer.Option(help="What to minimise after the likelihood; auto: the state error if --truth "
+                          "is given."),
     ] = "auto",
     truth: options.Truth = None,
     time: options.Time = None,
@@ -58,7 +58,7 @@ def tune(
     held_out: Annotated[float, typer.Option(help="Share of the blocks held out to judge the "
                                                  "result.")] = 0.25,
     horizons: Annotated[
-        str | None, typer.Option(help="Horizons to compare afterwards, between commas.")
+        str | None, typer.Option(help="Horizons to compare afterwards, separated by commas.")
     ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Starting points of the search.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the starting points.")] = 0,
@@ -71,7 +71,7 @@ def tune(
         Path | None, typer.Option(help="PNG of the weights and the held-out scores.")
     ] = None,
 ) -> None:
-    """Choose the weights of an estimator from records; if it is stopped, the same call resumes."""
+    """Choose the weights of an estimator from records; if stopped, the same command resumes."""
     from ..plots import save
     from ..records.arrays import read_record
     from ..records.record_model import load_record_model
@@ -81,7 +81,7 @@ def tune(
 
     if out.exists() and not overwrite:
         raise OptionError(
-            f"{out} exists already; give another --out, or replace it by --overwrite."
+            f"{out} exists already; give another --out, or replace it with --overwrite."
         )
     make_folder(out.parent)
     wanted, started, source = _integers("--horizons", horizons), _starts(parameter), find(model)
@@ -181,4 +181,4 @@ def _integers(option: str, text: str | None) -> list[int]:
     try:
         return [int(item) for item in text.split(",")] if text else []
     except ValueError:
-        raise OptionError(f"{option} is {text!r}; expected integers between commas.") from None
+        raise OptionError(f"{option} is {text!r}; expected integers separated by commas.") from None

@@ -10,7 +10,7 @@ from ..model.sets import Box
 
 
 def read_box(option: str, text: str, width: int | None = None, kind: str = "components") -> Box:
-    """The box of an option, of so many components where that is known."""
+    """The box of an option; `width` is its number of components, if known."""
     pairs = [item.split(":") for item in text.split(",")]
     try:
         many = len(pairs) if width is None else width
@@ -20,7 +20,7 @@ def read_box(option: str, text: str, width: int | None = None, kind: str = "comp
     except ValueError as error:
         whom = "each component" if width is None else f"each of {width} {kind}"
         raise OptionError(
-            f"{option} is {text!r}; expected low:high for {whom}, between commas, as in "
+            f"{option} is {text!r}; expected low:high for {whom}, separated by commas, as in "
             "0.1:9,-1:9."
         ) from error
     return Box(low, high)
@@ -32,11 +32,11 @@ def read_state(text: str) -> NDArray[np.float64]:
 
 
 def read_numbers(option: str, text: str) -> NDArray[np.float64]:
-    """Numbers between commas."""
+    """Comma-separated numbers."""
     try:
         return np.array([float(item) for item in text.split(",")])
     except ValueError:
-        raise OptionError(f"{option} is {text!r}; expected numbers between commas.") from None
+        raise OptionError(f"{option} is {text!r}; expected numbers separated by commas.") from None
 
 
 def read_width(text: str | None) -> str | float | None:
@@ -58,7 +58,7 @@ def with_arguments(model: str, parameters: dict[str, float]) -> str:
         return model
     if model.endswith(")"):
         raise ModelError(
-            f"model {model!r} has arguments already; give the tuned ones by --parameter only, and "
-            "the others as defaults of the function."
+            f"model {model!r} has arguments already; give the tuned ones with --parameter only, "
+            "and the others as defaults of the function."
         )
     return f"{model}({arguments_of(parameters)})"

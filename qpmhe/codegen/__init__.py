@@ -38,9 +38,9 @@ def write(
     """Write the estimator as a C99 header and source that need only libm.
 
     The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
-    factorisation (active sets where inequalities bind), the verdict by the true
-    cost, and the fallback, without allocation and with bounded loops. ``engine="compiled"``
-    compiles the same text. Gain, options and present weights and sets of the estimator become
+    factorisation (active sets where inequalities bind), the check by the true cost, and the
+    fallback, without allocation and with bounded loops. ``engine="compiled"`` compiles the same
+    text. Gain, options and present weights and sets of the estimator become
     ``<name>_default_settings``; the top of the header says how to call it. Parameters are the last
     inputs of each sample.
 
@@ -52,7 +52,7 @@ def write(
         `RobustCost`, whose losses may be your own if their methods have no branch on a value. Its
         measurements so far are not written.
     directory : str or path
-        Where; made if need be.
+        The directory; made if it does not exist.
     name : str
         Name of the files and prefix of all public names: a C identifier of at most 60 letters,
         and not the name of a system's header, such as ``math``.
@@ -68,13 +68,13 @@ def write(
     Returns
     -------
     header, source : Path
-        ``<name>.h`` and ``<name>.c``; with ``fmu``, the path of the FMU, too.
+        ``<name>.h`` and ``<name>.c``; with ``fmu``, also the path of the FMU.
 
     Raises
     ------
     OptionError, CompilationError
         If something has no C form, or an option is unknown; if CasADi has no C code for the model,
-        or an FMU is wanted and there is no C compiler.
+        or an FMU is requested and there is no C compiler.
     InvalidInputError
         If this is no estimator, or the directory cannot be written.
     """
@@ -92,8 +92,8 @@ def write(
         )
     if len(name) > _LONGEST_NAME:
         raise OptionError(
-            f"name has {len(name)} letters; expected at most {_LONGEST_NAME}, as compilers tell "
-            "no more apart."
+            f"name has {len(name)} letters; expected at most {_LONGEST_NAME}, since compilers "
+            "distinguish no more."
         )
     if name.lower() in _SYSTEM_HEADERS:
         raise OptionError(

@@ -1,4 +1,4 @@
-"""Compilation ahead of use, and the engine that ``engine="auto"`` takes, with the reason."""
+"""Compilation ahead of use, and the engine that ``engine="auto"`` selects, with the reason."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Compiled:
     is_new : bool
         Whether it was compiled now; False if it was in the cache.
     engine : str
-        ``compiled``, which ``engine="auto"`` takes from now on.
+        ``compiled``, which ``engine="auto"`` uses from now on.
     """
 
     path: Path
@@ -43,7 +43,7 @@ def compile(  # noqa: A001 - the name that users look for
     system: System | MovingHorizonEstimator, observer: Observer | None = None,
     cost: Cost | None = None, **options: Any,
 ) -> Compiled:
-    """Compile the step of an estimator, so that ``engine="auto"`` takes it from now on.
+    """Compile the step of an estimator, so that ``engine="auto"`` uses it from now on.
 
     One library serves all weights, gains, bounds, initial states and most options. Another model,
     horizon, kind of sets or of cost, or a time budget needs another. An estimator that exists
@@ -88,7 +88,7 @@ def compile(  # noqa: A001 - the name that users look for
     else:
         raise InvalidInputError(
             "the estimator has an observer, a cost and options already; leave them out, or give "
-            "its system in its place."
+            "its system instead."
         )
     from .rehearsal import checked_library  # late: most programs do without
 

@@ -1,7 +1,7 @@
 """Compiled models compared with CasADi's interpreter, before their use.
 
-A compiler's mistake changes numbers without any sign. What the interpreter itself computes from
-arguments that differ in their last digits shows how far rounding alone can go.
+A compiler's mistake changes numbers silently. The interpreter's results for arguments that differ
+in their last digits show how far rounding alone can go.
 """
 
 from __future__ import annotations

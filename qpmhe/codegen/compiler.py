@@ -1,4 +1,4 @@
-"""C source in, loaded and checked library out, with a cache on disk."""
+"""Compile C source, check and load the library, and cache it on disk."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ _checked: set[tuple[str, str]] = set()
 
 
 class WrongCodeError(CompilationError):
-    """The compiler makes wrong code of the source, however little it optimises."""
+    """The compiler makes wrong code from the source, at every level of optimisation."""
 
 
 class NotCachedError(CompilationError):
-    """The library is not in the cache, and nobody asked to wait for a compiler."""
+    """The library is not in the cache, and the caller does not wait for a compiler."""
 
 
 def find_compiler() -> list[str] | None:
@@ -88,8 +88,8 @@ def compiled_library(
     """Compile C source and load it; a library made before is loaded from the cache.
 
     With a key, which must differ where the source does, `files` may be a function that is called
-    only to compile. Compilers make mistakes. What `check` finds wrong is compiled again with less
-    optimisation, and the cache remembers the level.
+    only to compile. Compilers make mistakes: if `check` finds one, the source is compiled again
+    with less optimisation, and the cache remembers the level.
     """
     compiler = required_compiler()
     if key is None:
@@ -145,7 +145,7 @@ def shared_library(sources: list[Path], target: Path) -> None:
 def cached_library(
     main: str, key: str, check: Callable[[ctypes.CDLL], str] | None = None
 ) -> ctypes.CDLL | None:
-    """What `compiled_library` has made of the source with this key; None if it would compile."""
+    """The library that `compiled_library` made for this key; None if it would compile."""
     compiler = find_compiler()
     if compiler is None:
         return None
@@ -164,12 +164,12 @@ def cached_files(main: str) -> Iterator[Path]:
 
 
 def optimisation(library: Path) -> str:
-    """The compiler's flags that a library of the cache was found right with."""
+    """The compiler's flags with which a library of the cache was found correct."""
     return " ".join(_LEVELS[int(library.stem.rpartition("-")[2])])
 
 
 def check_any_cached(main: str) -> None:
-    """Raise where no library can be there, before anything is imported or traced."""
+    """Raise if the cache holds no such library, before anything is imported or traced."""
     required_compiler()
     if next(cached_files(main), None) is None:
         raise NotCachedError("its library is not in the cache; qpmhe.compile makes it.")
@@ -311,7 +311,7 @@ def _folders() -> tuple[Path, Path]:
 
 
 def cache_folders() -> list[Path]:
-    """Those that exist and nobody else fills: code is run from there."""
+    """The existing folders that belong to this user: code is run from there."""
     found = []
     for folder in _folders():
         try:

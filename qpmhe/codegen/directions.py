@@ -1,4 +1,4 @@
-"""What users say of disturbances w, as the C step has it of d = x(t+1) - f(x(t))."""
+"""Sets and weights of disturbances w, converted for the C step to d = x(t+1) - f(x(t))."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ SIDES = ("lower", "upper", "row_lower", "row_upper")
 
 
 class Directions:
-    """Between w (r,) and d (n,), which are the same unless disturbances have fewer directions.
+    """Conversion between w (r,) and d (n,), which are equal unless w has fewer directions.
 
     Parameters
     ----------
     system, observer, cost : System, Observer and Cost
-        Those that the user gave.
+        As the user gave them.
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ _PIECE = 256
 
 
 class Tools(NamedTuple):
-    """What a step uses; made anew where the usual conditions change."""
+    """What a step uses; made again when the usual conditions change."""
 
     usual: Conditions
     system: System
@@ -58,7 +58,7 @@ class Tools(NamedTuple):
 
 
 class CompiledEngine:
-    """The loop body in C; in all else as `PythonEngine`."""
+    """The loop body in C; otherwise as `PythonEngine`."""
 
     name = "compiled"
 
@@ -161,7 +161,7 @@ class CompiledEngine:
 
     @property
     def observer_state(self) -> Array:
-        """The state from which the observer goes on."""
+        """The state from which the observer continues."""
         state: Array = self._memory[0]["z_end"].copy()
         return state
 
@@ -171,7 +171,7 @@ class CompiledEngine:
         return int(self._memory[0]["length"])
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
-        """Let other conditions hold at all samples of the window and from now on."""
+        """Apply other conditions at all samples of the window and from now on."""
         began, memory, before = perf_counter(), self._memory.copy(), self._tools
         usual = changes.over(self.usual)
         if parameters is not None:
@@ -199,7 +199,7 @@ class CompiledEngine:
     def step(
         self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
-        """Take a sample in, and estimate."""
+        """Take in a sample, and estimate."""
         time = self._time.item()
         if time >= self._next_check:
             self._check_trace(u)
@@ -260,7 +260,7 @@ class CompiledEngine:
         return rejected.astype(np.bool_) if self._rejects else None
 
     def amend(self, time: int, y: Array) -> Estimate:
-        """Put a late measurement in its place, and estimate again."""
+        """Insert a late measurement, and estimate again."""
         began = perf_counter()
         before = self._memory.copy()
         try:
@@ -276,7 +276,7 @@ class CompiledEngine:
             raise
 
     def run(self, ys: Array, us: Array | None) -> Run:
-        """Take a whole record in without leaving C; times are means over some samples."""
+        """Process a whole record without leaving C; times are means over some samples."""
         samples = len(ys)
         log, start = self._library.log((samples,)), self.state
         observer_start = self.observer_state
@@ -370,7 +370,7 @@ class CompiledEngine:
         return self._directions.constraints_of(tools.system, tools.cost).basis
 
     def state_dict(self) -> dict[str, Any]:
-        """All that was learnt from measurements so far, as plain arrays and numbers."""
+        """All information from the measurements so far, as plain arrays and numbers."""
         memory = self._memory.view(np.uint8).copy()  # as bytes: padding is copied, too
         memory.view(self._memory.dtype)["settings"] = 0  # an address means nothing elsewhere
         return {
@@ -387,12 +387,12 @@ class CompiledEngine:
         return system.n, system.p, system.m, self._settings.horizon
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where another estimator stopped."""
+        """Continue where another estimator stopped."""
         check_problem(state, self._size())
         if str(state.get("engine")) != "compiled":
             raise InvalidInputError(
                 f"the state is of an estimator with engine={state.get('engine')!r}; expected "
-                "'compiled', as of this one: make this one with the engine of the state."
+                "'compiled', the engine of this one: make this one with the engine of the state."
             )
         with reading():
             check_description(state["estimator"], self._description())

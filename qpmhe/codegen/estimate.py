@@ -27,7 +27,7 @@ class CompiledWatch(ObserverWatch):
     """The watch on an observer, where C counts."""
 
     def warn(self, far: int, dropped: int, level: int) -> None:
-        """Warn once, at a level of the stack, if so many consecutive samples are too many."""
+        """Warn once, at a level of the stack, if too many consecutive samples are counted."""
         self.counts = far, dropped
         text = self.warning()
         if text is not None:
@@ -35,7 +35,7 @@ class CompiledWatch(ObserverWatch):
 
 
 class CompiledEstimate(Estimate):
-    """An estimate whose arrays are views of one block, made when they are asked for."""
+    """An estimate whose arrays are views of one block, made on access."""
 
     __slots__ = ("_block", "_delay", "_numbers", "_sizes", "_to_disturbances")
 
@@ -104,7 +104,7 @@ class CompiledEstimate(Estimate):
 
     @property
     def message(self) -> str:  # type: ignore[override]
-        """Words of the QP solver where it failed."""
+        """The QP solver's message where it failed."""
         return _MESSAGE if self._numbers[1] & _SOLVER_FAILED else ""
 
     @property
@@ -134,7 +134,7 @@ class CompiledEstimate(Estimate):
 
     @property
     def observer_state(self) -> Array:  # type: ignore[override]
-        """z(t+1), the state from which the observer goes on."""
+        """z(t+1), the state from which the observer continues."""
         n = self._sizes[0]
         return self._block[-2 * n : self._block.size - n]
 
@@ -146,7 +146,7 @@ class CompiledEstimate(Estimate):
 
     @property
     def solve_time(self) -> float:  # type: ignore[override]
-        """Not measured inside of the C step: NaN."""
+        """NaN: the C step does not measure it."""
         return math.nan
 
 

@@ -20,7 +20,7 @@ _DATA = frozenset(("dt",))
 
 
 def source_key(model: CasadiModel, layout: Layout | None = None) -> str | None:
-    """A key that differs where the C source of a model, or of an estimator of it, does.
+    """A key that differs if the C source of a model, or of its estimator, differs.
 
     None where a function of the model cannot be written down, such as a callback.
     """

@@ -1,4 +1,4 @@
-"""The window of a compiled estimator, taken over by the Python step."""
+"""The window of a compiled estimator, handed over to the Python step."""
 
 from __future__ import annotations
 

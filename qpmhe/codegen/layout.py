@@ -134,7 +134,7 @@ class Layout:
         return np.float64 if self.real == "double" else np.float32
 
     def header_values(self, name: str) -> dict[str, Any]:
-        """What the header's template is filled with."""
+        """Values for the header's template."""
         bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
@@ -330,7 +330,7 @@ def settings_record(
     for name, numbers in given:
         if not np.isfinite(numbers).all():
             raise OptionError(
-                f"{name.replace('_', ' ')} has entries beyond what real={layout.real!r} holds; "
+                f"{name.replace('_', ' ')} has entries beyond the range of real={layout.real!r}; "
                 "take 'double', or other units."
             )
     return record

@@ -253,8 +253,8 @@ class EstimatorLibrary:
     ``update``, ``undo``, ``set``, ``update_members``, ``amend``, ``reset``, ``run`` and
     ``recompute`` are the C functions of these names; `update` is ``mhe_update_undoable``, which
     `undo` reverses. ``path`` is the file. With ``settings.engine="auto"`` it must be in the cache:
-    `NotCachedError` is raised if it is not. ``check`` says what is wrong with a library that was
-    not checked before; `checked_library` has the usual one.
+    `NotCachedError` is raised if it is not. ``check`` reports what is wrong with a library that was
+    not checked before; `checked_library` passes the usual one.
     """
 
     def __init__(
@@ -382,5 +382,5 @@ class EstimatorLibrary:
         return memory
 
     def log(self, shape: tuple[int, ...]) -> RunLog:
-        """Where `run` is to write of so many samples."""
+        """Arrays into which `run` writes so many samples."""
         return RunLog(shape, self.layout.nx, self.layout.sensors)

@@ -65,13 +65,13 @@ class CompiledMembers:
         return int(self._memory["time"][0])
 
     def state_dict(self) -> dict[str, Any]:
-        """All that was learnt from measurements so far."""
+        """All information from the measurements so far."""
         memory = self._memory.view(np.uint8).copy()  # as bytes: padding is copied, too
         memory.view(self._memory.dtype)["settings"] = 0  # an address means nothing elsewhere
         return {"memory": memory}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where an engine of the same arguments stopped."""
+        """Continue where an engine with the same arguments stopped."""
         self._memory = state["memory"].copy().view(self._memory.dtype)
         self._memory["settings"] = self._library.settings.ctypes.data
 
@@ -99,12 +99,12 @@ class CompiledMembers:
 
     @property
     def observer_states(self) -> Array:
-        """The states (K, n) from which the observers go on."""
+        """The states (K, n) from which the observers continue."""
         states: Array = self._memory["z_end"].copy()
         return states
 
     def step(self, y: Array, u: Array) -> dict[str, Any]:
-        """Take a sample of each member in, and estimate."""
+        """Take in a sample of each member, and estimate."""
         ys, us = np.ascontiguousarray(y), np.ascontiguousarray(u)
         if self._memory["time"][0] >= self._next_check:
             self._check_trace(us)
@@ -134,7 +134,7 @@ class CompiledMembers:
         }
 
     def run(self, y: Array, u: Array) -> dict[str, Any]:
-        """Take records (K, T, p) and (K, T, m) in without leaving C."""
+        """Process records (K, T, p) and (K, T, m) without leaving C."""
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
         observers = self.observer_states
         samples, dropped = ys.shape[1], self._memory["dropped"].copy()

@@ -1,7 +1,7 @@
 """Compiled estimators compared with the Python step on CasADi's interpreter, before their use.
 
 Short records go through both. The Python step takes over the trajectories that C returns, and
-judges them: whatever C computes is compared, and none of it is stated again here.
+judges them: everything that C computes is compared, and no formula is repeated here.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from .layout import SET_NAMES, Layout
 
 
 class SampleRecord:
-    """One ``mhe_sample``, filled anew for each sample.
+    """One ``mhe_sample``, filled again for each sample.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class SampleRecord:
         self._addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
 
     def fill(self, dt: float | None, own: Conditions | None) -> None:
-        """Let the sample have this step's length and these conditions."""
+        """Set the sample's step length and conditions."""
         fields = self._fields
         fields["step"] = dt or 0.0
         for name, array in self._arrays.items():

@@ -57,8 +57,8 @@ def model_source(model: CasadiModel) -> str:
     """The model in C: CasADi's code for f, h and their Jacobians, and the discretisation."""
     if model.n > _MOST_STATES:
         raise CompilationError(
-            f"the model has {model.n} states; compiled code, which keeps (n, n) arrays on the "
-            f"stack, is for at most {_MOST_STATES}. Take engine='python'."
+            f"the model has {model.n} states; compiled code keeps (n, n) arrays on the stack and "
+            f"allows at most {_MOST_STATES}. Take engine='python'."
         )
     ca = import_casadi()
     generator = ca.CodeGenerator("mhe_model.c", {"casadi_int": "int", "include_math": False})
@@ -102,14 +102,13 @@ def model_source(model: CasadiModel) -> str:
     if "#error" in code:
         line = next(line for line in code.splitlines() if "#error" in line)
         raise CompilationError(
-            f"CasADi writes no C code for a part of the model ({line.strip()}); state it by "
-            "functions that it can, or use engine='python'."
+            f"CasADi writes no C code for a part of the model ({line.strip()}); write it with "
+            "functions that it supports, or use engine='python'."
         )
     if re.search(r"\bcasadi_newton\(", code):
         raise CompilationError(
-            "CasADi's code for a rootfinder 'fast_newton' takes an iterate that has not "
-            "converged for a root, without a word; use engine='python', which takes it for a "
-            "failure."
+            "CasADi's code for a rootfinder 'fast_newton' silently accepts an iterate that has not "
+            "converged as a root; use engine='python', which reports a failure."
         )
     return "\n".join((
         # CasADi writes out some functions that are not called, and arguments without use.

@@ -1,4 +1,4 @@
-"""Functions that a compiled estimator has traced, compared again with what they are now."""
+"""Functions that a compiled estimator traced, compared again with their present values."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class WatchedFunctions:
     def fault(self, z: Array, u: Array) -> str:
         """Which function differs from its trace, and how; blank if none does.
 
-        f and h are compared at the observer's state, the others at one of the points at which
-        they were compared at first, another one each time.
+        f and h are compared at the observer's state, the others at one of the points of the first
+        comparison, a different one each time.
         """
         fault = self.system.trace_fault(z, u)
         for name, one in self._others.items():

@@ -1,4 +1,4 @@
-"""Costs: what the prior, the disturbances and the noises weigh."""
+"""Costs of the prior, the disturbances and the noises."""
 
 from .base import Cost, CostConstants, LossForm, ObserverPrior
 from .lifted import LiftedCost, lifted

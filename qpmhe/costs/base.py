@@ -1,4 +1,4 @@
-"""What every cost offers: weights for the QP, values for the verdict."""
+"""The interface of a cost: weights for the QP, values to accept or reject a trial."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ class LossForm(NamedTuple):
     Parameters
     ----------
     kind : {"quadratic", "huber", "power", "own"}
-        Which function of the quadratic form.
+        The function of the quadratic form.
     parameter : float
         Its threshold or exponent.
     per_component : bool
-        Whether it is applied to each component and added.
+        Whether it is applied to each component and summed.
     function : callable or None
         Of a user's "own" loss: forms q (K,) to rho(q) and rho'(q), (2, K).
     graduation : float
-        By what it is widened at the first sample; see `Barron`.
+        Factor of its threshold at the first sample; see `Barron`.
     """
 
     kind: str = "quadratic"
@@ -72,7 +72,7 @@ class LossForm(NamedTuple):
 
 
 class CostForm(NamedTuple):
-    """The matrices and the factor by which the step in C computes a cost.
+    """The matrices and the discount with which the step in C computes a cost.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class CostForm(NamedTuple):
 
 
 class ObserverPrior:
-    r"""Weigh the prior z(t-N) with the inverse of the observer's own covariance at t-N.
+    r"""Weight the prior z(t-N) with the inverse of the observer's covariance at t-N.
 
     With a Kalman-type observer on a linear system, the estimator then equals the Kalman
     filter for every horizon. With D the standard deviations and C the correlations of the
@@ -102,17 +102,17 @@ class ObserverPrior:
     .. math::
         D^{-1} C^{-1} D^{-1}, \qquad P = D\, C\, D
 
-    where eigenvalues of C below 1e-12, which are rounding, count as 1e-12; those below 3e-9 as
-    3e-9 where the disturbance has fewer directions than the state, so that C may be singular.
+    where eigenvalues of C below 1e-12, which are rounding, are raised to 1e-12, or to 3e-9 if the
+    disturbance has fewer directions than the state, so that C may be singular.
 
     Parameters
     ----------
     minimum, maximum : float, optional
-        Bounds on the eigenvalues of the prior weight (inverse of squared state units), to which
-        they are clipped, so that (eq:cond0) holds with :math:`\underline c_p` and
-        :math:`\overline c_p` equal to them: a certificate needs them. Left out, nothing is
-        clipped, and the cost has no `Cost.constants`. An `OptionError` is raised unless both
-        are left out or 0 < minimum < maximum < infinity.
+        Bounds to which the eigenvalues of the prior weight (inverse of squared state units) are
+        clipped. Then (eq:cond0) holds with them as :math:`\underline c_p` and :math:`\overline
+        c_p`, which a certificate needs. If left out, nothing is clipped, and the cost has no
+        `Cost.constants`. An `OptionError` is raised unless both are left out or 0 < minimum <
+        maximum < infinity.
     """
 
     __slots__ = ("maximum", "minimum")
@@ -132,7 +132,7 @@ class ObserverPrior:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Minimum and maximum; None if they were left out."""
+        """Minimum and maximum; None if left out."""
         if self.minimum is None or self.maximum is None:
             return None
         return self.minimum, self.maximum
@@ -165,9 +165,9 @@ def _relative_inverse(covariance: Array, least: float) -> Array:
 class Cost(ABC):
     r"""A cost :math:`\gamma^K \Gamma(x_0 - \bar x) + \sum_{i<K} \gamma^{K-1-i} l(w_i, v_i)`.
 
-    Make a `QuadraticCost` or a `RobustCost`. The terms are functions of quadratic forms, so
-    that a stage is described by one joint weight of the residual (w, v), of shape
-    (n + p, n + p), and the QP by the weights that majorise the terms where it is built.
+    Create a `QuadraticCost` or a `RobustCost`. The terms are functions of quadratic forms: one
+    joint weight of the residual (w, v), of shape (n + p, n + p), describes a stage, and the QP uses
+    the weights that majorise the terms at its linearisation.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class Cost(ABC):
     p : int
         Number of outputs.
     stage_weight : (r + p, r + p) array
-        The weights of w and v as one.
+        The joint weight of w and v.
     """
 
     #: Whether the terms are the quadratic forms themselves, which makes weights constant.
@@ -226,7 +226,7 @@ class Cost(ABC):
 
     @property
     def n(self) -> int:
-        """Number of states: with an `ObserverPrior`, which has none, the dimension of w."""
+        """Number of states; with an `ObserverPrior`, which has none, the dimension of w."""
         return self.r if isinstance(self.prior, ObserverPrior) else len(self.prior)
 
     def directions(self, matrix: Array | None) -> Array | None:
@@ -244,23 +244,23 @@ class Cost(ABC):
 
     @property
     def observer_prior(self) -> ObserverPrior | None:
-        """The rule by which the observer's covariance gives the prior weight, if there is one."""
+        """The rule that takes the prior weight from the observer's covariance, if there is one."""
         return self.prior if isinstance(self.prior, ObserverPrior) else None
 
     @property
     def least_prior(self) -> Array:
-        """A weight (n, n) that the initial error's never falls below: zero if none is known."""
+        """A lower bound (n, n) on the weight of the initial error; zero if none is known."""
         if not isinstance(self.prior, ObserverPrior):
             return self.prior
         return (self.prior.minimum or 0.0) * np.eye(self.n)
 
     def graduated(self, progress: float) -> Cost:
-        """The surrogate to minimise when a share ``progress`` of the first window is full."""
+        """The surrogate cost when a share ``progress`` of the first window is full."""
         return self
 
     @property
     def c_form(self) -> CostForm | None:
-        """What the step in C needs of the cost; None for a cost that it cannot compute."""
+        """The cost's data for the step in C; None if C cannot compute it."""
         return None
 
     def prior_deviations(self, covariance: Array | None, matrix: Array | None = None) -> Array:
@@ -271,8 +271,7 @@ class Cost(ABC):
     def prior_variances(self, covariance: Array | None, matrix: Array | None = None) -> Array:
         """Variances (n,) of the initial error, as typical squares of the states.
 
-        Where the disturbance has a larger one, or an observer knows no initial error, they
-        are the disturbance's; 1 where neither has any.
+        The disturbance's variance replaces a smaller or missing one; 1 if both are missing.
 
         Parameters
         ----------
@@ -296,7 +295,7 @@ class Cost(ABC):
     @property
     @abstractmethod
     def constants(self) -> CostConstants | None:
-        """The constants of (eq:exp_bounds), or None if the cost has none."""
+        """The constants of (eq:exp_bounds); None if the cost has none."""
 
     @abstractmethod
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
@@ -345,9 +344,9 @@ class Cost(ABC):
 
     def _no_second_derivatives(self) -> InvalidInputError:
         return InvalidInputError(
-            f"{type(self).__name__} has no second derivatives; take qpmhe.QuadraticCost or "
-            "qpmhe.RobustCost, or give it the methods stage_hessian, stage_weight_gradient, "
-            "prior_hessian and prior_weight_gradient."
+            f"{type(self).__name__} has no second derivatives; use qpmhe.QuadraticCost or "
+            "qpmhe.RobustCost, or implement stage_hessian, stage_weight_gradient, prior_hessian "
+            "and prior_weight_gradient."
         )
 
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:

@@ -1,4 +1,4 @@
-"""Losses of one residual: how much a disturbance, a noise or an initial error costs."""
+"""Losses of one residual: a disturbance, a noise or an initial error."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Loss(ABC):
     weight : (d, d) array_like
         W, the inverse of a covariance, symmetric positive definite.
     per_component : bool
-        Apply the function to each component's own :math:`W_{jj} s_j^2` and add, instead of
-        to the form as a whole; needs a diagonal W.
+        Apply the function to each component's :math:`W_{jj} s_j^2` and sum, instead of to the whole
+        form; requires a diagonal W.
 
     Raises
     ------
     WeightError, ShapeError
-        If the weight is not symmetric positive definite, or not diagonal where it must be.
+        If the weight is not symmetric positive definite, or not diagonal with ``per_component``.
     """
 
     def __init__(self, weight: ArrayLike, per_component: bool = False) -> None:
@@ -147,9 +147,9 @@ class Loss(ABC):
             getattr(type(self), name) is not getattr(Loss, name) for name in ("cost", "majorise")
         ):
             raise InvalidInputError(
-                f"{type(self).__name__} computes its cost in its own way, so its second "
-                "derivatives are not known; write it as a function of the quadratic form, "
-                "with _value and _slope, or take qpmhe.Huber or qpmhe.Power."
+                f"{type(self).__name__} overrides its cost, so its second derivatives are not "
+                "known; write it as a function of the quadratic form, with _value and _slope, or "
+                "use qpmhe.Huber or qpmhe.Power."
             )
         weighted = np.matmul(weight, s[:, :, None])[:, :, 0]
         form = s * weighted if self.per_component else np.einsum("ki,ki->k", s, weighted)
@@ -203,9 +203,9 @@ class Huber(Loss):
     .. math::
         \rho = r^2 \text{ for } r \le k, \quad 2 k r - k^2 \text{ beyond}, \qquad r = |s|_W
 
-    It has **no** constants in the sense of (eq:exp_bounds): no single exponent bounds it
-    from below near zero and from above far away at once. The theorem does not apply with
-    it; the cost decrease (eq:estimator) holds all the same.
+    It has **no** constants in the sense of (eq:exp_bounds): no single exponent bounds it both near
+    zero and far away. The theorem does not apply to it; the cost decrease (eq:estimator) still
+    holds.
 
     Parameters
     ----------
@@ -247,8 +247,8 @@ class Huber(Loss):
 class Power(Loss):
     r"""The power :math:`|s|_W^a` of the weighted norm, :math:`a \ge 1`.
 
-    a = 1 is the Euclidean norm, or the L1 norm where applied per component. The constants
-    of (eq:exp_bounds) are powers of the extreme eigenvalues of W.
+    a = 1 is the Euclidean norm, or the L1 norm with ``per_component``. The constants of
+    (eq:exp_bounds) are powers of the extreme eigenvalues of W.
 
     Parameters
     ----------
@@ -259,16 +259,16 @@ class Power(Loss):
 
     Notes
     -----
-    For a < 2 the majorising form has an infinite weight where s = 0; forms smaller than
-    1e-8 are treated as that, which bounds the weight. For a > 2 the form is not above the
-    loss everywhere; the judgement by the true cost takes care of that.
+    For a < 2 the majorising form has an infinite weight at s = 0; smaller forms are raised to 1e-8,
+    which bounds the weight. For a > 2 the form is not above the loss everywhere; evaluating the
+    true cost handles this.
     """
 
     def __init__(self, weight: ArrayLike, exponent: float, per_component: bool = False) -> None:
         super().__init__(weight, per_component)
         self.exponent: float = positive("exponent", exponent)
         if self.exponent < 1.0:
-            raise OptionError(f"exponent is {exponent!r}; expected a number >= 1: convexity.")
+            raise OptionError(f"exponent is {exponent!r}; expected a number >= 1, for convexity.")
 
     @property
     def c_form(self) -> LossForm | None:
@@ -288,7 +288,7 @@ class Power(Loss):
         return np.where(q < 1e-8, 0.0, half * (half - 1.0) * np.maximum(q, 1e-8) ** (half - 2.0))
 
 class Barron(Loss):
-    r"""Barron's family of losses: the smaller the shape, the less an outlier weighs.
+    r"""Barron's family of losses: the smaller the shape, the less an outlier counts.
 
     .. math::
         \rho = \frac{2 c^2 (2 - \alpha)}{\alpha}
@@ -299,8 +299,8 @@ class Barron(Loss):
     (`Cauchy`), :math:`2 c^2 (1 - e^{-r^2 / (2 c^2)})` for :math:`-\infty` (Welsch). The shape -2
     is `GemanMcClure`, 1 a smooth form of `Huber`. All are close to :math:`r^2` for r well below c.
 
-    It has **no** constants in the sense of (eq:exp_bounds). The theorem does not apply with it; the
-    cost decrease (eq:estimator) holds all the same.
+    It has **no** constants in the sense of (eq:exp_bounds). The theorem does not apply to it; the
+    cost decrease (eq:estimator) still holds.
 
     Parameters
     ----------
@@ -312,22 +312,22 @@ class Barron(Loss):
         c, in standard deviations, > 0.
     graduation : float
         While the first window fills, the sequence of QPs minimises a surrogate: the loss with a
-        threshold that is this many times as large at the first sample and decreases to c as the
-        window fills. The estimate is the surrogate's minimiser only where its true cost, that of
-        the loss itself, is below the candidate's. 1 for none.
+        threshold that starts at this multiple of c and decreases to c. The surrogate's minimiser is
+        accepted only if its true cost, with the original loss, is below the candidate's. 1 for
+        none.
 
     Raises
     ------
     WeightError, ShapeError, OptionError
-        As for `Loss`; if shape, threshold or graduation are out of range, or graduation is not 1
-        for a shape of 1 or more.
+        As for `Loss`; if shape, threshold or graduation is out of range, or graduation is not 1 for
+        a shape of at least 1.
 
     Notes
     -----
-    For a shape below 1 the loss is not convex: its slope goes to zero far away, and the problem
-    has several minima. Which one is found depends on where the QPs start. The widened losses
-    lead from a nearly quadratic problem to it, so that the first estimate matters less; later on
-    the estimator follows its minimum from sample to sample with ``warm_start=True``.
+    For a shape below 1 the loss is not convex: its slope goes to zero far away, and the problem has
+    several minima. Which one is found depends on where the QPs start. Graduation leads there from a
+    nearly quadratic problem, so that the first estimate matters less; later the estimator follows
+    its minimum from sample to sample with ``warm_start=True``.
 
     References
     ----------
@@ -349,7 +349,7 @@ class Barron(Loss):
         if self.graduation < 1.0 or (self.graduation > 1.0 and self.shape >= 1.0):
             raise OptionError(
                 f"graduation is {graduation!r} for the shape {shape!r}; expected 1, or a larger "
-                "factor for a shape below 1: other losses are convex and need none."
+                "factor for a shape below 1; other losses are convex and need no graduation."
             )
 
     def _value(self, q: Array) -> Array:

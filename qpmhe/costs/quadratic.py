@@ -20,28 +20,28 @@ class QuadraticCost(Cost):
         \Gamma(\chi, \bar x) = |\chi - \bar x|_P^2, \qquad
         l(\omega, \nu) = |\omega|_Q^2 + |\nu|_R^2
 
-    as in (eq:costfunction) and the paper's example; P, Q, R are *weights*, that is
-    inverse covariances. Where components of y are missing, those that are there weigh the
-    inverse of their block of the covariance R^{-1}.
+    as in (eq:costfunction) and the paper's example; P, Q, R are *weights*, that is inverse
+    covariances. If components of y are missing, the weight of the others is the inverse of their
+    block of the covariance R^{-1}.
 
     Parameters
     ----------
     prior : (n, n) array_like or ObserverPrior
-        Weight P of the prior, symmetric positive definite, or the rule to take it from a
+        Weight P of the prior, symmetric positive definite, or `ObserverPrior` to take it from a
         Kalman-type observer.
     disturbance, noise : (r, r) and (p, p) array_like
         Weights Q of the disturbance w and R of the noise v, symmetric positive definite. r is n,
         or the number of columns of the system's ``disturbance_matrix``.
     discount : float
-        Factor in (0, 1] by which a stage's cost shrinks with each step of age, the prior's
-        with the window's length; 1 is the paper's cost.
+        Factor in (0, 1] of a stage's cost per step of age, and of the prior's per step of the
+        window; 1 gives the paper's cost.
 
     Raises
     ------
     WeightError, ShapeError
         If a weight is not square, symmetric and positive definite.
     OptionError
-        If the discount is outside of (0, 1].
+        If the discount is outside (0, 1].
     """
 
     quadratic = True
@@ -63,10 +63,10 @@ class QuadraticCost(Cost):
         cls, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
         discount: float = 1.0,
     ) -> QuadraticCost:
-        """The same cost, given the covariances of initial error, w and v; see `QuadraticCost`.
+        """The cost from the covariances of initial error, w and v; see `QuadraticCost`.
 
-        The covariance of w may be singular, symmetric positive semidefinite: every estimate then
-        follows the model exactly in the directions in which w has no variance.
+        The covariance of w may be singular: every estimate then follows the model exactly in the
+        directions without variance.
         """
         covariance, singular = positive_semidefinite("disturbance covariance", disturbance)
         cost = cls(
@@ -94,9 +94,9 @@ class QuadraticCost(Cost):
     def constants(self) -> CostConstants | None:
         """Constants of (eq:exp_bounds): extreme eigenvalues of the weights, a = 2.
 
-        None with a discount: the bounds then shrink with the age of a stage. None with an
-        `ObserverPrior` without bounds: its weight may be anything. None with a singular
-        covariance: no number bounds the cost of what has no variance.
+        None with a discount, since the bounds then shrink with the age of a stage; with an
+        `ObserverPrior` without bounds, since its weight is arbitrary; and with a singular
+        covariance, since the cost in directions without variance is unbounded.
         """
         if self.discount < 1.0 or self.disturbance_factor is not None:
             return None

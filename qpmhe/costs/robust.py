@@ -1,4 +1,4 @@
-"""A cost with losses of the user's choice."""
+"""A cost with selectable losses."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class RobustCost(Cost):
         \Gamma(\chi, \bar x) = \rho_p(\chi - \bar x), \qquad
         l(\omega, \nu) = \rho_w(\omega) + \rho_v(\nu)
 
-    Assumption ass:stagecosts asks for one exponent a in all three terms. `constants` is
-    None where the losses do not have that; the theorem does not apply then.
+    Assumption ass:stagecosts requires one exponent a in all three terms. Otherwise `constants` is
+    None, and the theorem does not apply.
 
     Parameters
     ----------
@@ -38,8 +38,8 @@ class RobustCost(Cost):
     Raises
     ------
     WeightError, ShapeError, OptionError
-        If a weight is not symmetric positive definite, dimensions differ, or the discount
-        is outside of (0, 1].
+        If a weight is not symmetric positive definite, dimensions differ, or the discount is
+        outside (0, 1].
     """
 
     def __init__(

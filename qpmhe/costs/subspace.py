@@ -1,4 +1,4 @@
-"""The directions in which disturbances act, where these are fewer than the states."""
+"""The directions in which disturbances act, if these are fewer than the states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rows that hold an estimate: active inequalities, noise-free directions, soft rows."""
+"""The active rows of an estimate: inequalities, noise-free directions, soft rows."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _ROUNDS = 10
 
 
 class ActiveRow(NamedTuple):
-    """An inequality that holds an estimate.
+    """An active inequality of an estimate.
 
     Attributes
     ----------
     set, row, side, time
         As in `DroppedRow`.
     multiplier : float
-        By how much J falls for each unit by which the side is moved outwards.
+        Decrease of J per unit by which the side moves outwards.
     """
 
     set: str
@@ -131,7 +131,7 @@ class HeldRows:
             np.add.at(bent, at, bend[:, None, None] * rows[:, :, None] * rows[:, None, :])
 
     def settle(self, blocks: Callable[[], Blocks], gradient: Callable[[Array], Array]) -> None:
-        """Find the multipliers, and release the rows that do not hold the estimate.
+        """Compute the multipliers, and release the rows that are not active.
 
         ``blocks`` gives a positive definite Hessian, ``gradient`` that of J with multipliers.
         """
@@ -208,7 +208,7 @@ class HeldRows:
         return value
 
     def named(self, first: int) -> tuple[tuple[ActiveRow, ...], tuple[ActiveRow, ...]]:
-        """The inequalities that hold the estimate, and those that do so weakly."""
+        """The active inequalities, and the weakly active ones."""
         every, inequalities = self._all, ~self._all["fixed"]
         return tuple(
             tuple(
@@ -275,9 +275,10 @@ def _candidates(
         other = ~functions.on_state[function]
         if other.any():
             raise InvalidInputError(
-                f"row {int(function[other][0])} of the nonlinear constraints is active, a function "
-                "of more than the state, whose second derivatives are not known; write it as a "
-                "function of x alone (qpmhe.Constraint), or as a set of disturbances or noises."
+                f"row {int(function[other][0])} of the nonlinear constraints is active and "
+                "depends on more than the state, so its second derivatives are unknown; write "
+                "it as a function of x alone (qpmhe.Constraint), or as a set of disturbances "
+                "or noises."
             )
         on_state[...] = np.einsum("rt,rtn->rn", matrix, slopes[k])
     elif rows.name == "states":

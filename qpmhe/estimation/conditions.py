@@ -1,4 +1,4 @@
-"""What a sample is taken with: weights, bounds, sensors and parameters, where they may change."""
+"""The conditions of a sample: weights, bounds, sensors and parameters, which may change."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SIDES = ("lower", "upper", "row_lower", "row_upper")
 
 
 class Conditions(NamedTuple):
-    """What holds at a sample, or usually; None where nothing else than usual does.
+    """The conditions of a sample, or the usual ones; None where nothing differs from usual.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Conditions(NamedTuple):
     sampled : (p,) bool array or None
         The components of y that were sampled; None for all. The others are not missing.
     parameters : (k,) array or None
-        The last inputs; only of usual conditions: a sample has them among its inputs.
+        The last inputs, only in the usual conditions; a sample has them among its inputs.
     """
 
     noise_weight: Array | None = None
@@ -53,17 +53,17 @@ class Conditions(NamedTuple):
         return not all(one is None for one in (self.states, self.disturbances, self.noises))
 
     def over(self, usual: Conditions) -> Conditions:
-        """These conditions, and the usual ones where these say nothing."""
+        """These conditions, with the usual ones where these are None."""
         pairs: Any = zip(self, usual, strict=True)
         return Conditions(*(b if a is None else a for a, b in pairs))
 
     def without(self, others: Conditions) -> Conditions:
-        """These conditions where the others say nothing."""
+        """These conditions, only where the others are None."""
         pairs: Any = zip(self, others, strict=True)
         return Conditions(*(a if b is None else None for a, b in pairs))
 
     def applied(self, system: System, cost: Cost) -> tuple[System, Cost]:
-        """The system with these sets and the cost with these weights, where they say something."""
+        """The system with these sets and the cost with these weights, where they are not None."""
         if self.has_bounds:
             sets = {name: getattr(self, name) for name in SET_NAMES}
             system = system.with_sets({n: one for n, one in sets.items() if one is not None})
@@ -84,7 +84,7 @@ USUAL = Conditions()
 
 
 class ConditionReader:
-    """Validates what a user gives with a sample.
+    """Validates the arguments of a sample.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class ConditionReader:
             if cost.disturbance_factor is not None:
                 raise OptionError(
                     "disturbance_weight was given, but the cost has a singular covariance of the "
-                    "disturbance, of which no weight is the inverse; give the system a "
+                    "disturbance, which no weight can replace; give the system a "
                     "disturbance_matrix in place of the singular covariance."
                 )
         cost.check_weights(noise, disturbance)
@@ -142,13 +142,13 @@ class ConditionReader:
         built = self._system.set_of(name)
         if built is None:
             raise OptionError(
-                f"bounds has {name!r}, but the system has no set of {name}; make it with "
-                f"System(..., {name}=...), as wide as it ever is, and narrow it here."
+                f"bounds has {name!r}, but the system has no set of {name}; create it with "
+                f"System(..., {name}=...), as wide as it will ever be, and narrow it here."
             )
         if not isinstance(given, ConvexSet):
             raise SetError(
-                f"bounds[{name!r}] is {shown(given)}; expected a qpmhe.Box or a qpmhe.Polytope, "
-                "also for a soft set, whose penalties stay. Leave it out for the usual bounds."
+                f"bounds[{name!r}] is {shown(given)}; expected a qpmhe.Box or a qpmhe.Polytope "
+                "(a soft set keeps its penalties). Leave it out for the usual bounds."
             )
         checked_set(f"bounds[{name!r}]", given, built.dimension)
         key = tuple(
@@ -176,13 +176,13 @@ class ConditionReader:
         if new.size:
             raise OptionError(
                 f"{what}, which bounds component {int(new[0])}; the system's set of {name} does "
-                "not. Give that component a bound in the system, as wide as it ever is, and narrow "
+                "not. Bound that component in the system, as wide as it will ever be, and narrow "
                 "it here."
             )
         if given.matrix.shape[0] and not np.array_equal(given.matrix, built.matrix):
             raise OptionError(
-                f"{what}, whose general inequalities are not those of the system's set of {name}; "
-                "only their sides may change. Take the same matrix in the same order of rows."
+                f"{what}, whose general inequalities differ from the system's set of {name}; only "
+                "their sides may change. Use the same matrix, with its rows in the same order."
             )
         if name == "disturbances" and name not in self._system.soft:
             fixed = np.zeros(built.dimension, np.bool_)
@@ -193,13 +193,14 @@ class ConditionReader:
                 j = int(np.argmax(changed))
                 raise OptionError(
                     f"{what}, which "
-                    + ("frees component" if fixed[j] else "leaves no width to component")
-                    + f" {j}; the components without a disturbance are those of the system. Make "
-                    "another estimator, or leave this component as it is."
+                    + ("frees component" if fixed[j] else "fixes component")
+                    + f" {j}; only the system can fix components of the "
+                    "disturbance. Create another "
+                    "estimator, or leave this component as it is."
                 )
 
     def sensors(self, sensors: Any) -> tuple[NDArray[np.intp], Conditions | None]:
-        """Indices of the sensors in the order given, and conditions; None if they are all."""
+        """Indices of the sensors in the given order, and conditions; None if all are sampled."""
         key: Any = None
         if type(sensors) is list:
             key = *sensors, *map(type, sensors)  # True is 1 otherwise
@@ -235,7 +236,7 @@ class ConditionReader:
         if not (whole and array.size and array.min() >= 0 and array.max() < p):
             raise InvalidInputError(
                 f"sensors is {shown(sensors)}; expected indices of outputs from 0 to {p - 1}, at "
-                "least one. For a sample without any, update(None)."
+                "least one. For a sample without measurements, call update(None)."
             )
         mask = np.zeros(p, np.bool_)
         mask[array] = True
@@ -250,13 +251,13 @@ class ConditionReader:
         """Validated values of the parameters."""
         if usual.parameters is None:
             raise InvalidInputError(
-                f"parameters is {shown(given)}, but the estimator has none; name their usual "
-                "values when it is made: MovingHorizonEstimator(..., parameters=...)."
+                f"parameters is {shown(given)}, but the estimator has none; give their usual "
+                "values at construction: MovingHorizonEstimator(..., parameters=...)."
             )
         return vector("parameters", given, usual.parameters.size)
 
     def load(self, saved: dict[str, Any], usual: Conditions) -> Conditions:
-        """The conditions that `Conditions.state_dict` described; raises anything if damaged."""
+        """The conditions from `Conditions.state_dict`; raises any exception if damaged."""
         if not isinstance(saved, dict):
             raise TypeError(f"conditions are {saved!r}")
         p, values, found = self._system.p, dict(saved), dict[str, Any]()

@@ -354,7 +354,7 @@ class Directions:
             if abs(value) > _DEPENDENT * abs(rows.lower[j]):
                 raise SetError(
                     f"the set of disturbances fixes component {rows.numbers[j]} at "
-                    f"{rows.lower[j]:.6g}, but the covariance of the disturbance says that it is "
+                    f"{rows.lower[j]:.6g}, but the covariance of the disturbance implies "
                     f"{rows.lower[j] - value:.6g}; leave it out of the set, or give it a variance."
                 )
         self.projection = _off(normal, scale)

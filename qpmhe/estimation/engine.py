@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 
 
 class Tools(NamedTuple):
-    """What a step uses; made anew where the usual conditions change."""
+    """The objects that a step uses; rebuilt if the usual conditions change."""
 
     usual: Conditions
     system: System
@@ -57,7 +57,7 @@ class Tools(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What an estimator remembers from step to step."""
+    """The memory of an estimator between steps."""
 
     tools: Tools
     window: Window
@@ -165,7 +165,7 @@ class PythonEngine:
 
     @property
     def usual(self) -> Conditions:
-        """The conditions of a sample that comes without any."""
+        """The conditions of a sample that brings none."""
         return self._tools.usual
 
     @property
@@ -180,7 +180,7 @@ class PythonEngine:
 
     @property
     def observer_state(self) -> Array:
-        """The state from which the observer goes on."""
+        """The state from which the observer continues."""
         return self._window.observer_state.copy()
 
     @property
@@ -233,7 +233,7 @@ class PythonEngine:
             warn_of(fault, 5)
 
     def leave_trace(self) -> None:
-        """Evaluate the functions as they are written, along the window and from now on."""
+        """Evaluate the original functions, along the window and from now on."""
         self._next_check = math.inf
         self._system.use_functions()
         self.set(USUAL, None)
@@ -372,7 +372,7 @@ class PythonEngine:
         self.replace(Memory(self._tools, window, None, (0, 0), [window.initial_state]))
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
-        """Let other conditions hold at all samples of the window and from now on."""
+        """Change the conditions of all samples in the window and of later ones."""
         began, before = perf_counter(), self.memory
         usual = changes.over(before.tools.usual)
         if parameters is not None:
@@ -424,7 +424,7 @@ class PythonEngine:
         trajectory: Array | None, history: list[Array],
         watched: tuple[int, int], smoothed: Array | None, trusted: Array | None,
     ) -> None:
-        """Continue where another engine stands, whose window starts at a time and state.
+        """Continue from another engine, whose window starts at a time and state.
 
         With the observer's covariance and its sensors' failures there if it has any, the samples
         since then, the last estimate's trajectory, the last states that were estimated, the
@@ -446,12 +446,12 @@ class PythonEngine:
         self.replace(Memory(tools, window, trajectory, watched, history))
 
     def run(self, ys: Array, us: Array | None) -> None:
-        """None: samples are taken one at a time only."""
+        """None: this engine only takes one sample at a time."""
 
     def covariances(self) -> Array:
         """Covariances along the last estimate."""
         if self._trajectory is None:
-            raise InvalidInputError("there is no estimate yet; update first.")
+            raise InvalidInputError("there is no estimate yet; call update first.")
         with np.errstate(all="ignore"):
             problem = self._tools.formulation.problem(self._window)
             trial = problem.evaluate(self._trajectory.copy())
@@ -466,7 +466,7 @@ class PythonEngine:
     def solved(self) -> Solved:
         """The last step's problem and its estimate."""
         if self._trajectory is None:
-            raise InvalidInputError("there is no estimate yet; update first.")
+            raise InvalidInputError("there is no estimate yet; call update first.")
         window, formulation = self._window, self._tools.formulation
         with np.errstate(all="ignore"):
             problem = formulation.problem(window)
@@ -504,9 +504,9 @@ class PythonEngine:
         check_problem(state, self._size())
         if str(state.get("engine", "python")) != "python":
             raise InvalidInputError(
-                f"the state is of an estimator with engine={state['engine']!r}, and this one "
-                "has the Python step; make it with that engine, which needs a C compiler, or "
-                "snapshot with engine='python'."
+                f"the state is from an estimator with engine={state['engine']!r}, but this "
+                "one runs the Python step; create it with that engine, which needs a C "
+                "compiler, or take the snapshot with engine='python'."
             )
         before = self._system.call_modes()
         try:

@@ -42,7 +42,7 @@ class Engine(Protocol):
 
     @property
     def observer_state(self) -> Array:
-        """The state from which the observer goes on, a copy."""
+        """The state from which the observer continues, a copy."""
 
     @property
     def time(self) -> int:
@@ -57,14 +57,14 @@ class Engine(Protocol):
 
     @property
     def usual(self) -> Conditions:
-        """The conditions of a sample that comes without any."""
+        """The conditions of a sample that brings none."""
 
     @property
     def system(self) -> System:
         """The system with its present sets."""
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
-        """Let other conditions hold at all samples of the window and from now on."""
+        """Change the conditions of all samples in the window and of later ones."""
 
     def step(
         self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
@@ -75,7 +75,7 @@ class Engine(Protocol):
         """Insert a late measurement, and estimate again."""
 
     def run(self, ys: Array, us: Array | None) -> Run | None:
-        """Take a whole record; None if the engine takes samples one at a time only."""
+        """Process a whole record; None if the engine only takes one sample at a time."""
 
     def covariances(self) -> Array:
         """Covariances along the last estimate."""
@@ -110,10 +110,10 @@ _ENGINES: dict[str, Callable[[System, Observer, Cost, Settings, Array], Engine]]
 def register_engine(
     name: str, make: Callable[[System, Observer, Cost, Settings, Array], Engine]
 ) -> None:
-    """Let ``engine=name`` use this factory, which may raise `CompilationError`.
+    """Register a factory for ``engine=name``, which may raise `CompilationError`.
 
-    One named ``compiled`` also serves ``engine="auto"``. It must raise then rather than compile,
-    and wherever it lacks a feature.
+    A factory named ``compiled`` also serves ``engine="auto"``. There it must raise instead of
+    compiling, and wherever it lacks a feature.
     """
     _ENGINES[name] = make
 
@@ -158,7 +158,7 @@ def engine_of_snapshot(
         return PythonEngine(*parts, settings, initial_state)
     if name not in _ENGINES:
         raise InvalidInputError(
-            f"the state is of an estimator with engine={name!r}; expected one of "
+            f"the state is from an estimator with engine={name!r}; expected one of "
             f"{', '.join(_ENGINES)}."
         )
     try:
@@ -167,8 +167,8 @@ def engine_of_snapshot(
         return _ENGINES[name](*parts, settings, initial_state)
     except (QpmheError, OSError) as error:
         raise InvalidInputError(
-            f"the state is of an estimator with engine={name!r}, which is not ready here: "
-            f"{str(error).rstrip('.')}. Call qpmhe.compile with this estimator before, or make it "
+            f"the state is from an estimator with engine={name!r}, which is not ready here: "
+            f"{str(error).rstrip('.')}. Call qpmhe.compile with this estimator first, or create it "
             f"with engine={name!r}."
         ) from error
 

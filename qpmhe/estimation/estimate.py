@@ -12,11 +12,10 @@ Array = NDArray[np.float64]
 
 
 class Status(enum.Flag):
-    """Outcome of a step, and everything that happened in it.
+    """Outcome and events of a step.
 
-    Either IMPROVED or CANDIDATE is always set, and any others that apply:
-    ``Status.IMPROVED in estimate.status`` asks for the outcome. `explain` says what each one
-    means and what to do about it.
+    Either IMPROVED or CANDIDATE is always set, and all other flags that apply. Test for a flag with
+    ``Status.IMPROVED in estimate.status``. `explain` gives each flag's meaning and remedy.
     """
 
     IMPROVED = enum.auto()
@@ -41,72 +40,72 @@ class Status(enum.Flag):
     ALL_REJECTED = enum.auto()
 
     def explain(self) -> str:
-        """What happened, and what can be done about it, in sentences."""
+        """What happened, and what to do about it, in sentences."""
         return " ".join(text for flag, text in _TEXTS.items() if flag in self)
 
 
 _TEXTS = {
     Status.IMPROVED: "The estimate's true cost is below the candidate's.",
     Status.CANDIDATE: "The observer's candidate is the estimate.",
-    Status.NO_QPS: "No QP was asked for; raise max_qps to improve on the observer.",
+    Status.NO_QPS: "No QP was requested; raise max_qps to improve on the observer.",
     Status.CONVERGED: "The sequence of QPs converged.",
     Status.NO_DECREASE: (
         "The last trial did not lower the true cost at any step length and was rejected; "
-        "raise max_solver_iterations or take another backend if this is frequent."
+        "raise max_solver_iterations or use another backend if this happens often."
     ),
     Status.SOLVER_FAILED: (
         "The QP solver returned no usable iterate; see the estimate's message."
     ),
     Status.SOLVER_STOPPED: (
-        "A QP was not solved to tolerance; its iterate was evaluated all the same. Raise "
-        "max_solver_iterations if the cost is too far from the converged one."
+        "A QP was not solved to tolerance; its iterate was evaluated anyway. Raise "
+        "max_solver_iterations if the cost stays too far from the converged cost."
     ),
     Status.MODEL_FAILED: (
-        "A model function raised or was not finite; bound the states, or make the model "
-        "defined on all of them."
+        "A model function raised or was not finite; bound the states, or define the "
+        "model for all states."
     ),
     Status.FAILED_STAGE: (
-        "The model failed at an earlier stage, which is still in the window: the candidate has "
-        "no finite cost, and any trajectory with a finite one is accepted."
+        "The model failed at an earlier stage that is still in the window: the candidate has "
+        "no finite cost, and any trajectory with a finite cost is accepted."
     ),
     Status.MISSING: (
-        "The measurement is missing in part or whole (not finite); its noise term was left "
-        "out and the observer predicted without it."
+        "Some or all measurement components are missing (not finite); their noise terms were "
+        "left out and the observer predicted without them."
     ),
     Status.CANDIDATE_OUTSIDE: (
         "The observer's candidate violates the sets of disturbances or noises or a hard nonlinear "
         "constraint (or the set of states, with project_observer=False)."
     ),
     Status.ROWS_DROPPED: (
-        "No trajectory was found that satisfies all sets at a cost not above the candidate's; the "
+        "No trajectory satisfying all sets was found at a cost up to the candidate's; the "
         "inequalities in estimate.dropped were left out. Widen these sets, or raise max_qps."
     ),
     Status.OBSERVER_PROJECTED: "The observer's step left the set of states; it was projected.",
     Status.PREDICTION_OUTSIDE: (
         "The model's prediction from the observer's state left the set of states, so the fitting "
-        "error does not bound the observer's correction at this sample; where this is frequent, "
-        "check that the model keeps the set."
+        "error does not bound the observer's correction at this sample; if this happens often, "
+        "check that the model stays in the set."
     ),
     Status.METRIC_SINGULAR: (
-        "The observer's covariance is singular and leaves no way into the set of states; the "
-        "observer was projected in another metric."
+        "The observer's covariance is singular, and no correction within its range reaches the set "
+        "of states; the observer was projected in another metric."
     ),
     Status.OBSERVER_FAR: (
-        "The observer has been far from the estimates for a whole horizon; take another gain or "
-        "observer, or candidate='reinitialized', which starts it anew from the estimates."
+        "The observer has been far from the estimates for a whole horizon; use another gain or "
+        "observer, or candidate='reinitialized', which restarts it from the estimates."
     ),
     Status.TIME_UP: "The time budget was spent; the best trajectory so far is the estimate.",
     Status.GRADUATED: (
-        "The first window was not full: the QPs minimised the cost with a widened loss, whose "
-        "minimiser is the estimate where its true cost is below the candidate's."
+        "The first window was not full: the QPs minimised the cost with a widened loss; the "
+        "minimiser is accepted only if its true cost is below the candidate's."
     ),
     Status.SENSORS_REJECTED: (
-        "At the newest sample the observer's gate rejected the sensors in "
-        "estimate.rejected_sensors: its covariance does not explain their innovations."
+        "The observer's gate rejected the newest sample's sensors in estimate.rejected_sensors: "
+        "the observer's covariance does not explain their innovations."
     ),
     Status.ALL_REJECTED: (
-        "These are all sensors of the sample, and the observer only predicted. Where this lasts, "
-        "the observer is lost until its gate opens again: raise the covariances of prior or "
+        "These are all sensors of the sample, so the observer only predicted. If this persists, "
+        "the observer is lost until its gate reopens: raise the covariances of prior or "
         "disturbance, or lower the gate's reopen."
     ),
 }
@@ -120,8 +119,8 @@ class DroppedRow(NamedTuple):
     set : str
         ``states``, ``disturbances``, ``noises`` or ``constraints``.
     row : int
-        The component that it bounds, or the dimension of the set plus the row of its matrix; for
-        ``constraints`` the row among those of all constraints.
+        The bounded component, or the dimension of the set plus the row of its matrix; for
+        ``constraints`` the row counted through all constraints.
     side : str
         ``lower`` or ``upper``.
     time : int
@@ -154,8 +153,8 @@ class Estimate:
         Estimate of x(t+1), the paper's estimate: a prediction one step ahead of the newest
         measurement.
     filtered : (n,) array
-        Estimate of x(t) that has used y(t). Where the candidate is the estimate, it is the
-        observer's own measurement update, and z(t) for an observer without one.
+        Estimate of x(t) that uses y(t). Where the candidate is the estimate, this is the observer's
+        measurement update, or z(t) for an observer without one.
     trajectory : (N_t + 1, n) array
         Estimates of all states in the window.
     disturbances : (N_t, r) array
@@ -164,27 +163,27 @@ class Estimate:
     noises : (N_t, p) array
         v(i) = y(i) - h(x(i)) along the trajectory; NaN where y is missing or was not sampled.
     cost, candidate_cost : float
-        True cost J of the estimate and of the observer's candidate, penalties of what is soft
-        included; cost <= candidate_cost.
+        True cost J of the estimate and of the observer's candidate, including soft penalties; cost
+        <= candidate_cost.
     candidate : (N_t + 1, n) array
         The observer's trajectory.
     observer_state : (n,) array
-        z(t+1), the state from which the observer goes on. With ``candidate="reinitialized"``
-        this observer started anew at the window's first estimate.
+        z(t+1), the state from which the observer continues. With ``candidate="reinitialized"`` this
+        observer restarted at the window's first estimate.
     delayed : (n,) array or None
         Estimate of x(t+1-k) for the estimator's delay k; None until the window reaches it.
     dropped : tuple of DroppedRow
-        The inequalities that the estimate violates because no trajectory was found that
-        satisfies all of them at a cost not above the candidate's.
+        The inequalities that the estimate violates because no trajectory satisfying all of them was
+        found at a cost up to the candidate's.
     rejected_sensors : tuple of int
         The sensors that the observer's gate rejected at the newest sample; see `qpmhe.Gate`.
     status : Status
         Outcome and events.
     message : str
-        What the model, the observer or the cost raised where it failed, and at which state;
-        the QP solver's message where that failed.
+        What a failed model, observer or cost raised, and at which state; or the message of a failed
+        QP solver.
     qps, corrections, nearest_points : int
-        QPs solved and, beside them, second-order corrections and QPs for a feasible trajectory
+        Numbers of QPs solved, of second-order corrections, and of QPs for a feasible trajectory
         near an infeasible candidate.
     solver_iterations : int or None
         Sum of the solver's own iterations; None where it reports none.
@@ -192,7 +191,7 @@ class Estimate:
         Seconds for the whole update, and for the QP solver in it; the latter is NaN with the
         compiled step, which does not measure it.
     engine : str
-        What ran the step: ``python`` or ``compiled``.
+        The engine that ran the step: ``python`` or ``compiled``.
     """
 
     __slots__ = (
@@ -246,7 +245,7 @@ class Estimate:
 
     @property
     def filtered(self) -> Array:
-        """Estimate of x(t) that has used y(t)."""
+        """Estimate of x(t) that uses y(t)."""
         value: Array = self.trajectory[-2] if self._filtered is None else self._filtered
         return value
 
@@ -271,7 +270,7 @@ class Estimate:
         return tuple(np.flatnonzero(self.rejected).tolist())
 
     def explain(self) -> str:
-        """What happened, and what can be done about it, in sentences; with any dropped rows."""
+        """What happened, and what to do about it, in sentences; with any dropped rows."""
         text = self.status.explain()
         if self.rejected_sensors:
             text += f" Rejected sensors: {', '.join(map(str, self.rejected_sensors))}."

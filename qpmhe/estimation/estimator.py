@@ -44,12 +44,12 @@ class MovingHorizonEstimator:
     r"""Suboptimal moving horizon estimation with an observer-based candidate.
 
     Each measurement advances the auxiliary observer. Its last N steps are the candidate for the
-    estimation problem (eq:optiMHE), and the state at which they begin is the prior. A
-    sequence of convex QPs then improves the candidate. An iterate is accepted only if it
-    satisfies the constraints and its true cost J is no greater than the candidate's
-    (eq:estimator); otherwise the candidate is the estimate. ``infeasible`` says what happens
-    where the candidate itself violates a set. Under the assumptions of the paper's theorem the
-    estimator is robustly exponentially stable for every horizon, solver and cap.
+    estimation problem (eq:optiMHE), and their first state is the prior. A sequence of convex QPs
+    then improves the candidate. An iterate is accepted only if it satisfies the constraints and its
+    true cost J is no greater than the candidate's (eq:estimator); otherwise the candidate is the
+    estimate. ``infeasible`` sets what happens if the candidate itself violates a set. Under the
+    assumptions of the paper's theorem the estimator is robustly exponentially stable for every
+    horizon, solver and cap.
 
     Parameters
     ----------
@@ -62,73 +62,70 @@ class MovingHorizonEstimator:
     horizon : int
         N >= 1. While there are fewer than N samples, all are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
-        Estimate of x(0), the state at the first measurement. One outside of the state set is
-        projected onto the set, with an `ObserverWarning`.
+        Estimate of x(0), the state at the first measurement. A state outside the set X is projected
+        onto it, with an `ObserverWarning`.
     backend : str or Solver
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
-        factorisation and another solver only where inequalities are active; a named backend
-        solves every QP. Or a solver made by ``qpmhe.solvers.create``, which brings its own
-        cap and tolerances. It may serve several estimators of one thread, and starts afresh
-        whenever it passes from one to another.
+        factorisation and another solver only where inequalities are active; a named backend solves
+        every QP. A solver made by ``qpmhe.solvers.create`` keeps its cap and tolerances. Several
+        estimators of one thread may share it; it starts cold whenever the estimator changes.
     max_qps : int or None
-        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence,
-        with at most 100 QPs. Where inequalities are dropped, at least one QP is solved without
-        them, beyond the cap if need be.
+        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence, with at
+        most 100 QPs. If inequalities are dropped, at least one QP is solved without them, even
+        beyond the cap.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.
     solver_tolerance : float
-        Tolerance on the QP's residuals in scaled numbers, which have no unit; see
-        `qpmhe.solvers.SolverOptions`. If left out, a solver given as ``backend`` keeps its own.
+        Tolerance on the QP's scaled, dimensionless residuals; see `qpmhe.solvers.SolverOptions`. If
+        left out, a solver given as ``backend`` keeps its own.
     tolerance : float
-        The sequence of QPs has converged when a QP that was solved to its own tolerance
-        lowers J by less than this share of J.
+        The sequence of QPs has converged when a QP solved to its tolerance lowers J by less than
+        this fraction of J.
     engine : {"auto", "python", "compiled"}
-        What runs the step. ``compiled`` generates C code for the whole step, compiles it once
-        and keeps it in a cache on disk. It refuses by name what has no C form; without a C
-        compiler it warns and runs the Python step. ``auto`` takes the compiled step where its
-        library is in the cache, see `qpmhe.compile`, and else the Python step: it never waits
-        for a compiler, never warns, and takes every option. `engine` says which one runs.
+        ``compiled`` generates C code for the whole step, compiles it once and caches it on disk. It
+        raises an error that names any feature without a C form; without a C compiler it warns and
+        falls back to the Python step. ``auto`` uses the compiled step if its library is in the
+        cache, see `qpmhe.compile`, and otherwise the Python step; it never waits for a compiler,
+        never warns, and accepts every option. The property `engine` reports the choice.
     project_observer : bool
-        Whether the observer's state is projected onto X after each step, in the observer's own
-        metric: `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its
-        linearised error. False gives the paper's plain observer, which may leave X.
+        Whether the observer's state is projected onto X after each step, in the observer's metric:
+        `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its linearised
+        error. False gives the paper's plain observer, which may leave X.
     infeasible : {"drop_rows", "keep_candidate"}
-        What to do where the candidate violates a set and no trajectory is found that satisfies
-        all sets at a cost not above the candidate's: ``drop_rows`` leaves out, in this step only,
-        those inequalities of the sets that the candidate violates; ``keep_candidate`` returns
-        the candidate.
+        What to do if the candidate violates a set and no trajectory satisfying all sets is found at
+        a cost up to the candidate's: ``drop_rows`` leaves out, in this step only, the inequalities
+        that the candidate violates; ``keep_candidate`` returns the candidate.
     warm_start : bool
-        Whether the sequence starts at the previous estimate, shifted by one step, where this has
-        a lower true J than the candidate. Either way J(estimate) <= J(candidate).
+        Whether the sequence starts at the previous estimate, shifted by one step, if its true J is
+        lower than the candidate's. Either way J(estimate) <= J(candidate).
     candidate : {"observer", "reinitialized"}
-        The paper's candidate, or the trajectory of an observer that at each sample starts
-        anew from the estimate made N samples ago: the paper's outlook, which its theorem
-        does not cover.
+        The paper's candidate, or the trajectory of an observer that restarts at each sample from
+        the estimate made N samples ago. The paper's theorem does not cover the latter, its outlook.
     time_budget : float or None
-        Seconds for one update: no QP begins later, and backends with a clock stop.
+        Seconds for one update: no QP starts later, and backends with a time limit stop.
     delay : int
         ``estimate.delayed`` is the estimate of the state this many steps before
         ``estimate.state``; at most N.
     isolated : bool
-        Whether the backend solves in a separate process, so that a crash of compiled code is
-        a failed QP and nothing more, and the time budget stops any backend. It adds some tenths
-        of a millisecond to each QP. Not for ``engine="compiled"``, which needs no backend.
+        Whether the backend solves in a separate process, so that a crash of compiled code only
+        fails the QP, and the time budget stops any backend. It adds some tenths of a millisecond to
+        each QP. Not for ``engine="compiled"``, which needs no backend.
     arrival : {"observer", "smoothed"}
-        The mean of the prior: the observer's z(t-N), or ``smoothed``, the estimate of the same
-        state in the window before, once the window moves on. That is a convenience outside of the
-        theorem: this estimate has used N - 1 of the window's measurements already, so they count
-        twice. The candidate stays the observer's trajectory, and its J then has a prior term.
-        Where a loss has no finite value there, z(t-N) serves in this step.
+        The mean of the prior: the observer's z(t-N) or, once the window moves, the previous
+        window's ``smoothed`` estimate of the same state. The theorem does not cover the latter:
+        this estimate already uses N - 1 of the window's measurements, so they count twice. The
+        candidate stays the observer's trajectory, and its J then has a prior term. If a loss is not
+        finite there, the step uses z(t-N).
     parameters : (k,) array_like, optional
-        Usual values of parameters of the model, which are the last k of the system's m inputs:
-        ``u`` then has m - k numbers. They hold until `set` changes them; `update` takes values
-        for a single sample.
+        Usual values of the model's parameters, the last k of the system's m inputs; ``u`` then has
+        m - k numbers. They hold until `set` changes them; `update` takes values for a single
+        sample.
 
     Raises
     ------
     InvalidInputError
-        If an argument does not fit; the subclass says which (see `qpmhe.errors`).
+        If an argument is invalid; the subclass says how (see `qpmhe.errors`).
 
     Examples
     --------
@@ -178,7 +175,7 @@ class MovingHorizonEstimator:
         check_cost(system, cost)
         if cost.observer_prior is not None and observer.initial_covariance() is None:
             raise InvalidInputError(
-                f"the prior weight is to come from the observer, but {type(observer).__name__} "
+                f"the prior weight comes from the observer, but {type(observer).__name__} "
                 "has no covariance; take a Kalman-type observer, such as qpmhe.ExtendedKalman, "
                 "or give a constant weight."
             )
@@ -205,8 +202,8 @@ class MovingHorizonEstimator:
             )
         except MemoryError as error:
             raise OptionError(
-                f"horizon is {self.settings.horizon}: the arrays of so many stages of "
-                f"{system.n} states do not fit into the memory ({error}); take a shorter one."
+                f"horizon is {self.settings.horizon}: the arrays of this many stages of "
+                f"{system.n} states do not fit into memory ({error}); take a shorter horizon."
             ) from error
 
     def _checked_start(self, initial_state: ArrayLike, system: System) -> Array:
@@ -214,7 +211,7 @@ class MovingHorizonEstimator:
         return check_start(system, self.observer, self.cost, state, u=self._usual_input)
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
-        """Forget all measurements and start again.
+        """Forget all measurements and restart.
 
         Parameters
         ----------
@@ -224,7 +221,7 @@ class MovingHorizonEstimator:
         Raises
         ------
         InvalidInputError
-            If the state does not fit; the estimator is left as it was.
+            If the state is invalid; the estimator stays unchanged.
         """
         before, modes = self._initial_state, self._own_system.call_modes()
         try:
@@ -248,12 +245,12 @@ class MovingHorizonEstimator:
 
     @property
     def observer_state(self) -> Array:
-        """z(t+1), the state from which the observer goes on; at first the initial state."""
+        """z(t+1), the state from which the observer continues; at first the initial state."""
         return self._engine.observer_state
 
     @property
     def engine(self) -> str:
-        """What runs the step: ``python`` or ``compiled``, also where ``engine="auto"`` chose."""
+        """The engine in use, ``python`` or ``compiled``, also with ``engine="auto"``."""
         return self._engine.name
 
     @property
@@ -263,12 +260,12 @@ class MovingHorizonEstimator:
 
     @property
     def horizon(self) -> int:
-        """N."""
+        """The horizon N."""
         return self.settings.horizon
 
     @property
     def inputs(self) -> int:
-        """Number of inputs in the ``u`` of `update`: the system's without the parameters."""
+        """Number of inputs in the ``u`` of `update`: the system's inputs without the parameters."""
         return self._inputs
 
     @property
@@ -285,7 +282,7 @@ class MovingHorizonEstimator:
 
     @property
     def hold(self) -> WindowHold | None:
-        """What held parameters in the last step, see `augment_parameters`.
+        """How the last step held parameters, see `augment_parameters`.
 
         None where nothing is held: without ``hold``, without QPs, or before the first measurement.
         """
@@ -307,31 +304,30 @@ class MovingHorizonEstimator:
     ) -> Estimate:
         """Take the measurement y(t) and the input u(t), and estimate x(t+1).
 
-        Solver failures, a model that cannot be evaluated and missing measurements do not
-        raise: the step falls back to the candidate, and the estimate's status says why. An
-        interrupted update (Ctrl+C) leaves the estimator as it was before the sample, except
-        that a QP solver that warm-starts loses its start.
+        Solver failures, a model that cannot be evaluated and missing measurements do not raise: the
+        step falls back to the candidate, and the estimate's status says why. An update interrupted
+        by Ctrl+C leaves the estimator as before the sample, but a QP solver loses its warm start.
 
         Parameters
         ----------
         y : (p,) array_like
             y(t), or a scalar if p is 1. Components count as missing if they are masked, None,
             pandas' NA or NaT, not finite, or so large that their square is not finite. With
-            ``sensors``, the components that these name.
+            ``sensors``, only these components.
         u : (m,) array_like, optional
-            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), without
-            the estimator's parameters. Required if and only if there are other inputs.
+            u(t), the input that acts from t to t+1 (and on y(t), if h depends on it), without the
+            estimator's parameters. Required if the system has such inputs; otherwise leave it out.
         dt : float, optional
-            Length of the step from t to t+1 if not the sampling time; for a system made by
+            Length of the step from t to t+1, if not the sampling time; for systems made by
             `System.from_ode`.
         noise_weight, disturbance_weight : (p, p) and (r, r) array_like, optional
             Weights of this sample's v(t) and w(t), in place of the cost's. Kalman-type observers
             take their inverses as covariances.
         bounds : dict, optional
-            Sets for this sample, by ``"states"``, ``"disturbances"`` and ``"noises"``: the
-            system's with other sides. A `Box` changes the bounds of components, a `Polytope`
-            the sides of the general inequalities, and both together both. x(t+1) has this
-            sample's bounds until the next sample comes, with its own or the usual ones.
+            Sets for this sample, by ``"states"``, ``"disturbances"`` and ``"noises"``: the system's
+            with other sides. A `Box` changes the bounds of components, a `Polytope` the sides of
+            the general inequalities, ``box & polytope`` both. x(t+1) keeps this sample's bounds
+            until the next sample brings its own or the usual ones.
         parameters : (k,) array_like, optional
             Values of the parameters at this sample, in place of the usual ones.
         sensors : int, array_like of int or (p,) array_like of bool, optional
@@ -346,12 +342,12 @@ class MovingHorizonEstimator:
         Raises
         ------
         ShapeError, WeightError, OptionError, SetError, InvalidInputError
-            If an argument does not fit; the estimator is left as it was.
+            If an argument is invalid; the estimator stays unchanged.
 
         Notes
         -----
-        Each sample keeps the weights, bounds, parameters and step length that it came with, as
-        long as it is in the window; `set` changes those of all samples.
+        Each sample keeps its weights, bounds, parameters and step length while it is in the window;
+        `set` changes them for all samples.
         """
         began = perf_counter()
         own: Conditions | None = None
@@ -390,9 +386,9 @@ class MovingHorizonEstimator:
     ) -> Estimate | None:
         """Change weights, bounds or parameters, for all samples of the window and all later ones.
 
-        The observer runs again from the start of the window, and the current state is estimated
-        again: as by an estimator that was made with these values and continues from there. What
-        single samples of the window had in their place is forgotten. `reset` keeps the changes.
+        The observer reruns from the start of the window, and the current state is estimated again,
+        as by an estimator made with these values that continues from there. Values given for single
+        samples of the window are discarded. `reset` keeps the changes.
 
         Parameters
         ----------
@@ -407,7 +403,7 @@ class MovingHorizonEstimator:
         Raises
         ------
         ShapeError, WeightError, OptionError, SetError, InvalidInputError
-            If an argument does not fit; the estimator is left as it was.
+            If an argument is invalid; the estimator stays unchanged.
         """
         usual = self._engine.usual
         changes = self._reader.read(
@@ -448,7 +444,7 @@ class MovingHorizonEstimator:
         if u is None:
             if count:
                 raise InvalidInputError(
-                    f"u is missing; the system has {count} inputs: update(y, u)."
+                    f"u is missing; the system has {count} input{'s' * (count != 1)}: update(y, u)."
                 )
         elif count == 0:
             beside = " beside its parameters" if self.system.m else ""
@@ -483,7 +479,7 @@ class MovingHorizonEstimator:
                 raise
 
     def amend(self, time: int, y: ArrayLike) -> Estimate:
-        """Insert a late measurement, run the observer again from there, and estimate.
+        """Insert a late measurement, rerun the observer from there, and estimate again.
 
         Parameters
         ----------
@@ -500,13 +496,12 @@ class MovingHorizonEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If the time is not within the window, or y does not fit; the estimator is left
-            as it was.
+            If the time is not within the window, or y is invalid; the estimator stays unchanged.
         """
         oldest, newest = self.time - self._engine.length, self.time - 1
         if newest < 0:
             raise InvalidInputError(
-                f"time is {shown(time)}, but there is no sample yet; update first."
+                f"time is {shown(time)}, but there is no sample yet; call update first."
             )
         index = integer(time)
         if index is None or not oldest <= index <= newest:
@@ -523,7 +518,7 @@ class MovingHorizonEstimator:
         *,
         covariances: bool = False,
     ) -> Run:
-        """Update with each sample of a record, starting at the present state.
+        """Update with each sample of a record, starting at the current state.
 
         Parameters
         ----------
@@ -543,7 +538,7 @@ class MovingHorizonEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If a shape is wrong; the estimator is left as it was.
+            If a shape is wrong; the estimator stays unchanged.
         """
         ys = record("measurements", measurements, self.system.p)
         flag("covariances", covariances)
@@ -580,7 +575,7 @@ class MovingHorizonEstimator:
     def run_source(
         self, measurements: Array, inputs: Array | None, steps: Array | None = None
     ) -> RunSource:
-        """The source of a run over a record, for one that is put together from single updates.
+        """The source of a run that is assembled from single updates.
 
         Parameters
         ----------
@@ -615,14 +610,14 @@ class MovingHorizonEstimator:
     def sensitivity(self) -> Sensitivity:
         """Derivatives of the last estimate with respect to weights, data and parameters.
 
-        By the implicit function theorem on the window's true cost, with its exact Hessian and
-        its active rows held; whatever engine made the step. It takes a few factorisations of a
-        banded matrix, O(N n^3), and each derivative one solve.
+        Applies the implicit function theorem to the window's true cost, with its exact Hessian and
+        fixed active rows, for any engine. This takes a few factorisations of a banded matrix, O(N
+        n^3), and one solve per derivative.
 
         Returns
         -------
         Sensitivity
-            Its `Sensitivity.adjoint` gives the derivative of any function of the trajectory by
+            Its `Sensitivity.adjoint` differentiates any function of the trajectory with respect to
             everything at once.
 
         Raises
@@ -651,16 +646,16 @@ class MovingHorizonEstimator:
         return value
 
     def state_dict(self) -> dict[str, Any]:
-        """A snapshot of the estimator's memory: arrays by name, and a text of all the rest.
+        """A snapshot of the estimator's memory: arrays by name, and one text for the rest.
 
-        ``numpy.savez(file, **state)`` writes it down, and so does
-        ``json.dumps(state, default=numpy.ndarray.tolist)``. An estimator made with the same
-        arguments continues bit for bit after `load_state_dict`, in the same process or another.
+        Save it with ``numpy.savez(file, **state)`` or ``json.dumps(state,
+        default=numpy.ndarray.tolist)``. An estimator made with the same arguments continues bit for
+        bit after `load_state_dict`, in the same process or another.
 
         Returns
         -------
         dict
-            Copies; safe to keep, to pickle, or to write down.
+            Copies, safe to keep, pickle or save.
         """
         return written(self._engine.state_dict())
 
@@ -670,20 +665,20 @@ class MovingHorizonEstimator:
         Parameters
         ----------
         state : dict
-            What `state_dict` of an estimator with the same arguments returned, or what
-            ``numpy.load`` or ``json.load`` read of it.
+            The `state_dict` of an estimator with the same arguments, also as read by ``numpy.load``
+            or ``json.load``.
 
         Raises
         ------
         InvalidInputError
-            If it is not such a state: damaged, or of an estimator with another model,
-            observer, cost, sets or candidate, or with another engine. The estimator is left as
-            it was. QP caps, backend, tolerances, ``infeasible`` and ``warm_start`` may differ.
+            If the state is damaged, or from an estimator with another model, observer, cost, sets,
+            candidate or engine. The estimator stays unchanged. QP caps, backend, tolerances,
+            ``infeasible`` and ``warm_start`` may differ.
 
         Notes
         -----
-        It computes every stored stage again and compares the results. With ``engine="auto"`` the
-        estimator goes on with the engine that the snapshot was taken with.
+        Every stored stage is recomputed and compared. With ``engine="auto"`` the estimator
+        continues with the snapshot's engine.
         """
         memory = read(state)
         pinned = memory.get("engine")
@@ -718,8 +713,8 @@ class MovingHorizonEstimator:
             except Exception as error:
                 raise InvalidInputError(
                     f"the solver {solver!r} given as backend cannot be pickled "
-                    f"({type(error).__name__}: {error}), nor can its estimator; give the name of "
-                    "a registered backend, or keep state_dict() instead."
+                    f"({type(error).__name__}: {error}), nor can its estimator; name "
+                    "a registered backend instead, or save state_dict()."
                 ) from error
         return {
             "arguments": (self.system, self.observer, self.cost),
@@ -807,7 +802,7 @@ def _inside(
     inside = nearest(state, inverse(weight)).point
     warnings.warn(
         f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the estimator "
-        f"starts at the nearest point in it, {inside.tolist()}.",
+        f"starts at the nearest point of the set, {inside.tolist()}.",
         ObserverWarning,
         stacklevel=5,
     )

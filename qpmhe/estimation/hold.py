@@ -1,4 +1,4 @@
-"""Parameters held at their last trusted values where a window does not see them."""
+"""Hold parameters at their last trusted values where a window does not excite them."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ class WindowHold:
     values : (k,) array
         Singular values s, the best seen direction first.
     shares : (k,) array
-        By how much of the full hold each parameter is held: 0 where the window sees it well, 1
-        where it does not.
+        Fraction of the full hold on each parameter: 0 where the window sees it well, 1 where it
+        does not.
     weight : (k, k) array
         H.
     """

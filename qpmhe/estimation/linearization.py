@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class Stage:
-    """Views of one stage of `StageTerms`, made once: making them takes as long as using them.
+    """Views of one stage of `StageTerms`, made once since making them takes as long as using them.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the data of each window say about its states: Gauss-Newton matrices along a run."""
+"""How well each window's data determine its states: Gauss-Newton matrices along a run."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ Array = NDArray[np.float64]
 class Observability:
     r"""Singular values of the windows' Gauss-Newton matrices, in deviations of the prior.
 
-    With the disturbances eliminated, the measurements of a window add
-    :math:`|x_0 - \hat x_0|_\Lambda^2` to the cost of its first state, and the prior
-    :math:`|x_0 - \bar x|_P^2`. In deviations of the prior, :math:`x_0 = L \xi` with
-    :math:`P^{-1} = L L^\top`, the prior's matrix is the identity and the data's is
-    :math:`L^\top \Lambda L`. Where its singular value is 1, data and prior say equally much;
-    where it is 0, the data say nothing.
+    With the disturbances eliminated, the measurements of a window add :math:`|x_0 - \hat
+    x_0|_\Lambda^2` to the cost of its first state, and the prior :math:`|x_0 - \bar x|_P^2`. In
+    deviations of the prior, :math:`x_0 = L \xi` with :math:`P^{-1} = L L^\top`, the prior's matrix
+    is the identity and the data's is :math:`L^\top \Lambda L`. At a singular value of 1, data and
+    prior inform equally; at 0, the data give no information.
 
     Attributes
     ----------
@@ -51,7 +50,7 @@ def observability(
     disturbance : (n, n) array
         Covariance of what the disturbance adds to the state at each sample.
     prior : (n, n) array
-        Covariance of the initial error, in whose deviations the values are.
+        Covariance of the initial error; the values are in its standard deviations.
     horizon : int
         N <= T.
     """
@@ -68,7 +67,7 @@ def observability(
 def window_information(
     transitions: Sequence[Array] | Array, information: Sequence[Array] | Array, disturbance: Array
 ) -> Array:
-    """What the data of windows say about their first states, (..., n, n).
+    """Information of the windows' data on their first states, (..., n, n).
 
     ``transitions`` and ``information`` are, stage by stage, those of `observability`, (..., n, n).
     """
@@ -85,7 +84,7 @@ def prior_shares(
     transitions: Array, information: Array, disturbance: Array, prior: Array, longest: int,
     most: int = 100,
 ) -> Array:
-    r"""How much the prior still matters to the newest estimate, for windows of each length.
+    r"""The prior's share in the newest estimate, for windows of each length.
 
     With G the derivative of the estimate with respect to the prior's mean, the share of state
     i is :math:`(G \Pi G^\top)_{ii} / \Sigma_{ii}`: what an error of the prior with the
@@ -98,7 +97,7 @@ def prior_shares(
     longest : int
         The largest horizon.
     most : int
-        Windows to take the median of, spread over the run.
+        Number of windows for the median, spread over the run.
 
     Returns
     -------
@@ -124,7 +123,7 @@ def prior_shares(
 
 
 def prior_units(covariance: Array) -> tuple[Array, Array]:
-    """L with L L^T the covariance, and its inverse, or what is nearest to one."""
+    """L with L L^T the covariance, and its inverse, regularised if singular."""
     units = np.sqrt(covariance.diagonal())
     units = np.where(units > 0.0, units, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.multiply.outer(units, units))

@@ -1,4 +1,4 @@
-"""The sequence of QPs, which accepts an iterate only by its true cost (eq:estimator)."""
+"""The sequence of QPs, with each iterate accepted only by its true cost (eq:estimator)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Outcome:
         The best trajectory so far, at first the candidate. Its cost is infinite as long as it
         violates a constraint of the problem being solved.
     improved : bool
-        Whether it is an estimate better than the candidate.
+        Whether the trial is a better estimate than the candidate.
     events : Status
         Why the sequence stopped, and what happened.
     followed : array or None
@@ -129,8 +129,8 @@ class Optimizer:
             The problem of the window.
         shifted : callable
             Returns the previous estimate, shifted to this window, or None. A warm start begins
-            there; and if no feasible trajectory is found near the candidate, the search for one
-            goes on there.
+            there; so does a second search for a feasible trajectory, if the search near the
+            candidate fails.
         deadline : float
             Time, by `time.perf_counter`, after which no QP begins.
         """

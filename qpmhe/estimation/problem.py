@@ -68,7 +68,7 @@ class Trial:
 
 
 class Formulation:
-    """What all problems of an estimator have in common."""
+    """The common data of all problems of an estimator."""
 
     def __init__(self, system: System, observer: Observer, cost: Cost) -> None:
         self.system, self.cost, self.quadratic = system, cost, cost.quadratic
@@ -124,7 +124,7 @@ class Problem:
     Parameters
     ----------
     formulation : Formulation
-        What the problems of all windows have in common.
+        The common data of the problems of all windows.
     window : Window
         The data, with the prior z(t-N) of (eq:prior).
 
@@ -133,7 +133,7 @@ class Problem:
     candidate : Trial
         The observer's trajectory (eq:warmstart), with its true J even if it is infeasible.
     rolled_out : Trial or None
-        What its J is taken of, where a correction is outside of the range of the disturbances.
+        The trajectory that defines its J, if a correction is outside the range of the disturbances.
     constraints : Constraints
         The rows that a trial must satisfy.
     prior, inputs, measurements : array
@@ -505,18 +505,18 @@ class Problem:
 
 
 class Solved(NamedTuple):
-    """The last step's problem and what it was solved with.
+    """The last step's problem and its conditions.
 
     Attributes
     ----------
     problem : Problem
         The problem of the window, with all of its rows.
     formulation : Formulation
-        What it was made from.
+        The formulation of the problem.
     trajectory : (K + 1, n) array
         The estimate.
     conditions : list of Conditions
-        What each sample was taken with.
+        The conditions of each sample.
     """
 
     problem: Problem

@@ -1,4 +1,4 @@
-"""The results of a whole record."""
+"""The results of a run over a whole record."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ _PER_STEP = (
 
 
 class RunSource(NamedTuple):
-    """What a run was made from, by reference.
+    """What produced a run, by reference.
 
     Parameters
     ----------
     system, observer, cost, settings : System, Observer, Cost and Settings
-        Those of the estimator, with what `MovingHorizonEstimator.set` has changed.
+        The estimator's, including changes by `MovingHorizonEstimator.set`.
     measurements : (T, p) array
         y, NaN where it is missing.
     inputs : (T, m) array or None
-        u, the parameters behind the rest; None for a system without inputs.
+        u, with the parameters last; None for a system without inputs.
     steps : (T,) array or None
-        Lengths of the steps; None where all are the usual one.
+        Step lengths; None if all are usual.
     """
 
     system: System
@@ -63,14 +63,14 @@ class Run:
     Parameters
     ----------
     states : (T + 1, n) array
-        Estimates of x(0), ..., x(T); that of x(t) is made before y(t); row 0 is the start.
+        Estimates of x(0), ..., x(T), of which x(t) does not use y(t); row 0 is the start.
     filtered : (T, n) array
-        Estimates of x(0), ..., x(T-1); that of x(t) is made with y(t).
+        Estimates of x(0), ..., x(T-1), of which x(t) uses y(t).
     costs, candidate_costs : (T,) array
         True cost J of estimate and candidate.
     times, solve_times : (T,) array
-        Seconds for each update, and for the QP solver in it. A compiled run gives means over
-        pieces of some hundred samples, and NaN for its solver.
+        Seconds for each update, and for the QP solver in it. A compiled run reports means over some
+        hundred samples, and NaN for the solver.
     qps : (T,) array
         QPs solved.
     solver_iterations : (T,) array
@@ -87,16 +87,16 @@ class Run:
     rejected_sensors : (T, s) bool array, optional
         Whether the gate of the observer rejected each of its s sensors; s is 0 without a gate.
     engine : str
-        What ran the steps: ``python``, ``compiled``, or ``compiled, then python`` where a model
-        has changed since it was compiled.
+        The engine that ran the steps: ``python``, ``compiled``, or ``compiled, then python`` if the
+        model changed after it was compiled.
 
     Attributes
     ----------
     statuses : list of Status
         Outcome and events of each step.
     source : RunSource or None
-        What it was made from, for `qpmhe.diagnose`; None for a run that was put together from
-        single estimates, or unpickled.
+        What produced the run, for `qpmhe.diagnose`; None for a run that was assembled from single
+        estimates, or unpickled.
     """
 
     source: RunSource | None = None
@@ -190,7 +190,7 @@ class Run:
         return self.flags.size
 
     def facts(self) -> dict[str, str]:
-        """What the run holds, in words: steps, outcomes, costs and times."""
+        """A summary in words: steps, outcomes, costs and times."""
         kept = int(((self.flags & Status.CANDIDATE.value) != 0).sum())
         improved = int(((self.flags & Status.IMPROVED.value) != 0).sum())
         found = {
@@ -210,14 +210,14 @@ class Run:
         return None if Run.page is None else Run.page(self)
 
     def to_frame(self) -> pandas.DataFrame:
-        """The run as a table of pandas, a row for each update.
+        """The run as a pandas table, with one row per update.
 
         Returns
         -------
         pandas.DataFrame
-            Indexed by t. ``x1``, ``x2``, ... is the estimate of x(t+1), ``filtered1``, ... that of
-            x(t), ``std1``, ... are the standard deviations of the first, where covariances were
-            requested; then ``J``, ``J_candidate``, ``status``, ``qps``, ``solver_iterations``,
+            Indexed by t. ``x1``, ``x2``, ... is the estimate of x(t+1), ``filtered1``, ... the
+            estimate of x(t), ``std1``, ... the standard deviations of the former, if covariances
+            were requested; then ``J``, ``J_candidate``, ``status``, ``qps``, ``solver_iterations``,
             ``seconds``, ``solver_seconds``.
 
         Raises
@@ -248,7 +248,7 @@ class Run:
         Parameters
         ----------
         path : str or Path
-            The file, usually in ``.npz``; one that exists is replaced.
+            The file, usually ``.npz``; an existing file is replaced.
         """
         arrays: dict[str, Any] = {
             name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)
@@ -268,7 +268,7 @@ class Run:
         Raises
         ------
         InvalidInputError
-            If it cannot be read, or is no run.
+            If the file cannot be read, or holds no run.
         """
         try:
             with np.load(path, allow_pickle=False) as file:
@@ -292,6 +292,6 @@ class Run:
         return float(has.sum()) / max(1, len(self))
 
     def reasons(self) -> dict[str, int]:
-        """Counts of each combination of flags, the most frequent first."""
+        """Counts of each combination of flags, most frequent first."""
         counts = Counter(str(status).removeprefix("Status.") for status in self.statuses)
         return dict(counts.most_common())

@@ -25,9 +25,9 @@ NAMES = (
 
 
 class Gradient:
-    r"""The derivative of a scalar function of the trajectory, by everything that it rests on.
+    r"""The derivative of a scalar function of the trajectory with respect to all data.
 
-    `Sensitivity.adjoint` makes it. A derivative with respect to a matrix is symmetric: for a
+    `Sensitivity.adjoint` returns it. A derivative with respect to a matrix is symmetric: for a
     symmetric change dW, the function changes by ``sum(gradient * dW)``. With respect to the
     covariance :math:`C = W^{-1}` it is :math:`-W\, (\cdot)\, W`.
 
@@ -42,7 +42,7 @@ class Gradient:
     parameters : (..., k) array
         By the estimator's ``parameters``, changed at all samples alike.
     prior_weight : (..., n, n) array
-        By the weight of the prior; where the observer gives it, by what it gave.
+        By the weight of the prior, also where the observer gives it.
     disturbance_weight, noise_weight : (..., r, r) and (..., p, p) array
         By the cost's weights. Samples that came with other weights do not count. Where
         the covariance of w is singular, by the weight (s, s) of its factor, see `Cost`.
@@ -238,29 +238,28 @@ class Sensitivity:
     with the exact Hessian, second derivatives of the model and of the losses included. The
     matrix is banded: it is factored once, in O(N n^3), and each derivative is one solve.
 
-    The prior's mean and weight are data here: what the observer makes of the weights before the
-    window begins is not included. Attributes named as those of `Gradient` are the derivatives of
-    the whole trajectory, (N_t + 1, n, ...) with the shapes there behind; they take a solve for
-    each state, `adjoint` takes one and `along` one for each direction.
+    The prior's mean and weight are data here: their dependence on the weights, through the observer
+    before the window, is not included. The attributes of `Gradient` are also available here, as
+    derivatives of the whole trajectory, (N_t + 1, n, ...) with their shapes behind. They take one
+    solve per state; `adjoint` takes one, and `along` one per direction.
 
     Attributes
     ----------
     trajectory : (N_t + 1, n) array
         The estimate that was differentiated.
     converged : bool
-        Whether it is a minimiser: a Newton step would lower J by less than a thousand times the
-        estimator's ``tolerance``, and the second-order condition holds.
+        Whether the estimate is a minimiser: a Newton step would lower J by less than a thousand
+        times the estimator's ``tolerance``, and the second-order condition holds.
     step : (N_t + 1, n) array
         The Newton step from the trajectory to the minimiser, in the states' units.
     active : tuple of ActiveRow
-        The rows that hold the estimate, with their multipliers. Noise-free directions are not
-        named.
+        The active rows, with their multipliers. Noise-free directions are not listed.
     weakly_active : tuple of ActiveRow
         Rows at which the derivative jumps: at their side, with a multiplier near zero.
     exact : bool
         Whether the model's second derivatives are exact, and not differences of its Jacobians.
     warning : str
-        Why the derivatives should be read with care; blank if nothing is to be said.
+        Why the derivatives need care; blank if they do not.
     """
 
     def __init__(
@@ -309,13 +308,13 @@ class Sensitivity:
         if not small:
             said.append(
                 f"The estimate has not converged: a Newton step would lower J = {cost:.6g} by "
-                f"{decrease:.3g}. The derivatives are those of a minimiser only up to first order "
-                "in `step`; take max_qps=None, or a smaller tolerance."
+                f"{decrease:.3g}. The derivatives match the minimiser's only "
+                "to first order in `step`; take max_qps=None, or a smaller tolerance."
             )
         if not self._matrix.definite:
             said.append(
-                "The Hessian of J is not positive definite on the active rows: the estimate is no "
-                "strict minimiser, and the derivatives need not exist."
+                "The Hessian of J is not positive definite on the active rows: the estimate is not "
+                "a strict minimiser, and the derivatives may not exist."
             )
         if self.weakly_active:
             said.append(
@@ -330,8 +329,8 @@ class Sensitivity:
         Parameters
         ----------
         cotangent : (..., N_t + 1, n) or (n,) array_like
-            The function's gradient: by the whole trajectory, or by the newest state alone.
-            Leading dimensions are several functions at once.
+            The function's gradient: by the whole trajectory, or by the newest state alone. Leading
+            dimensions stand for several functions at once.
 
         Returns
         -------
@@ -360,14 +359,14 @@ class Sensitivity:
     def along(self, **changes: ArrayLike) -> Array:
         """The derivative of the trajectory along a change; one solve for each.
 
-        A parametrisation of the weights, for instance, has one change for each of its parameters:
-        ``along(noise_weight=dR)`` with the derivative dR (k, p, p) of the weight by k parameters.
+        For a weight that depends on k parameters, for instance, pass its derivatives dR (k, p, p):
+        ``along(noise_weight=dR)``.
 
         Parameters
         ----------
         **changes : array_like
-            Changes by the names and shapes of `Gradient`, with the same leading dimensions;
-            those of matrices are symmetric. Several names are changed together.
+            Changes by the names and shapes of `Gradient`, with the same leading dimensions; changes
+            of matrices are symmetric. Several names change together.
 
         Returns
         -------

@@ -22,7 +22,7 @@ _SOLVER_TOLERANCE = 1e-7
 
 @dataclass(frozen=True)
 class Settings:
-    """Options of `MovingHorizonEstimator`, where each is explained."""
+    """Options of `MovingHorizonEstimator`, which documents each."""
 
     horizon: int
     backend: str | Solver = "auto"
@@ -93,7 +93,7 @@ class Settings:
             )
         if self.isolated:
             raise OptionError(
-                f"isolated is True, but backend is {solver!r}, which is made already; make it by "
+                f"isolated is True, but backend is {solver!r}, an existing solver; make it with "
                 "qpmhe.solvers.create(name, options, isolated=True)."
             )
         tolerance = float(self.solver_tolerance)
@@ -115,7 +115,7 @@ class Settings:
             raise OptionError(
                 f"time_budget is {self.time_budget!r}, but the solver given as backend has "
                 f"time_limit={options.time_limit!r}; leave one of them out: with a budget, each "
-                "QP gets what remains of it."
+                "QP gets the time that remains."
             )
 
     @property

@@ -1,4 +1,4 @@
-"""Snapshots: how they are written down, and whether they fit the estimator that reads them."""
+"""Snapshots: writing them, and checking that they fit the estimator that reads them."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ def written(memory: dict[str, Any]) -> dict[str, Any]:
 
 
 def read(state: Any) -> dict[str, Any]:
-    """The memory that `written` wrote down; arrays may have become lists."""
+    """The memory that `written` saved; arrays may have become lists."""
     if not isinstance(state, Mapping):
         raise InvalidInputError(
-            f"the state is a {type(state).__name__}; expected the dict that state_dict gave."
+            f"the state is a {type(state).__name__}; expected the dict that state_dict returned."
         )
     given = dict(state)
     if _STRUCTURE not in given:
         names = ", ".join(map(repr, list(given)[:10]))
         raise InvalidInputError(
             f"the state has no {_STRUCTURE!r} ({f'only {names}' if names else 'it is empty'}); "
-            "expected the whole dict that state_dict gave."
+            "expected the whole dict that state_dict returned."
         )
 
     def with_arrays(value: Any) -> Any:
@@ -73,7 +73,7 @@ def read(state: Any) -> dict[str, Any]:
         name = value["array"]
         if name not in given:
             raise _MisfitError(
-                f"the state has no {name!r}; expected the whole dict that state_dict gave."
+                f"the state has no {name!r}; expected the whole dict that state_dict returned."
             )
         array = given[name]
         if isinstance(array, list):
@@ -195,10 +195,10 @@ class _MisfitError(InvalidInputError):
 
 
 def mismatch(what: str) -> InvalidInputError:
-    """The error to raise where the estimators differ in ``what``."""
+    """The error for estimators that differ in ``what``."""
     return _MisfitError(
-        f"the state is of an estimator with another {what} (or it is damaged); make this one "
-        "with the arguments of the one that it was taken from."
+        f"the state is from an estimator with another {what}, or damaged; create this estimator "
+        "with the arguments of that one."
     )
 
 
@@ -212,7 +212,7 @@ def reading() -> Iterator[None]:
     except Exception as error:
         raise InvalidInputError(
             f"the state is damaged ({type(error).__name__}: {error}); expected what "
-            "state_dict gave, unchanged."
+            "state_dict returned, unchanged."
         ) from error
 
 

@@ -27,7 +27,7 @@ View = TypeVar("View")
 
 
 class Mark(NamedTuple):
-    """A point to which a window can be rolled back: what a sample changes."""
+    """A point to which a window can be rolled back: the data that a sample changes."""
 
     start: int
     end: int
@@ -48,14 +48,14 @@ def read_only(array: Array) -> Array:
 
 
 class Stages:
-    """Samples and what was computed on them, stage by stage.
+    """Samples and the data computed from them, stage by stage.
 
     The arrays are longer than the window, which slides along them; at the end its stages
     move back to the front. Thus every window is a plain slice. Row k of an array belongs to
     stage k, or to the state before it; the window consists of the stages ``start`` to ``end - 1``.
 
-    A stage is *special* if its weight is not the usual one, *irregular* if its step length is
-    not, and *unusual* if either holds. What it was taken with is kept by its time.
+    A stage is *special* if its weight is not the usual one, *irregular* if its step length is not,
+    and *unusual* if either holds. Its conditions are stored by its time.
     """
 
     def __init__(

@@ -177,7 +177,7 @@ class Subproblem:
         return self._softened.lowered(qp, solution)
 
     def start(self) -> None:
-        """Say that a new sequence of QPs begins: nothing is known of its multipliers."""
+        """Start a new sequence of QPs, with unknown multipliers."""
         self._forces = None
 
     def note(self, qp: QP, solution: Solution) -> None:
@@ -202,7 +202,7 @@ class Subproblem:
         return max(decrease, 0.0)
 
     def forget(self) -> None:
-        """Build the QP anew at its next use: an interrupt may have left it half written."""
+        """Rebuild the QP at its next use, since an interrupt may have left it half written."""
         self._qp = None
 
     def _assemble(self, problem: Problem, trial: Trial, span: Span, at_prior: bool) -> QP:

@@ -53,10 +53,10 @@ class ObserverWatch:
             return (
                 f"inequalities were dropped in {dropped} consecutive samples, because the "
                 "observer's candidate violates them and no better trajectory satisfies them all; "
-                "see estimate.dropped. Widen these sets, raise max_qps, or take another observer."
+                "see estimate.dropped. Widen these sets, raise max_qps, or use another observer."
             )
         return (
             f"the observer was far from the estimates in {far} consecutive samples (more than "
-            f"{FAR:g} standard deviations of the prior); take another gain or observer, or "
+            f"{FAR:g} standard deviations of the prior); use another gain or observer, or "
             "candidate='reinitialized'."
         )

@@ -133,7 +133,7 @@ class Window(Stages):
 
     @property
     def conditions(self) -> list[Conditions]:
-        """What each stage was taken with."""
+        """The conditions of each stage."""
         return [self._own.get(t, USUAL) for t in range(self.time - self.length, self.time)]
 
     def moves_state(self, own: Conditions | None) -> bool:
@@ -219,7 +219,7 @@ class Window(Stages):
     def take_over(
         self, other: Window, changes: Conditions, parameters: Array | None
     ) -> None:
-        """Take the samples of another window, without what changes, and run through them anew."""
+        """Take the samples of another window, with these changes, and process them again."""
         length, m = other.length, self._m
         mine, kept = self._arrays(), other._copies()
         for name in ("y", "u", "irregular", "observed"):

@@ -1,4 +1,4 @@
-"""Inputs of a model that become states: what unknown parameters and noisy inputs have in common."""
+"""Inputs of a model that become states, for unknown parameters and noisy inputs."""
 
 from __future__ import annotations
 
@@ -91,8 +91,9 @@ def augmented(system: System, change: Augmentation, **options: Unpack[SystemOpti
     """The augmented system, made by the adapter that made the system, with exact derivatives."""
     if system.extensions:
         raise InvalidInputError(
-            f"the system has {' and '.join(system.extensions)}, which an augmented model does not "
-            "take over; leave them out, or write the augmented model as functions of a System."
+            f"the system has {' and '.join(system.extensions)}, which "
+            "an augmented model does not inherit; leave them out, or write the augmented model as "
+            "a System with its own functions."
         )
     if system.make_augmented is not None:
         found = system.make_augmented(change, options)
@@ -134,7 +135,8 @@ def chosen(name: str, given: ArrayLike | None, size: int, kind: str) -> Index:
         )
     if np.unique(found).size < found.size:
         raise InvalidInputError(
-            f"{name} is {found.tolist()}, which names one {kind} twice; expected different indices."
+            f"{name} is {found.tolist()}, which names one "
+            f"{kind} twice; expected distinct indices."
         )
     return found.astype(np.intp)
 
@@ -176,8 +178,8 @@ def extended_matrix(system: System, k: int) -> Array | None:
 def _hard(one: ConvexSet | SoftSet | None) -> ConvexSet | None:
     if isinstance(one, SoftSet):
         raise SetError(
-            f"the set {one!r} is soft; an augmented model takes hard ones only: leave it out, or "
-            "write the augmented model as functions of a System."
+            f"the set {one!r} is soft; an augmented model takes only hard sets: leave it out, or "
+            "write the augmented model as a System with its own functions."
         )
     return one
 

@@ -39,32 +39,32 @@ _MOST_LABELS = 62
 class Constraint:
     r"""Nonlinear inequalities :math:`g(x, u, w, v) \le 0` at every sample, hard or soft.
 
-    Without penalties they are hard: the estimator treats them as it does the sets W and V.
-    With penalties the cost J has in addition, for each row j of g and each sample,
+    Without penalties they are hard: the estimator treats them like the sets W and V. With penalties
+    they are soft: for each row j of g and each sample, the cost J gains
 
     .. math::
         \rho_j s + \sigma_j s^2, \qquad s = \max(0, g_j(x, u, w, v))
 
-    discounted as the cost of the sample's stage is.
+    with the discount of the sample's stage.
 
     Parameters
     ----------
     g : callable
-        A function of any of x (n,), u (m,), w (r,) and v (p,), named so, that returns ``size``
-        numbers, or a number if ``size`` is 1. One of x alone holds for the newest state x(t+1),
-        too; any other one for the samples of the window.
+        A function of any of x (n,), u (m,), w (r,) and v (p,), with these parameter names, that
+        returns ``size`` numbers, or a number if ``size`` is 1. A function of x alone also holds for
+        the newest state x(t+1); any other holds for the samples of the window.
     size : int
         Number of rows.
     linear, quadratic : float or (size,) array_like, optional
-        The penalties :math:`\rho`, in units of cost per unit of the row, and :math:`\sigma`, per
-        its square; at least 0, and one of them above 0 for each row.
+        The penalties :math:`\rho`, in cost per unit of the row, and :math:`\sigma`, in cost per
+        unit squared; at least 0, and one of them above 0 for each row.
 
     Raises
     ------
     ModelError
-        If g is no function, or has other parameters.
+        If g is not a function, or has other parameters.
     ShapeError
-        If the size is no positive integer.
+        If the size is not a positive integer.
     SetError
         If a penalty is not a finite number >= 0, or a row of a soft constraint has none.
 
@@ -81,7 +81,7 @@ class Constraint:
     ) -> None:
         if not callable(g):
             raise ModelError(
-                f"g is {shown(g)}; expected a function of x, u, w or v that is to be <= 0."
+                f"g is {shown(g)}; expected a function of x, u, w or v, for g <= 0."
             )
         rows = integer(size)
         if rows is None or rows < 1:

@@ -37,18 +37,18 @@ _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 class Jacobian:
     """The Jacobian with respect to x of a `BatchedFunction` with vector values.
 
-    Steps are shares of the states' magnitudes, which are 1 until `use_scales` says better; a
-    given Jacobian is compared with differences only from then on.
+    Steps are fractions of the states' magnitudes, which are 1 until `use_scales` sets them; a given
+    Jacobian is compared with differences only from then on.
 
     Attributes
     ----------
     method : str
         ``given``, ``complex step`` or ``finite differences``.
     remedy : str
-        What to do about a given Jacobian that is wrong.
+        Remedy for a wrong given Jacobian.
     """
 
-    remedy = "Correct it, or leave it out to have it computed."
+    remedy = "Correct it, or leave it out to compute it automatically."
 
     def __init__(
         self,
@@ -246,7 +246,7 @@ class Jacobian:
         return usable
 
     def check(self, x: Array, u: Array) -> None:
-        """Try the method again at a state that will be used, and find the steps there."""
+        """Test the method at a state that will be used, and find the steps there."""
         if self._given is not None:
             if self._scales is not None and self.method != "traced":
                 self._compare([(x, u)])

@@ -86,7 +86,7 @@ class Evaluator:
 
 
 def may_fail(function: Any) -> bool:
-    """Whether an evaluation can break off: one of scalar operations alone cannot."""
+    """Whether an evaluation can fail; purely scalar operations cannot."""
     call = import_casadi().OP_CALL
     return not function.is_a("SXFunction") or any(
         function.instruction_id(k) == call for k in range(function.n_instructions())

@@ -98,7 +98,7 @@ def casadi_model(
         if known or m is None or isinstance(h, ca.Function):
             m = _agreed("m", m, known[0].numel_in(1) if known else 0)
     elif n is None:
-        raise InvalidInputError("n is missing: f is no casadi.Function, which would state it.")
+        raise InvalidInputError("n is missing, and f is no casadi.Function, which would define it.")
     n, m = dimension("n", n, 1), dimension("m", 0 if m is None else m, 0)
     made_f = _canonical(ca, "f", f, n, m)
     made_h = _canonical(ca, "h", h, n, m)
@@ -123,7 +123,7 @@ def _check_arguments(name: str, function: Any) -> None:
 
 def _agreed(name: str, stated: int | None, found: int) -> int:
     if stated is not None and stated != found:
-        raise ModelError(f"{name} is {found}, as the function has it; expected {stated}.")
+        raise ModelError(f"{name} is {found}, according to the function; expected {stated}.")
     return int(found)
 
 

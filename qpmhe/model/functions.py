@@ -24,12 +24,12 @@ Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 class EvaluationError(QpmheError):
     """A model function ended the program, or returned no value, at some state.
 
-    It never leaves an estimator: the step falls back.
+    It never escapes from an estimator: the step falls back.
     """
 
 
 class Trusted(NamedTuple):
-    """A function of this package that takes (..., n) as well as (n,) and writes into nothing."""
+    """A function of this package that takes (..., n) as well as (n,) and modifies no argument."""
 
     function: Callable[..., Any]
 
@@ -53,7 +53,7 @@ class Parametric(NamedTuple):
 
 
 def contained(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Foreign code that may raise an Exception or be interrupted, and nothing else."""
+    """Contain foreign code: it can only raise an Exception or be interrupted."""
 
     def call(*arguments: Any) -> Any:
         try:
@@ -314,7 +314,7 @@ class BatchedFunction:
 
     @property
     def plain(self) -> bool:
-        """Whether the user's function can be called as it is, on (..., n) and all inputs."""
+        """Whether the user's function can be called directly, on (..., n) and all inputs."""
         takes_all = self.takes_input or self._inputs == 0
         return self.mode == "batched" and takes_all and self._returns_array and not self._short
 
@@ -328,7 +328,7 @@ class BatchedFunction:
         except Exception as error:
             raise ModelError(
                 f"{self.name} raised {type(error).__name__}: {error} at the initial state "
-                f"{x.tolist()}; it must be defined where the estimation starts."
+                f"{x.tolist()}; it must be defined there."
             ) from error
         if value.shape != self.shape:
             raise ModelError(
@@ -338,7 +338,7 @@ class BatchedFunction:
         if not np.isfinite(value).all():
             raise ModelError(
                 f"{self.name} is {value.tolist()} at the initial state {x.tolist()}; "
-                "expected finite numbers. Start elsewhere or bound the states."
+                "expected finite numbers. Change the initial state or bound the states."
             )
 
 
@@ -363,9 +363,8 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
     for q in parameters:
         if q.kind is q.KEYWORD_ONLY and (q.default is q.empty or (q.name == "u" and inputs > 0)):
             raise ModelError(
-                f"{name} takes {q.name} by keyword only, but is called as {name}(x) or "
-                f"{name}(x, u); make it the second positional parameter, or bind it with "
-                "functools.partial."
+                f"{name} takes {q.name} by keyword only, but is called as {name}(x) or {name}(x, "
+                "u); make it the second positional parameter, or bind it with functools.partial."
             )
     required = sum(q.default is q.empty for q in positional)
     if required > 1 + (inputs > 0):
@@ -396,7 +395,7 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
 
 
 def check_inputs(m: int, **takes_input: bool) -> None:
-    """Refuse inputs that no function of the model takes."""
+    """Reject inputs that no function of the model takes."""
     if m and not any(takes_input.values()):
         names = list(takes_input)
         raise ModelError(

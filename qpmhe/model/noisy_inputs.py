@@ -18,24 +18,24 @@ Array = NDArray[Any]
 
 
 def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
-    r"""The system whose state is the model's state together with the errors of its inputs.
+    r"""Extend the state of a system by the errors of its measured inputs.
 
-    The inputs u are measured, and what acts is :math:`u + e` with an error e that is white: its
-    values at different times have nothing to do with each other.
+    The inputs u are measured, but :math:`u + e` acts on the system, with a white error e: its
+    values at different times are independent.
 
     .. math::
         x(t+1) = f(x(t), u(t) + e(t)) + w(t), \qquad e(t+1) = w_e(t), \qquad
         y(t) = h(x(t), u(t) + e(t)) + v(t)
 
-    The state is (x, e), the disturbance (w, w_e), and nothing is approximated: with the
-    covariance :math:`Q_u` of the errors, extend the covariances of the prior and of the disturbance
-    by it, ``scipy.linalg.block_diag(P, Qu)`` and ``block_diag(Q, Qu)``, the gain of an observer by
-    rows of zeros, and the initial state by zeros. On a linear system
-    :math:`x^+ = A x + B u + w` this is the process noise covariance :math:`Q + B Q_u B^\top`.
+    The state is (x, e) and the disturbance (w, w_e); nothing is approximated. With the covariance
+    :math:`Q_u` of the errors, extend the covariances of prior and disturbance to
+    ``scipy.linalg.block_diag(P, Qu)`` and ``block_diag(Q, Qu)``, the gain of an observer by rows of
+    zeros, and the initial state by zeros. On a linear system :math:`x^+ = A x + B u + w` this is
+    the process noise covariance :math:`Q + B Q_u B^\top`.
 
-    This is a convenience outside of the paper. Its theorem speaks of the system that is returned
-    only where that meets its assumptions, and its bounds count e among the errors; none of the
-    constants of the original system carry over.
+    This is a convenience outside the paper. Its theorem covers the returned system only if that
+    meets the assumptions, and its bounds then include the error of e; no constants of the original
+    system carry over.
 
     Parameters
     ----------
@@ -47,14 +47,13 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
     Returns
     -------
     System
-        With a state behind x for each of these inputs, in their order, and the same inputs. It
-        takes steps of other lengths and pickles where the given one does. There is no C form
-        of it.
+        The same inputs, and one more state behind x for each chosen input, in order. It takes steps
+        of other lengths and pickles if the given system does. It has no C form.
 
     Raises
     ------
     ModelError
-        If it is not a `System`.
+        If ``system`` is not a `System`.
     InvalidInputError, ShapeError
         If the system has no inputs, or ``inputs`` does not name any.
 
@@ -67,7 +66,7 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
     """
     n, m = checked_system(system).n, system.m
     if m == 0:
-        raise InvalidInputError("system has no inputs, so none of them is measured.")
+        raise InvalidInputError("system has no inputs; expected at least one.")
     noisy = chosen("inputs", inputs, m, "input")
     if noisy.size == 0:
         raise InvalidInputError("inputs is empty; expected at least one input, or leave it out.")

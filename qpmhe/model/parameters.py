@@ -42,46 +42,46 @@ def augment_parameters(
     parameter_bounds: ConvexSet | None = None,
     hold: ArrayLike | Mapping[int, float] | None = None,
 ) -> System:
-    r"""The system whose state is the model's state together with its unknown constants.
+    r"""Extend the state of a model by its unknown constants.
 
     .. math::
         x(t+1) = f(x(t), u(t), \theta) + w(t), \qquad \theta(t+1) = \theta(t), \qquad
         y(t) = h(x(t), u(t), \theta) + v(t)
 
-    Its state is :math:`(x, \theta_e)` with the estimated parameters behind, in the order in
-    which they were named. Unless they drift, their disturbance is {0}: they are constant along
-    every estimated trajectory, to the last bit. So an observer fits that does not correct them,
-    with zeros in their rows of the gain; where another one is used, its candidate is outside of W,
-    and the estimator looks for a trajectory with constant parameters that costs no more.
+    The state is :math:`(x, \theta_e)`, with the estimated parameters last, in the order of
+    ``estimated``. Unless they drift, their disturbance is {0}: they are constant along every
+    estimated trajectory, to the last bit. Use an observer that does not correct them, with zeros in
+    their rows of the gain; the candidate of any other observer violates W, and the estimator then
+    searches for a trajectory with constant parameters that costs no more.
 
-    The model is a pair of NumPy functions, or any `System` whose last inputs are the parameters,
-    made by `System`, `from_casadi`, `from_jax`, `from_sympy` or `from_control`: the result then
-    has the same kind of derivatives, and a CasADi model stays one.
+    The model is a pair of NumPy functions, or a `System` whose last inputs are the parameters, made
+    by `System`, `from_casadi`, `from_jax`, `from_sympy` or `from_control`: the result has the same
+    kind of derivatives, and a CasADi model stays one.
 
     Parameters
     ----------
     f : callable or System
-        f(x, u, theta), or f(x, theta) where m is 0: x of shape (n,), u of (m,) and theta of
-        (k,), all parameters, to (n,). Functions of (..., n), (..., m), (..., k) are called
-        once for a whole window, as with `System`. With dt, the rate, in units of x per unit of
-        time. Or a system of m + k inputs, the last k of which are the parameters; it has its own
-        sizes, sets and sampling time, and h, n, p, m, dt, method and the sets are left out.
+        f(x, u, theta), or f(x, theta) if m is 0: maps x (n,), u (m,) and all parameters theta (k,)
+        to (n,). Functions of (..., n), (..., m), (..., k) are called once for a whole window, as
+        with `System`. With dt, f is the rate, in units of x per unit of time. Or a system of m + k
+        inputs, the last k of which are the parameters; it has its own sizes, sets and sampling
+        time, so leave out h, n, p, m, dt, method and the sets.
     h : callable
-        h(x, u, theta), or h(x, theta) where m is 0, to (p,); a scalar will do where p is 1.
+        h(x, u, theta), or h(x, theta) if m is 0, to (p,), or a scalar if p is 1.
     nominal : (k,) array_like
-        Values of all parameters, each in its own unit: the prior of those that are
-        estimated, the constants of the others.
+        Values of all parameters, each in its unit: prior means of the estimated ones, constants for
+        the others.
     n, p, m : int
         Numbers of states x, outputs and known inputs; m is 0 if left out.
     estimated : array_like, optional
         Indices of the parameters to be estimated, or a boolean mask (k,). All if left out;
         none with an empty list, which gives the model at its nominal parameters.
     drifting : bool
-        Whether the parameters change from step to step by a disturbance, which the cost weighs
-        with the others.
+        Whether a disturbance changes the parameters from step to step; the cost weighs it with the
+        others.
     dt : float, optional
-        Sampling time. If given, f is a rate, which is discretised with u held over the step, and
-        the system takes steps of other lengths.
+        Sampling time. If given, f is a rate, discretised with u held over the step, and the system
+        takes steps of other lengths.
     method : {"rk4", "euler"}, optional
         With dt: Runge-Kutta of order 4, the default, or one explicit Euler step.
     states, disturbances : Box or Polytope, optional
@@ -89,12 +89,12 @@ def augment_parameters(
     noises : Box or Polytope, optional
         The set V, of dimension p.
     parameter_bounds : Box or Polytope, optional
-        Where the estimated parameters are, in their order. The model is also tried out
-        within these bounds, which helps where it is not defined everywhere.
+        Bounds of the estimated parameters, in their order. Probes of the model also stay within
+        them, which helps if it is not defined everywhere.
     hold : float, array_like or mapping, optional
-        Within how many deviations of its prior an estimated parameter is held at its last trusted
-        value while the window does not see it, such as 0.1: one number for all, one for each, or
-        a mapping from the indices of some to theirs. Nothing is held if left out. See Notes.
+        Number of prior standard deviations, such as 0.1, within which an estimated parameter is
+        held at its last trusted value while the window does not see it: one number for all, one for
+        each, or a mapping from the indices of some. Nothing is held if left out. See Notes.
 
     Returns
     -------
@@ -106,35 +106,34 @@ def augment_parameters(
     Raises
     ------
     InvalidInputError, ShapeError
-        If a parameter has no finite nominal value, ``estimated`` does not name parameters, or a
-        system has fewer inputs than there are parameters; if ``hold`` is not positive, or is of a
-        parameter that is not estimated.
+        If a parameter has no finite nominal value, ``estimated`` does not name parameters, a system
+        has fewer inputs than parameters, or ``hold`` is not positive or names a parameter that is
+        not estimated.
     ModelError
         If a function does not take the arguments above, or returns a wrong shape.
     SetError
-        If a set has the wrong dimension, or a nominal value is outside of its bounds.
+        If a set has the wrong dimension, or a nominal value is outside its bounds.
     OptionError
         If a size, dt or the method is out of range, or given with a system or without dt.
 
     Notes
     -----
-    Data without excitation say nothing about some parameters. An estimate then follows the
-    observer, which noise leads astray, or falls back to the nominal value; with a disturbance so
-    small that neither happens, it is too stiff to follow a change later on.
+    Without excitation, the data do not determine some parameters. Their estimates then follow the
+    observer, which drifts with the noise, or fall back to the nominal values; a disturbance small
+    enough to prevent both is too small to follow later changes.
 
-    With ``hold``, J has one more term :math:`|\theta_0 - \bar\theta|_H^2`, on the parameters at
-    the start of the window. Its weight H and the trusted value :math:`\bar\theta`, at first the
-    nominal one, are fixed before each step, and the candidate's J has the same term: so
-    J(estimate) <= J(candidate) is a statement about one function. What a window sees is measured
-    by the singular values of its Gauss-Newton matrix in deviations of the first prior, as in
-    `Diagnosis`, with the other states eliminated. A direction with a singular value up to 1, of
-    which the data say no more than that prior, is held fully; above, its weight falls as the
-    inverse square, and the trusted value follows the estimate. See `WindowHold`.
+    With ``hold``, J has one more term :math:`|\theta_0 - \bar\theta|_H^2`, on the parameters at the
+    start of the window. Its weight H and the trusted value :math:`\bar\theta`, at first the nominal
+    one, are fixed before each step, and the candidate's J has the same term: so J(estimate) <=
+    J(candidate) compares the same function. What a window sees is measured by the singular values
+    of its Gauss-Newton matrix in deviations of the first prior, as in `Diagnosis`, with the other
+    states eliminated. A direction with a singular value up to 1, where the data are no more
+    informative than that prior, is held fully; above, its weight falls as the inverse square, and
+    the trusted value follows the estimate. See `WindowHold`.
 
-    The observer is not held: it stays the one that the theorem is about, but the theorem does not
-    cover this term. Kalman-type observers need no more than a disturbance of the parameter that
-    lets them follow changes; that their covariance grows while the parameter is unseen then
-    speeds recovery up.
+    The observer is not held: it stays the theorem's observer, but the theorem does not cover this
+    term. A Kalman-type observer only needs a disturbance of the parameter that lets it follow
+    changes; its covariance grows while the parameter is unseen, which speeds up recovery.
 
     Examples
     --------
@@ -248,8 +247,8 @@ def _other_inputs(arguments: dict[str, Any], parameters: int) -> int:
     total: int = arguments["f"].m
     if parameters > total:
         raise ShapeError(
-            f"nominal has {parameters} values, but the system has {total} inputs; its last inputs "
-            "are the parameters, so expected at most so many."
+            f"nominal has {parameters} values, but the system has {total} inputs; its last "
+            f"inputs are the parameters, so expected at most {total} values."
         )
     return total - parameters
 
@@ -263,8 +262,8 @@ def _nominal(given: ArrayLike) -> Array:
     if not np.isfinite(values).all():
         j = int(np.argmin(np.isfinite(values)))
         raise InvalidInputError(
-            f"nominal[{j}] is {values[j]}: a parameter without a prior value; expected a finite "
-            "number. A poor guess will do, with a small prior weight."
+            f"nominal[{j}] is {values[j]}: the parameter has no prior value; expected a finite "
+            "number. A poor guess is enough, with a small prior weight."
         )
     return values
 
@@ -283,9 +282,9 @@ def _held(hold: ArrayLike | Mapping[int, float] | None, moved: Index) -> dict[in
         for j in hold:
             if isinstance(j, (bool, np.bool_)) or j not in places:
                 raise InvalidInputError(
-                    f"hold has the key {shown(j)}, which is no estimated parameter; expected "
-                    f"indices among {moved.tolist()}. To hold parameter {shown(j)}, name it in "
-                    "estimated, too."
+                    f"hold has the key {shown(j)}, which is not an estimated parameter; expected "
+                    f"indices among {moved.tolist()}. To hold parameter {shown(j)}, also name it "
+                    "in estimated."
                 )
         found = {places[int(j)]: within for j, within in hold.items()}
     elif isinstance(hold, (bool, np.bool_)):
@@ -303,8 +302,7 @@ def _held(hold: ArrayLike | Mapping[int, float] | None, moved: Index) -> dict[in
         if size is None or size <= 0.0:
             raise InvalidInputError(
                 f"hold is {shown(within)}; expected numbers above 0, in deviations of the "
-                "parameter's prior, such as 0.1. For a parameter that is not to be held, leave it "
-                "out of a mapping."
+                "parameter's prior, such as 0.1. To leave a parameter free, omit it from a mapping."
             )
     return {place: float(within) for place, within in found.items()}
 
@@ -317,8 +315,8 @@ def _check_bounds(bounds: ConvexSet | None, nominal: Array) -> None:
     )
     if hard is not None and hard.violation(nominal) > 0.0:
         raise SetError(
-            f"nominal is {nominal.tolist()} for the estimated parameters, outside of "
-            f"parameter_bounds {bounds!r}; the prior value must be within."
+            f"nominal is {nominal.tolist()} for the estimated parameters, outside parameter_bounds "
+            f"{bounds!r}; the prior value must be within."
         )
 
 
@@ -326,8 +324,9 @@ def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> Bat
     """A user's function of x and (u, theta), tried at the nominal parameters and near them."""
     if not callable(written) or type(written).__module__.startswith("casadi"):
         raise ModelError(
-            f"{name} is {shown(written)}; expected a function of NumPy arrays. Make a System of a "
-            "model in another language, with the parameters as its last inputs, and give that as f."
+            f"{name} is {shown(written)}; expected a function of NumPy arrays. For a model in "
+            "another language, make a System with the parameters as its last inputs, and pass that "
+            "as f."
         )
     arguments = ("x", "u", "theta") if m else ("x", "theta")
     try:
@@ -340,7 +339,7 @@ def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> Bat
     except TypeError as error:
         inputs = f"{m} inputs" if m else "no inputs"
         raise ModelError(
-            f"{name}{signature} cannot be called as {name}({', '.join(arguments)}), which a model "
+            f"{name}{signature} cannot be called as {name}({', '.join(arguments)}), as a model "
             f"with {inputs} is, whether it uses all of them or not ({error})."
         ) from error
     x, known = probes[0]

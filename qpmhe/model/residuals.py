@@ -1,4 +1,4 @@
-"""Differences of outputs and of states of which some components are angles."""
+"""Differences of outputs and states with angles among their components."""
 
 from __future__ import annotations
 
@@ -124,15 +124,15 @@ def angles(indices: ArrayLike, period: ArrayLike = 2.0 * math.pi) -> Angles:
     .. math::
         (a \ominus b)_j = a_j - b_j - k_j P_j \in [-P_j/2, P_j/2), \qquad k_j \in \mathbb Z
 
-    for the components named; the others are plain differences. Nothing changes as long as all
-    differences lie within half a period.
+    for the named components; the others are plain differences. Differences within half a period do
+    not change.
 
     Parameters
     ----------
     indices : int or (k,) array_like of int
-        The components that are angles, from 0 on.
+        The components that are angles, counted from 0.
     period : float or (k,) array_like
-        P, of all of them or of each, in their unit: 360 for degrees.
+        P, one for all or one for each, in the angle's unit: 360 for degrees.
 
     Returns
     -------
@@ -143,9 +143,9 @@ def angles(indices: ArrayLike, period: ArrayLike = 2.0 * math.pi) -> Angles:
     Raises
     ------
     InvalidInputError
-        If an index is no integer >= 0, or given twice.
+        If an index is not an integer >= 0, or occurs twice.
     OptionError, ShapeError
-        If a period is not finite and above zero, or there is not one for each index.
+        If a period is not finite and above zero, or their number is not the number of indices.
 
     Examples
     --------
@@ -162,13 +162,13 @@ def angles(indices: ArrayLike, period: ArrayLike = 2.0 * math.pi) -> Angles:
     if given.ndim != 1 or not chosen or not all(one is not None and one >= 0 for one in chosen):
         raise InvalidInputError(
             f"indices is {shown(indices)}; expected one or more integers >= 0, the components "
-            "that are angles. Without angles, leave the residual function out."
+            "that are angles. Without angles, leave out the residual function."
         )
     components = np.array(chosen, np.intp)
     if np.unique(components).size < components.size:
         raise InvalidInputError(
-            f"indices is {components.tolist()}, which names a component twice; expected "
-            "different indices."
+            f"indices is {components.tolist()}, which names a component twice; expected distinct "
+            "indices."
         )
     periods = np.atleast_1d(numbers("period", period, finite=False))
     if periods.shape not in ((1,), components.shape):
@@ -234,8 +234,8 @@ class _Given(Residual):
         value = self._checked(a, a.copy())
         if (np.abs(value) > 64.0 * _EPS * max(unit, np.abs(a).max())).any():
             raise ModelError(
-                f"{self._name} is {value.tolist()} at a = b = {a.tolist()}; expected zeros, for "
-                f"it is a difference. {_REMEDY}"
+                f"{self._name} is {value.tolist()} at a = b = {a.tolist()}; expected zeros, as for "
+                f"a difference. {_REMEDY}"
             )
         return value
 
@@ -249,9 +249,9 @@ class _Given(Residual):
                 rise, taken = self._checked(ahead, other.copy()) - value, ahead - a
                 if (np.abs(rise - taken) > _ACCURACY * _STEP * unit + rounding).any():
                     raise ModelError(
-                        f"{self._name} changes by {rise.tolist()} where a = {a.tolist()}, "
-                        f"b = {other.tolist()} and a changes by {taken.tolist()}; expected the "
-                        f"same change: it must be a - b but for constants. {_REMEDY}"
+                        f"{self._name} changes by {rise.tolist()} where a = {a.tolist()}, b = "
+                        f"{other.tolist()} and a changes by {taken.tolist()}; expected the same "
+                        f"change: it must equal a - b up to constants. {_REMEDY}"
                     )
 
     @staticmethod
@@ -354,15 +354,15 @@ class Turns:
             j = int(np.argmax(one_sided))
             raise SetError(
                 f"states bounds component {j}, an angle, by lower {lower[j]} and upper "
-                f"{upper[j]}; expected two finite bounds or none: on a circle, one alone bounds "
-                "nothing."
+                f"{upper[j]}; expected two finite bounds or none: on a circle, one bound alone "
+                "has no effect."
             )
         rows = states.touched(angle)
         if rows.any():
             raise SetError(
                 f"row {int(np.argmax(rows))} of the matrix of states has a coefficient of an "
-                f"angle, one of the components {which.tolist()}; expected angles in bounds of "
-                "their own (qpmhe.Box) only: with whole turns added, a sum means nothing."
+                f"angle, one of the components {which.tolist()}; expected angles only in component "
+                "bounds (qpmhe.Box): with whole turns added, a sum has no meaning."
             )
         bounded = angle & np.isfinite(lower)
         self._residual = residual
@@ -405,9 +405,9 @@ class Turns:
         if wrong.any():
             j = int(np.argmax(wrong))
             raise SetError(
-                f"component {j} of the states, an angle, is to be bounded by lower {lower[j]} and "
+                f"component {j} of the states, an angle, has the new bounds lower {lower[j]} and "
                 f"upper {upper[j]}; expected two bounds less than half a period from "
-                f"{self._middle[j]}, the middle of the system's own, or from it by whole turns."
+                f"{self._middle[j]}, the middle of the system's bounds, up to whole turns."
             )
         return np.where(given, ends[0], lower), np.where(given, ends[1], upper)
 

@@ -20,8 +20,7 @@ Array = NDArray[np.float64]
 class ConvexSet:
     r"""A closed polyhedron :math:`\{s : \ell \le s \le u,\ a \le M s \le b\}`.
 
-    What `Box` and `Polytope` have in common; make one of these. Two sets are intersected
-    with ``&``.
+    The base class of `Box` and `Polytope`; create one of these. ``&`` intersects two sets.
 
     Attributes
     ----------
@@ -59,7 +58,7 @@ class ConvexSet:
         known: NDArray[np.bool_] | None = None,
         rounding: Array | float = 0.0,
     ) -> float:
-        """The largest amount by which points miss a bound or a general inequality.
+        """The largest violation of a bound or a general inequality by points.
 
         Parameters
         ----------
@@ -68,7 +67,7 @@ class ConvexSet:
         known : (..., d) bool array, optional
             Known components; inequalities on others do not count.
         rounding : float or (..., 1) array
-            How far the points are uncertain; that much does not count.
+            Uncertainty of the points; violations up to this do not count.
         """
         missed = np.maximum(self.lower - points, points - self.upper) - rounding
         worst = float((missed if known is None else np.where(known, missed, 0.0)).max())
@@ -100,7 +99,7 @@ class ConvexSet:
         Parameters
         ----------
         lower, upper, row_lower, row_upper : array
-            The sides, shaped as this set's.
+            The sides, with the shapes of this set's.
 
         Raises
         ------
@@ -120,18 +119,18 @@ class ConvexSet:
     def soften(
         self, *, linear: ArrayLike | None = None, quadratic: ArrayLike | None = None
     ) -> SoftSet:
-        r"""The set as a soft one: its inequalities may be violated, at a price.
+        r"""Soften the set: its inequalities may be violated, at a cost.
 
-        The cost J then has in addition :math:`\rho_j s_j + \sigma_j s_j^2` for each inequality j
-        that is violated by :math:`s_j`, at each sample.
+        At each sample, every inequality j violated by :math:`s_j` then adds :math:`\rho_j s_j +
+        \sigma_j s_j^2` to the cost J.
 
         Parameters
         ----------
         linear, quadratic : float or array_like, optional
-            The penalties :math:`\rho` and :math:`\sigma` of each inequality, in units of cost per
-            unit of the inequality and per its square; at least 0, and one of them above 0.
-            Numbers for all, or arrays: (d,) for the components of a box, (r,) for the rows of a
-            polytope, (d + r,), components first, for a set with both.
+            The penalties :math:`\rho` and :math:`\sigma` of each inequality, in cost per unit of
+            the inequality and per unit squared; at least 0, and one of them above 0. One number for
+            all, or an array: (d,) for the components of a box, (r,) for the rows of a polytope, (d
+            + r,), components first, for a set with both.
 
         Raises
         ------
@@ -199,7 +198,7 @@ class ConvexSet:
 
 
 class SoftSet:
-    """A set whose inequalities may be violated at a price; made by `ConvexSet.soften`.
+    """A set whose inequalities may be violated at a cost; made by `ConvexSet.soften`.
 
     Attributes
     ----------
@@ -240,8 +239,8 @@ def penalties(
         value = np.zeros(()) if given is None else numbers(name, given, finite=False)
         if value.shape not in ((), counts.shape):
             raise SetError(
-                f"{name} has shape {value.shape}; expected a number, or {counts.size} of them: one "
-                f"for each row of the {what}."
+                f"{name} has shape {value.shape}; expected one number, or {counts.size} of them, "
+                f"one for each row of the {what}."
             )
         if not (np.isfinite(value) & (value >= 0.0)).all():
             raise SetError(f"{name} is {value.tolist()}; expected finite numbers >= 0.")
@@ -250,8 +249,8 @@ def penalties(
     if free.any():
         raise SetError(
             f"row {int(np.argmax(free))} of the soft {what} has no penalty (linear = "
-            f"{shown(linear)}, quadratic = {shown(quadratic)}), so that it would do nothing; pass "
-            f"linear > 0 or quadratic > 0, or leave the {what} hard."
+            f"{shown(linear)}, quadratic = {shown(quadratic)}), so it "
+            f"would have no effect; pass linear > 0 or quadratic > 0, or leave the {what} hard."
         )
     return made[0], made[1]
 
@@ -262,9 +261,9 @@ class Box(ConvexSet):
     Parameters
     ----------
     lower, upper : array_like
-        Bounds of equal shape (d,), in the units of the vector that they bound; ``-inf`` and
-        ``inf`` where a component is unbounded. Equal bounds fix a component: a disturbance
-        that is {0} makes its state free of process noise.
+        Bounds of equal shape (d,), in the units of the vector that they bound; ``-inf`` and ``inf``
+        where a component is unbounded. Equal bounds fix a component: a disturbance in {0} makes its
+        state free of process noise.
 
     Raises
     ------
@@ -304,7 +303,7 @@ class Polytope(ConvexSet):
     Parameters
     ----------
     matrix : (r, d) array_like
-        M, a row for each inequality.
+        M, one row for each inequality.
     bound : (r,) array_like
         b, in the units of the rows.
 
@@ -313,7 +312,7 @@ class Polytope(ConvexSet):
     SetError
         If the shapes do not fit, a row is zero, or the set is empty.
     InvalidInputError
-        If a number is not finite.
+        If an entry is not finite.
     """
 
     __slots__ = ()
@@ -328,7 +327,7 @@ class Polytope(ConvexSet):
         zero = ~rows.any(axis=1)
         if zero.any():
             raise SetError(
-                f"row {int(np.argmax(zero))} of matrix is zero; leave out rows that bound nothing."
+                f"row {int(np.argmax(zero))} of matrix is zero; leave out zero rows."
             )
         free = np.full(rows.shape[1], np.inf)
         super().__init__(-free, free, rows, np.full(side.size, -np.inf), side)

@@ -1,4 +1,4 @@
-"""What stands in the place of NumPy's makers of arrays, and of `math`, during a trace."""
+"""Replacements for NumPy's array constructors and for `math` during a trace."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class MakingRecord(Record):
 
 
 def without_symbols(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A function or method within which NumPy is itself again: see `numpy_on_symbols`."""
+    """Restore NumPy within a function or method; see `numpy_on_symbols`."""
 
     @functools.wraps(method)
     def call(*arguments: Any, **options: Any) -> Any:
@@ -67,9 +67,9 @@ def without_symbols(method: Callable[..., Any]) -> Callable[..., Any]:
 def numpy_on_symbols(record: MakingRecord) -> Iterator[None]:
     """Let arrays that a function makes in this thread take symbols, and `math` too.
 
-    NumPy asks no array of symbols about ``numpy.zeros(2)``, into which a model then writes
-    symbols; nor does ``math.sin`` ask its argument. For the time of a trace, and in its thread,
-    others stand in their places.
+    NumPy does not dispatch ``numpy.zeros(2)``, into which a model then writes symbols, and
+    ``math.sin`` does not dispatch on its argument. So both are replaced during a trace, in its
+    thread.
     """
     global _swaps
     before = getattr(_tracing, "record", None)

@@ -1,4 +1,4 @@
-"""Symbols in place of numbers: what a function does with its arguments whatever their values are.
+"""Symbols in place of numbers, to trace what a function does for all values of its arguments.
 
 A function that returns when it is called on symbols has no branch on a value, no loop over
 values and no table look-up by one: it computes the same expression everywhere. What a symbol
@@ -363,7 +363,7 @@ def run(
 ) -> tuple[Any, BaseException | None]:
     """What the function returns for symbols, or what it raises.
 
-    Whatever it raises is no matter: it may work on numbers. The record says whether it was
+    Its exceptions do not matter: it may work on numbers. The record shows whether the trace was
     refused, or writes into an argument.
     """
     before = [plain(one).copy() for one in arguments]

@@ -81,42 +81,41 @@ class System:
         x(t+1) = f(x(t), u(t)) + G w(t), \qquad y(t) = h(x(t), u(t)) + v(t),
         \qquad x \in \mathbb X,\ w \in \mathbb W,\ v \in \mathbb V
 
-    as in (eq:system) of the paper, where G is the identity; with known inputs u beside.
+    as in (eq:system) of the paper, where G is the identity, plus known inputs u.
 
     Parameters
     ----------
     f : callable
-        f(x) or f(x, u): x of shape (n,) to (n,). A function that takes (..., n), as NumPy's
-        own functions do, is called once for a whole window where a trace on symbols proves
-        that it may; any other is called state by state, with a copy of its arguments. With
-        inputs, the second positional parameter is u, whatever its name and default.
+        f(x) or f(x, u): maps x (n,) to (n,). A function that takes (..., n), as NumPy's own
+        functions do, is called once for a whole window if a trace on symbols proves that this is
+        correct; any other is called state by state, with a copy of its arguments. With inputs, the
+        second positional parameter is u, whatever its name and default.
     h : callable
-        h(x) or h(x, u): x of shape (n,) to (p,). A scalar will do where p is 1. With inputs,
-        f or h must take them.
+        h(x) or h(x, u): maps x (n,) to (p,), or to a scalar if p is 1. With inputs, f or h must
+        take them.
     n, p : int
         Number of states and of outputs, at least 1.
     m : int
         Number of known inputs; 0 for none.
     f_jacobian, h_jacobian : callable, optional
-        Derivatives with respect to x, of shapes (n, n) and (p, n), same arguments. Left out, or
-        where they are the same up to rounding, estimators take the exact ones of the function's
-        trace, see `explain`. Of a function that cannot be traced they are computed: by the
-        complex step where the function allows it, else by differences, central ones or, at a
-        bound of X, inward ones; see ``derivatives``.
+        Derivatives with respect to x, of shapes (n, n) and (p, n), same arguments. If left out, or
+        equal up to rounding, estimators use the exact derivatives of the function's trace, see
+        `explain`. If a function cannot be traced, they are computed by the complex step where the
+        function allows it, else by differences, central or, at a bound of X, inward; see
+        ``derivatives``.
     states, disturbances, noises : Box or Polytope, optional
-        The sets X, W and V; the whole space if left out. Soft ones are made by
-        `ConvexSet.soften`; the observer is not projected onto a soft X.
+        The sets X, W and V; the whole space if left out. `ConvexSet.soften` makes soft sets; the
+        observer is not projected onto a soft X.
     scales : (n,) array_like, optional
-        Typical magnitudes of the states, above zero, in their units: difference steps are
-        shares of them, and a given Jacobian is compared with differences where they are known.
-        Left out, an estimator takes the standard deviations of its prior; a system alone takes
-        1 for its steps and compares nothing.
+        Typical magnitudes of the states, above zero, in their units. Difference steps are fractions
+        of them, and given Jacobians are compared with differences if they are known. If left out,
+        an estimator uses the standard deviations of its prior; a system alone uses 1 for its steps
+        and compares nothing.
     output_residual, state_residual : Angles or callable, optional
-        How outputs, and states, are subtracted, where components are angles: `qpmhe.angles`, or
-        a function (a, b) of two vectors to a [-] b. It is zero where a = b, and a - b but for
-        constants, such as whole turns, everywhere. Then :math:`v = y \ominus h` and
-        :math:`w = x(t+1) \ominus f`, which W and V bound. Bounds of X on an angle hold for the
-        state moved by whole turns to between them, if they can.
+        Difference of outputs, and of states, if components are angles: `qpmhe.angles`, or a
+        function (a, b) of two vectors to a [-] b, which is zero where a = b, and equals a - b up to
+        constants, such as whole turns. Then V and W bound :math:`v = y \ominus h` and :math:`w =
+        x(t+1) \ominus f`. Bounds of X on an angle hold up to whole turns.
     disturbance_matrix : (n, r) array_like, optional
         G, of full column rank with r <= n; the identity if left out. Disturbances w, their set W,
         and their weights and covariances in costs and observers then have the dimension r.
@@ -133,16 +132,16 @@ class System:
     Raises
     ------
     ModelError
-        If a function returns the wrong shape, changes its argument, or a given Jacobian is
-        not the derivative, or a residual function not a difference; if the columns of G are
-        linearly dependent.
+        If a function returns the wrong shape or changes its argument, a given Jacobian is not the
+        derivative, a residual function is not a difference, or the columns of G are linearly
+        dependent.
     InvalidInputError
-        If a component that does not exist is declared an angle.
+        If an angle is declared for a component that does not exist.
     SetError
-        If a set has the wrong dimension, X an angle in a general row or with one bound only, or
-        ``constraints`` is no list of constraints.
+        If a set has the wrong dimension, X bounds an angle by a general row or on one side only, or
+        ``constraints`` is not a list of constraints.
     OptionError, ShapeError
-        If a scale is not above zero, or there is not one for each state; if G has the wrong shape.
+        If a scale is not above zero, or ``scales`` or G has the wrong shape.
 
     Examples
     --------
@@ -294,8 +293,7 @@ class System:
         dt : float
             Sampling time, in the time unit of the rate.
         n, p, m : int
-            Numbers of states (entries of x), of outputs (entries of y) and of inputs (entries
-            of u; 0 for a system without inputs).
+            Numbers of states, outputs and inputs; m is 0 for a system without inputs.
         method : {"rk4", "euler"}
             Runge-Kutta of order 4, or one explicit Euler step.
         rate_jacobian : callable, optional
@@ -382,8 +380,8 @@ class System:
         """
         if self.make_timed is None:
             raise InvalidInputError(
-                "the system is discrete: steps of another length need a model in continuous "
-                "time, as System.from_ode takes it."
+                "the system is discrete; steps of another length need a model in continuous "
+                "time, see System.from_ode."
             )
         made = self.make_timed()
         made._is_timed = True
@@ -391,10 +389,10 @@ class System:
 
     @property
     def symbolic(self) -> Any:
-        """The model as CasADi functions, from which C code is generated; None if it has none.
+        """The model as CasADi functions, for C code generation; None if it has no such form.
 
-        Functions in NumPy are traced when this is first asked for, or an estimator is made: it
-        takes some milliseconds, and 10 to 150 to import CasADi, which a `System` alone never does.
+        NumPy functions are traced at the first access, or when an estimator is made. This takes
+        some milliseconds, and 10 to 150 ms to import CasADi, which a `System` alone never does.
         """
         if self._symbolic is not None or self.tracing is None:
             return self._symbolic
@@ -411,7 +409,7 @@ class System:
 
     @property
     def no_symbolic(self) -> str:
-        """Why ``symbolic`` is None, as text; blank where it is not."""
+        """Why ``symbolic`` is None, as text; blank otherwise."""
         if self.symbolic is not None or self.tracing is None:
             return ""
         if self._has_other_steps:
@@ -515,7 +513,7 @@ class System:
             self.kernel = evaluator
 
     def use_functions(self) -> None:
-        """Evaluate f and h as they are written from now on, if a trace stands in their place."""
+        """Evaluate f and h as written from now on, if a trace replaces them."""
         written, self._as_written, self._pinned = self._as_written, None, None
         self._pins = False
         if written is not None:
@@ -545,11 +543,11 @@ class System:
         return "" if wrong is None else f"{wrong[0]} has changed since it was traced: {wrong[1]}"
 
     def explain(self) -> str:
-        """How f and h are evaluated, and why not faster, as text.
+        """How f and h are evaluated, and what prevents a faster way, as text.
 
-        A function that is traced is known as an expression: it has exact Jacobians, and estimators
-        evaluate it in CasADi's virtual machine or in generated C code. One that is not is called
-        as it is written; the text says what it asks for, in which line.
+        A traced function is known as an expression: it has exact Jacobians, and estimators evaluate
+        it in CasADi's virtual machine or in generated C code. Any other function is called as
+        written; the text names the operation that stopped the trace, and its line.
 
         Examples
         --------
@@ -605,7 +603,7 @@ class System:
         Raises
         ------
         OptionError, ShapeError
-            If they are not.
+            If a scale is not, or their number is wrong.
         ModelError
             If a given Jacobian is not the derivative at points of these magnitudes.
         """
@@ -662,13 +660,13 @@ class System:
         if bounded.any() or soft.convex.touched(angles).any():
             raise SetError(
                 f"the soft set of states, {soft.convex!r}, bounds an angle (components "
-                f"{residual.components.tolist()}), which is known up to whole turns; leave it out, "
-                "or write a qpmhe.Constraint of its sine and cosine."
+                f"{residual.components.tolist()}), which is known only up to whole turns; leave it "
+                "out, or write a qpmhe.Constraint of its sine and cosine."
             )
 
     @property
     def extensions(self) -> tuple[str, ...]:
-        """What it has beyond hard convex sets: soft sets and nonlinear constraints, in words."""
+        """Its soft sets and nonlinear constraints, in words."""
         found = [f"a soft set of {name}" for name in self.soft]
         return (*found, "nonlinear constraints") if self.constraints else tuple(found)
 
@@ -782,7 +780,8 @@ def _checked_matrix(given: ArrayLike | None, n: int) -> Array | None:
     if matrix.ndim != 2 or matrix.shape[0] != n or not 1 <= matrix.shape[1] <= n:
         raise ShapeError(
             f"disturbance_matrix has shape {matrix.shape}; expected (n, r) = ({n}, r) with r from "
-            f"1 to {n}: a column for each disturbance. Leave it out if each state has its own."
+            f"1 to {n}: one column for each disturbance. Leave it out if every state has its own "
+            "disturbance."
         )
     # In numbers of order one, so that no unit makes a column look small.
     rows, columns = equilibrated(matrix)
@@ -799,8 +798,8 @@ def _checked_scales(given: ArrayLike, n: int) -> Array:
     scales = vector("scales", given, n)
     if not (scales > 0.0).all():
         raise OptionError(
-            f"scales is {scales.tolist()}; expected a number > 0 for each state: its typical "
-            "magnitude, in its unit. Leave scales out if they are not known."
+            f"scales is {scales.tolist()}; expected a number > 0 for each state, its "
+            "typical magnitude in its unit. Leave scales out if they are unknown."
         )
     return scales
 

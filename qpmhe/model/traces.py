@@ -230,9 +230,9 @@ class ModelTrace:
 
 
 def warn_of(fault: str, stacklevel: int = 6) -> None:
-    """Warn that a trace is given up, and its function evaluated as it is written."""
+    """Warn that a trace is dropped, and its function evaluated as written."""
     warnings.warn(
-        f"{fault}. It is evaluated as it is written.", EngineWarning, stacklevel=stacklevel
+        f"{fault}. It is now evaluated as written.", EngineWarning, stacklevel=stacklevel
     )
 
 
@@ -243,7 +243,7 @@ def _of_both(function: BatchedFunction) -> Callable[[Array, Array], Any]:
 
 
 def next_check(time: int, horizon: int) -> int:
-    """When an estimator that has compared at a time does so again.
+    """The time of the next comparison after this one.
 
     At each sample of the first window, then at powers of two, then at each thousandth.
     """

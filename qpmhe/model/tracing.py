@@ -1,4 +1,4 @@
-"""Traces of users' functions: on labels, what each value depends on; in CasADi, the expression.
+"""Traces of users' functions: with labels, for dependencies; in CasADi, for expressions.
 
 A trace that estimators rely on is compared with its function again and again. A proof cannot rest
 on comparisons, so there a trace is watched: it is refused where the function could notice that it
@@ -177,7 +177,7 @@ def trace(function: Callable[..., Any], arguments: Sequence[Labels]) -> Labels |
 
 
 class Traced(NamedTuple):
-    """A function as CasADi has it, or why it has none.
+    """A function's CasADi form, or why it has none.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class Traced(NamedTuple):
     made_of: Any = None
 
     def fault(self, k: int) -> str:
-        """Where the function that was traced differs from its trace now; blank where it does not.
+        """Where the traced function now differs from its trace; blank if nowhere.
 
         Compares at one of the points only, another one for each k.
         """
@@ -219,13 +219,12 @@ def traced(
     *,
     name: str = "traced",
 ) -> Traced:
-    """The CasADi form of a function of NumPy vectors, if it has one that gives the same numbers.
+    """The CasADi form of a function of NumPy vectors, if one gives the same numbers.
 
-    The function is called once, with symbols. It is refused where it asks for a symbol's value:
-    in a branch, a loop or an index, by ``float()``, in a function without CasADi form. Then it is
-    compared with itself at many points, where both must agree up to rounding, or both fail or
-    not be finite. So nothing is traced wrongly that depends on what the points show: random
-    numbers, the time, a state kept between calls. Never raises, whatever the function does.
+    The function is called once, with symbols. It is refused if it needs a symbol's value: in a
+    branch, a loop or an index, in ``float()``, or in a function without CasADi form. Then trace and
+    function are compared at many points, where both must agree up to rounding, or both fail or not
+    be finite. This detects random numbers, the time, and states kept between calls. Never raises.
 
     Parameters
     ----------
@@ -400,7 +399,7 @@ def difference(
         result = "an error" if theirs is None else str(theirs.tolist())
         return (
             f"it returns {result} at {_shown(arguments)}, but the same expression of symbols is "
-            f"{mine.tolist()}: it depends on more than its arguments, or on their type"
+            f"{mine.tolist()}: it depends on more than its arguments, or on their types"
         )
     return ""
 

@@ -76,12 +76,13 @@ def battery_cell(method: str = "rk4") -> Example:
     The sampling time is 5 s, N = 60; a profile of discharge, rest and charge takes the
     full cell down to 0.7 within 2000 s. Disturbances have standard deviations of 0.0002, 1 mV and
     0.5 mV a step, the noise 5 mV. The estimation starts at s = 0.5, with the cell at rest;
-    the prior weighs with 0.3, and with 2 mV and 2.5 mV, what v_1 and v_2 stray by in the long
-    run: their true initial values are the estimate's. The state set is :math:`0 \le s \le 1`.
+    the prior's standard deviations are 0.3, 2 mV and 2.5 mV, the latter two as large as v_1 and v_2
+    stray in the long run: their true initial values are the estimate's. The state set is
+    :math:`0 \le s \le 1`.
 
     The observer corrects s alone, by :math:`k\,(y - h)` with k = 0.5 1/V. Then A - K C is
-    triangular with the eigenvalues :math:`1 - k V'(s)` and those of the RC elements: it is
-    stable from everywhere where V' < 4 V, which is s > 0.07.
+    triangular with the eigenvalues :math:`1 - k V'(s)` and those of the RC elements: it is stable
+    wherever V' < 4 V, that is s > 0.07.
 
     Parameters
     ----------

@@ -179,8 +179,8 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
         d_i = p_i - p_{i-1}, \quad i = 1, \dots, M
 
     with the wall :math:`p_0 = 0` and the end point :math:`p_{M+1} = 0.25\,(M + 1)\, e_1` m,
-    which is held: there is no input. The state is all positions, then all velocities, mass
-    after mass; n = 2 dimension M. The positions are measured, p = n/2.
+    which is fixed: there is no input. The state is all positions, then all velocities, mass after
+    mass; n = 2 dimension M. The positions are measured, p = n/2.
 
     The springs are those of acados' example: m = 0.033 kg, D = 1 N/m, L = 0.033 m, and with
     M = 3 its end point, 1 m from the wall; g = 9.81 m/s^2 along the last axis. The damping,
@@ -190,33 +190,33 @@ def chain_of_masses(masses: int = 2, dimension: int = 3, method: str = "rk4") ->
 
     In one dimension there is no gravity, and the masses run alternately on two parallel rails
     the distance L apart, as do wall and end point: :math:`|d_i|^2 = (p_i - p_{i-1})^2 + L^2`.
-    All in one line, the springs would be linear as long as no mass passes another.
+    On one rail, the springs would be linear as long as no mass passes another.
 
     The sampling time is 0.03 s, N = 30. Disturbances have standard deviations of 0.001 m and
     0.03 m/s a step, the noise 0.03 m. The chain starts displaced from rest by
-    :math:`0.3 \sin(\pi i / (M+1))` m along every axis, the estimation from rest. The prior
-    weighs with 0.3 m and the velocity that goes with it, :math:`0.3 \sqrt{D/m}`. The observer's
-    constant gain is the gain of the stationary Kalman predictor about rest.
+    :math:`0.3 \sin(\pi i / (M+1))` m along every axis, the estimation from rest. The prior's
+    standard deviations are 0.3 m and the corresponding velocity, :math:`0.3 \sqrt{D/m}`. The
+    observer's constant gain is the gain of the stationary Kalman predictor about rest.
 
     Parameters
     ----------
     masses : int
         M >= 1, free masses.
     dimension : {1, 2, 3}
-        Of space.
+        Dimension of space.
     method : {"rk4", "euler"}
         Discretisation of the model. Euler steps are stable here, too, but damp much less.
 
     Notes
     -----
     In two and three dimensions, the force of a spring is undefined where two neighbours meet:
-    x = 0 is no state to start from.
+    x = 0 cannot be a start.
 
-    No region is stated: noises of three standard deviations at each sample allow errors of the
-    positions of half a metre, and within that neighbours may meet, where the force is undefined.
+    No region is stated: noises of three standard deviations at each sample allow position errors of
+    half a metre, within which neighbours may meet, where the force is undefined.
 
-    Once settled, the observer is as good as MHE: its gain is Kalman's, and the prior weight,
-    which is that of the initial error, is a weak one. What MHE gains is the time till then.
+    Once settled, the observer is as good as MHE: it has the Kalman gain, and the prior weight,
+    chosen for the initial error, is weak. MHE is better until then.
 
     References
     ----------

@@ -84,13 +84,13 @@ def cstr(method: str = "rk4") -> Example:
     In the scenario, a proportional controller that knows T follows 350 K plus a sine of 8 K
     and 5 min, with u between 270 and 330 K. The sampling time is 0.05 min, N = 20;
     disturbances have standard deviations of 0.005 mol/L and 0.3 K a step, the noise 0.5 K. The
-    estimation starts at (0.65, 347); the prior weighs with 0.3 mol/L and 5 K. States are
-    bounded by what the reaction can reach, :math:`0 \le c \le c_f`, and by 250 K <= T <= 500 K.
+    estimation starts at (0.65, 347); the prior's standard deviations are 0.3 mol/L and 5 K. States
+    are bounded by what the reaction can reach, :math:`0 \le c \le c_f`, and by 250 K <= T <= 500 K.
 
     The observer has the constant gain of the stationary Kalman predictor about (0.5, 350), for
-    disturbances of 1 K. It converges from within 0.3 mol/L and 5 K, not from everywhere: from
-    far too much concentration, its own temperature runs away before the correction holds it, and
-    only the projection onto X brings it back. The smaller gain for 0.3 K holds less.
+    disturbances of 1 K. It converges from within 0.3 mol/L and 5 K, not from everywhere: from a far
+    too high concentration, its temperature runs away before the correction holds it, and only the
+    projection onto X brings it back. The smaller gain for 0.3 K converges from fewer states.
 
     Parameters
     ----------

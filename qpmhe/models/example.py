@@ -16,7 +16,7 @@ Array = NDArray[Any]
 
 
 class Selection:
-    """The output of some components of a state of n, and its Jacobian."""
+    """An output of some of the n state components, and its Jacobian."""
 
     def __init__(self, n: int, components: slice | list[int]) -> None:
         self._components, self._matrix = components, np.eye(n)[components]
@@ -31,10 +31,10 @@ class Selection:
 
 
 class Example(NamedTuple):
-    """A system with all that its estimation needs, as every function of `qpmhe.models` makes it.
+    """A system with all that its estimation needs; every function of `qpmhe.models` returns one.
 
     It unpacks in this order. An `OptionError` is raised where an argument of the function, such
-    as the method of discretisation, is not among what it names.
+    as the method of discretisation, is not one that it names.
 
     Parameters
     ----------

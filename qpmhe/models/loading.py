@@ -164,7 +164,10 @@ def load(source: ModelSource) -> Example:
             f"model {name!r} gave {type(parts).__name__}; expected (system, observer, cost, "
             "scenario), as qpmhe.models.Example."
         )
-    check_parts(name, parts)
+    options = isinstance(parts[3], dict)
+    check_parts(
+        name, parts, " A dict of options in its place is enough for a record." if options else ""
+    )
     return Example(*parts)
 
 
@@ -235,9 +238,9 @@ def _function(source: ModelSource) -> Callable[..., Any]:
         raise _failure(source, f": cannot import {place}", error) from error
     if source.fingerprint and now != source.fingerprint:
         raise ModelError(
-            f"model {name!r}: {place}, or a file that it imports, is another here than where the "
-            "study was started, or was changed since; bring the same files to all machines, and "
-            "give the command again."
+            f"model {name!r}: {place}, or a file that it imports, differs from the one that the "
+            "study was started with; copy the same files to all machines, and give the command "
+            "again."
         )
     function = getattr(module, attribute, None)
     if not callable(function):

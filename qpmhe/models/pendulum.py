@@ -41,10 +41,10 @@ def pendulum(method: str = "rk4") -> Example:
 
     State (angle from hanging, angular velocity) in rad and rad/s, with g = 9.81 m/s^2,
     l = 0.5 m, c = 0.2 1/s, and a coarse encoder of 64 counts a turn,
-    :math:`\delta = 2\pi / 64` rad. Its error is no normal noise; the cost weighs it as one of
-    the same variance, :math:`\delta^2 / 12`. The sampling time is 0.02 s, N = 30;
-    disturbances have standard deviations of 0.001 rad and 0.02 rad/s a step. The pendulum
-    starts at rest at 2.5 rad, the estimation hanging; the prior weighs with 1 rad and 5 rad/s.
+    :math:`\delta = 2\pi / 64` rad. Its error is not normal; the cost weighs it like normal noise of
+    the same variance, :math:`\delta^2 / 12`. The sampling time is 0.02 s, N = 30; disturbances have
+    standard deviations of 0.001 rad and 0.02 rad/s a step. The pendulum starts at rest at 2.5 rad,
+    the estimation hanging; the prior's standard deviations are 1 rad and 5 rad/s.
 
     The observer is a high-gain one with time constant 0.1 s: :math:`1 / 0.1^2 > g / l`, so that
     its error decays at any angle, upright included.

@@ -117,11 +117,11 @@ def quadrotor(method: str = "rk4") -> Example:
     at 1 rad/s, going up and down and turning slowly to and fro. The sampling time is 0.05 s,
     N = 20; disturbances have standard deviations of 0.002 m, 0.05 m/s, 0.002 rad and 0.1
     rad/s a step, the noise 0.1 m and 0.02 rad. The estimation starts level and at rest, beside
-    the vehicle; the prior weighs with 0.5 m, 1 m/s, 0.2 rad and 0.5 rad/s.
+    the vehicle; the prior's standard deviations are 0.5 m, 1 m/s, 0.2 rad and 0.5 rad/s.
 
     The observer has the constant gain of the stationary Kalman predictor about hovering at yaw
-    0, for disturbances three times as large. In the flight, only the way from errors of the
-    angles to the velocity differs.
+    0, for disturbances three times as large. In the flight, only the effect of angle errors on the
+    velocity differs.
 
     Parameters
     ----------

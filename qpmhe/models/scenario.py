@@ -60,7 +60,7 @@ class Scenario:
 
     Disturbance and noise are normal and white. Where the system has sets, they are truncated:
     w(t) to those with :math:`w \in \mathbb W` and :math:`f(x, u) + G w \in \mathbb X`, v(t) to
-    :math:`\mathbb V`, by drawing again. Components of a set that have zero width are set.
+    :math:`\mathbb V`, by drawing again. Where a set has zero width, the component has its value.
     Angles are recorded between minus and plus half a period, or in the turn about their bounds.
 
     Parameters
@@ -84,9 +84,9 @@ class Scenario:
         x(t): known inputs ignore the state, a feedback controller does not. Needed exactly
         if the system has inputs.
     settling_time : float
-        From this time on (in time_unit) the initial error counts as decayed.
+        From this time on (in time_unit), the initial error counts as decayed.
     title : str
-        What it is, in one line.
+        A description in one line.
     resolution : (p,) array, optional
         Step of outputs that are digital, 0 where they are not. Such an output is h(x)
         rounded to the nearest multiple of its step, in place of normal noise; the matching
@@ -134,7 +134,7 @@ class Scenario:
         dimension("horizon", self.horizon, 1)
         dimension("steps", self.steps, 1)
         if not isinstance(self.labels, (tuple, list)) or len(self.labels) != n:
-            raise OptionError(f"labels is {shown(self.labels)}; expected {n} names, one a state.")
+            raise OptionError(f"labels is {shown(self.labels)}; expected {n} names, one per state.")
         settling = finite(self.settling_time)
         if settling is None or settling < 0.0:
             raise OptionError(
@@ -176,7 +176,7 @@ class Scenario:
         OptionError
             If the seed or the number of steps is not an integer >= 0.
         ModelError
-            If no disturbance that is drawn keeps the state in its set, or it is not finite.
+            If no drawn disturbance keeps the state in its set, or the state is not finite.
         """
         generator = np.random.default_rng(count("seed", seed, 0))
         total = self.steps if steps is None else dimension("steps", steps, 0)
@@ -205,8 +205,9 @@ class Scenario:
             )
             if disturbance is None or not np.isfinite(reached).all():
                 raise ModelError(
-                    f"the simulated state cannot go on inside of the sets at sample {t}: it is "
-                    f"{reached.tolist()} without disturbance. Widen the sets, or simulate less."
+                    f"the simulated state cannot stay inside the sets at sample {t}: without "
+                    f"disturbance it is {reached.tolist()}. Widen the sets, or simulate fewer "
+                    "samples."
                 )
             if matrix is not None:
                 disturbance = matrix @ disturbance

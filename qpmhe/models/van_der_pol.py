@@ -36,10 +36,10 @@ def van_der_pol(method: str = "rk4") -> Example:
     .. math::
         \dot x_1 = x_2, \quad \dot x_2 = \mu (1 - x_1^2)\, x_2 - x_1, \quad y = x_1
 
-    with :math:`\mu = 1` and sampling time 0.1, all without unit. From (2, 0) it goes round
-    on its limit cycle, once in about 6.7. Disturbances have standard deviations of 0.02 and
-    0.05 a step, the noise 0.1. The estimation starts at (0, 0), where the linearisation is
-    unstable, and weighs the prior with I; N = 20.
+    with :math:`\mu = 1` and sampling time 0.1, all without unit. From (2, 0) it follows its limit
+    cycle, with a period of about 6.7. Disturbances have standard deviations of 0.02 and 0.05 a
+    step, the noise 0.1. The estimation starts at (0, 0), where the linearisation is unstable, and
+    weighs the prior with I; N = 20.
 
     The observer is a high-gain one with time constant 0.4: its error decays although the
     oscillator drives it apart wherever :math:`|x_1| < 1`.

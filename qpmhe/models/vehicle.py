@@ -92,10 +92,10 @@ def vehicle(method: str = "rk4") -> Example:
 
     The sampling time is 0.2 s, N = 20; disturbances have standard deviations of 0.02 m and
     0.02 rad a step, the noise 0.2 m and 0.05 rad. The estimation starts 1 m and 1.1 m beside
-    the vehicle, and turned by 0.5 rad; the prior weighs with 1 m and 0.5 rad.
+    the vehicle, and turned by 0.5 rad; the prior's standard deviations are 1 m and 0.5 rad.
 
-    The observer corrects by 0.3 of the fix that the measurement alone gives by weighted
-    least squares, linearised: its error shrinks to 0.7 a step wherever the vehicle is.
+    The observer corrects by 0.3 of the fix from linearised weighted least squares on the
+    measurement alone: its error shrinks to 0.7 a step wherever the vehicle is.
 
     Parameters
     ----------

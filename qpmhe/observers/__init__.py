@@ -1,4 +1,4 @@
-"""Auxiliary observers: stable, perhaps poor, and the source of every guarantee."""
+"""Auxiliary observers: stable, perhaps inaccurate, and the source of every guarantee."""
 
 from .base import Observer, Sample
 from .design import design_luenberger

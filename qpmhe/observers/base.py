@@ -1,4 +1,4 @@
-"""What an auxiliary observer in output-injection form must offer (eq:observer)."""
+"""The interface of an auxiliary observer in output-injection form (eq:observer)."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ SAME_COVARIANCE = 1e-9
 
 @dataclass(slots=True)
 class Sample:
-    """What an observer may know of the stage at which it corrects.
+    """The data of the stage at which an observer corrects.
 
     Parameters
     ----------
     system, u : System and (m,) array
-        The model that holds at this stage, and the input.
+        The model at this stage, and the input.
     f_jacobian, h_jacobian : (n, n) and (p, n) array or None
         Jacobians at z, if `Observer.needs_jacobians`.
     observed, noise_weight : (p,) bool and (p, p) array or None
-        Which components of y are there, and this sample's own noise weight; None if all
-        are there, or it has none.
+        Which components of y are available, and a noise weight for this sample only; None if all
+        are, or if it has none.
     covariance : (n, n) array or None
         Covariance of x(t) - z(t), if the observer has one.
     disturbance_weight : (r, r) array or None
-        This sample's own weight of the disturbance; None if it has none.
+        A disturbance weight for this sample only; None if it has none.
     states : ConvexSet or None
-        The X that this sample came with; None for the system's.
+        The set X of this sample; None for the system's.
     rejections, next_rejections : (s,) int array or None
-        How often in a row each of the `Observer.sensors` has failed the observer's test, before
-        this sample, and where `Observer.correct` writes the counts behind it.
+        Consecutive failures of each of the `Observer.sensors` before this sample, and an array into
+        which `Observer.correct` writes the counts after it.
     """
 
     system: System
@@ -63,7 +63,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class ObserverForm:
-    """What the step in C computes an observer by.
+    """The data with which the step in C computes an observer.
 
     Parameters
     ----------
@@ -74,13 +74,13 @@ class ObserverForm:
     prior, disturbance, noise : (n, n), (r, r) and (p, p) array or None
         Covariances of the initial error, of w and of v, of an observer with a covariance.
     f_jacobian, h_jacobian : (n, n) and (p, n) array or None
-        The constant Jacobians by which the covariance of a constant gain's error proceeds.
+        The constant Jacobians that propagate the error covariance of a constant gain.
     spread : float
         Distance of sigma points from the state, in standard deviations.
     correction : callable or None
         The CasADi form of a function L(z, v), from the sizes of its arguments.
     innovation : Innovation or None
-        How a Kalman filter judges its innovations.
+        How a Kalman filter tests its innovations.
     """
 
     kind: str
@@ -99,8 +99,8 @@ class ObserverForm:
 class Observer(ABC):
     r"""An observer :math:`z(t+1) = f(z, u) + L(z, y - h(z, u))` with :math:`L(\cdot, 0) = 0`.
 
-    An observer is a rule without memory: what it must remember from sample to sample, a
-    covariance, travels through `correct` and is kept in the estimator's window.
+    An observer has no memory: what it needs from sample to sample, a covariance, passes through
+    `correct` and is stored in the estimator's window.
     """
 
     #: Whether `correct` reads the Jacobians of f and h at z.
@@ -113,7 +113,7 @@ class Observer(ABC):
 
     @abstractmethod
     def check(self, system: System, initial_state: Array) -> None:
-        """Raise an `InvalidInputError` unless it fits the system and initial_state, z(0)."""
+        """Raise an `InvalidInputError` if it does not fit the system and initial_state, z(0)."""
 
     @property
     def constant_gain(self) -> Array | None:
@@ -122,9 +122,9 @@ class Observer(ABC):
 
     @property
     def metric(self) -> Array | None:
-        """A metric M (n, n) in which the error is proved to contract; None if none is known.
+        """A metric M (n, n) in which the error provably contracts; None if none is known.
 
-        The observer is projected onto X in this metric, so that the proof holds with X, too.
+        The observer is projected onto X in this metric, so that the proof also holds with X.
         """
         return self._metric
 
@@ -142,17 +142,17 @@ class Observer(ABC):
 
     @property
     def sensors(self) -> tuple[tuple[int, ...], ...]:
-        """The outputs of each sensor of which it counts how often in a row it has failed."""
+        """The outputs of each sensor whose consecutive failures it counts."""
         return ()
 
     @property
     def rejects(self) -> bool:
-        """Whether sensors that fail are rejected."""
+        """Whether failing sensors are rejected."""
         return False
 
     @property
     def innovation_limit(self) -> float | None:
-        """The largest innovation of one output that counts in full, in its standard deviations."""
+        """The largest fully weighted innovation of one output, in standard deviations."""
         return None
 
     @abstractmethod
@@ -164,14 +164,14 @@ class Observer(ABC):
         z, v : (n,) and (p,) array
             Observer state z(t), and fitting error y(t) - h(z(t)), with zeros where y is missing.
         sample : Sample
-            What else is known of the stage; overwritten at the next one.
+            Further data of the stage; overwritten at the next stage.
         """
 
     @property
     def filter_gain(self) -> Array | None:
         """The gain G (n, p) of an observer whose estimate of x(t) is z + G v at all times.
 
-        Zero without a measurement update; None for observers with another one.
+        Zero without a measurement update; None for other measurement updates.
         """
         gain = self.constant_gain
         if gain is None or type(self).filter is not Observer.filter:
@@ -180,14 +180,14 @@ class Observer(ABC):
 
     @property
     def c_form(self) -> ObserverForm | None:
-        """What the step in C needs of the observer; None for one that it cannot compute."""
+        """The observer's data for the step in C; None if C cannot compute it."""
         gain, filter_gain = self.constant_gain, self.filter_gain
         if gain is None or filter_gain is None:
             return None
         return ObserverForm("gain", gain, filter_gain)
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array] | None:
-        """The estimate of x(t) that has used y(t), and its covariance; None if there is none.
+        """The estimate of x(t) that uses y(t), and its covariance; None if there is none.
 
         A Kalman filter's measurement update.
 
@@ -290,9 +290,9 @@ class KalmanType(Observer):
 
 
 def covariance_of(weight: Array | None, usual: Array) -> Array:
-    """The covariance of a sample's own weight, or the usual one, from which rounding is no change.
+    """The covariance of a sample's weight; the usual one if both are equal up to rounding.
 
-    A weight that was computed from the usual covariance must lead to the same digits as none.
+    A weight computed from the usual covariance then gives the same digits as none.
     """
     if weight is None:
         return usual

@@ -32,16 +32,16 @@ def design_luenberger(
 ) -> Luenberger:
     r"""A Luenberger observer for the linearisation of a system about a point.
 
-    With A and C the Jacobians of f and h at the point, the error of the observer's state
-    obeys :math:`e(t+1) = (A - K C)\, e(t)` near it. The gain K either places the
-    eigenvalues of A - K C, or is the gain of the stationary Kalman predictor
+    With A and C the Jacobians of f and h at the point, the error of the observer's state obeys
+    :math:`e(t+1) = (A - K C)\, e(t)` near it. The gain K either places the eigenvalues of A - K C,
+    or is that of the stationary Kalman predictor
 
     .. math::
         K = A P C^\top S^{-1}, \quad S = C P C^\top + R, \quad
         P = A P A^\top + Q - K S K^\top
 
-    The observer is stable where the linearisation is a good one. How far that is remains open:
-    the point should be typical, most often a steady state.
+    The observer is stable only where the linearisation is accurate, in a region that is not
+    computed. Choose a typical point, usually a steady state.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def design_luenberger(
     at : (n,) array_like
         The state about which to linearise.
     u : (m,) array_like, optional
-        The input there; needed exactly if the system has inputs.
+        The input there; required if the system has inputs.
     poles : (n,) array_like, optional
         Eigenvalues of A - K C, inside the unit circle, complex ones in conjugate pairs.
         With several outputs, none more often than the rank of C. For a continuous-time
@@ -69,14 +69,14 @@ def design_luenberger(
     Raises
     ------
     OptionError
-        Unless either the poles or both covariances are given, or if a pole does not lie
-        inside the unit circle or comes without its conjugate.
+        Unless either the poles or both covariances are given; if a pole is not inside the unit
+        circle or lacks its conjugate.
     ShapeError, WeightError
         If an argument has the wrong shape, or a covariance is not positive definite.
     ModelError
-        If the model cannot be linearised there; if a mode that the outputs do not show is
-        to be moved or, with covariances, is not stable; or if the numbers are too
-        ill-conditioned for a gain with the promised poles.
+        If the model cannot be linearised there; if poles are given and a mode is not observable; if
+        covariances are given and an unobservable mode is unstable; or if the problem is too
+        ill-conditioned for a gain with these poles.
 
     References
     ----------
@@ -118,12 +118,13 @@ def linearize(
 ) -> tuple[Array, Array, Array]:
     """The Jacobians A (n, n) and C (p, n) at a point, and the point (n,).
 
-    A covariance of the disturbance, (n, n), says how large the states are: many times it.
+    A covariance of the disturbance, (n, n), sets the states' magnitudes: a multiple of it.
     """
     point = vector("at", at, system.n)
     if u is None and system.m:
         raise InvalidInputError(
-            f"u is missing; the system has {system.m} inputs, whose values at the point matter."
+            f"u is missing; the system has {system.m} inputs, and the linearisation depends on "
+            "them."
         )
     inputs = np.zeros(0) if u is None else vector("u", u, system.m)
     if disturbance is not None:
@@ -141,7 +142,8 @@ def linearize(
         except Exception as error:
             raise ModelError(
                 f"{function.name} cannot be linearised at x = {point.tolist()}: it raised "
-                f"{type(error).__name__}: {error}. Choose a point where it is defined."
+                f"{type(error).__name__}: {error}. Choose a point where it is defined and "
+                "differentiable."
             ) from error
         # The value too: outside of a function's domain a complex step may look like a slope.
         if not (np.isfinite(value).all() and np.isfinite(slope).all()):
@@ -193,8 +195,8 @@ def _stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[A
     if lasting.size:
         raise ModelError(
             f"the linearisation at x = {point.tolist()} is not detectable: the outputs do not "
-            f"show the mode with eigenvalue {_text(lasting)}, which does not decay by itself. "
-            "Choose another point, measure more, or take that part out of the state."
+            f"show the mode with eigenvalue {_text(lasting)}, which does not decay. Choose another "
+            "point, add outputs, or remove that part from the state."
         )
     singular = float(np.linalg.eigvalsh(q)[0]) <= SINGULAR
     still = _unobservable_modes(a.T, q) if singular else hidden
@@ -202,8 +204,9 @@ def _stationary(a: Array, c: Array, q: Array, r: Array, point: Array) -> tuple[A
     if still.size:
         raise ModelError(
             f"no disturbance reaches the mode with eigenvalue {_text(still)} of the linearisation "
-            f"at x = {point.tolist()}, which neither decays nor grows: the stationary gain does "
-            "not correct it. Give it a small variance, or take qpmhe.ExtendedKalman."
+            f"at x = {point.tolist()}, which "
+            "neither decays nor grows, so the stationary gain does not correct it. Give it a small "
+            "variance, or use qpmhe.ExtendedKalman."
         )
     try:
         covariance = np.asarray(solve_discrete_are(a.T, c.T, q, r), dtype=np.float64)
@@ -288,9 +291,9 @@ def _placed_scaled(a: Array, c: Array, poles: ComplexArray, point: Array) -> Arr
     off = float(np.abs(placed - asked).max() / np.abs(asked).max())
     if not (off < 1e-3 and spectral_radius(a - gain @ c) < 1.0):
         raise ModelError(
-            f"the poles about x = {point.tolist()} come out as "
-            f"{_text(_eigenvalues(a - gain @ c))} instead of {_text(poles)}: the pair is too "
-            "ill-conditioned. Ask for slower poles, or give covariances instead."
+            f"the poles about x = {point.tolist()} come out as {_text(_eigenvalues(a - gain @ c))} "
+            f"instead of {_text(poles)}: the pair is too ill-conditioned. Choose slower poles, or "
+            "give covariances instead."
         )
     return gain
 
@@ -303,7 +306,7 @@ def _place_poles(a: Array, c: Array, poles: ComplexArray) -> Array:
     if times.max() > rank:
         raise OptionError(
             f"the pole {_text(values[[times.argmax()]])} is given {times.max()} times; "
-            f"expected at most rank C = {rank} times. Move its copies a little apart."
+            f"expected at most rank C = {rank} times. Move the copies slightly apart."
         )
     with warnings.catch_warnings():
         # It warns where it has not found the most robust of the gains with these poles.
@@ -328,16 +331,16 @@ def _checked_poles(poles: ArrayLike, n: int) -> ComplexArray:
     outside = given[~(np.abs(given) < 1.0)]
     if outside.size:
         raise OptionError(
-            f"the poles {_text(outside)} do not lie inside the unit circle; a continuous-time "
-            "pole s is exp(s dt) here."
+            f"the poles {_text(outside)} do not lie inside the unit circle; for a continuous-time "
+            "pole s, give exp(s dt)."
         )
     upper, lower = given[given.imag > 0.0], given[given.imag < 0.0]
     if upper.size != lower.size or not np.allclose(
         np.sort_complex(upper), np.sort_complex(lower.conj()), rtol=0.0, atol=1e-9
     ):
         raise OptionError(
-            f"poles is {_text(given)}; expected complex poles in conjugate pairs, as a real "
-            "gain gives them."
+            f"poles is {_text(given)}; expected complex poles "
+            "in conjugate pairs, since the gain is real."
         )
     return np.concatenate((given[given.imag == 0.0], upper, upper.conj()))
 

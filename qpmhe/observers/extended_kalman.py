@@ -19,28 +19,28 @@ class ExtendedKalman(KalmanType):
         S = C P C^\top + R, \quad K = A P C^\top S^{-1}, \quad L(z, v) = K v, \quad
         P^+ = (A - K C) P (A - K C)^\top + K R K^\top + Q
 
-    linear in v, so that (eq:kappa) holds with the largest :math:`|K(t)|` met. On a linear
-    system it is the Kalman filter; its covariance can weigh the prior, see
-    `qpmhe.ObserverPrior`. It is robustly stable only where the Kalman filter of the
-    linearisation is; the estimator inherits what this observer has.
+    The correction is linear in v, so (eq:kappa) holds with the largest :math:`|K(t)|` that occurs.
+    On a linear system it is the Kalman filter. Its covariance can weight the prior, see
+    `qpmhe.ObserverPrior`. It is robustly stable only where the Kalman filter of the linearisation
+    is, and the estimator inherits this.
 
     Parameters
     ----------
     prior, disturbance, noise : (n, n), (r, r) and (p, p) array_like
         Covariances P(0) of the initial error x(0) - z(0), Q of w and R of v. P(0) and Q may be
-        singular. r is n, or the number of columns of the system's ``disturbance_matrix`` G, in
-        whose place :math:`G Q G^\top` then stands above.
+        singular. r is n, or the number of columns of the system's ``disturbance_matrix`` G; then
+        :math:`G Q G^\top` replaces Q above.
     innovation : Gate or HuberInnovation, optional
-        What to make of innovations that S does not explain; without it all correct alike. K and
-        :math:`P^+` are then those of the outputs that pass, with the P and R of the rule; K takes
-        finitely many forms, each bounded, so (eq:kappa) holds as before.
+        Rule for innovations that S does not explain; by default all correct alike. K and
+        :math:`P^+` then use the outputs that pass, with the P and R of the rule; K takes finitely
+        many forms, each bounded, so (eq:kappa) still holds.
 
     Raises
     ------
     WeightError, ShapeError
         If a covariance is not square, symmetric and positive semidefinite, R definite.
     OptionError
-        If ``innovation`` is none of these, or a group of its gate has an output beyond R's.
+        If ``innovation`` is neither, or a group of its gate names an output that R does not have.
 
     References
     ----------

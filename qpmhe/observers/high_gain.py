@@ -18,36 +18,35 @@ Sampling = Literal["exact", "euler"]
 
 
 class HighGain(Luenberger):
-    r"""Constant gain for the observability canonical form, as high as wanted.
+    r"""Constant gain, arbitrarily high, for the observability canonical form.
 
-    For systems that are, sampled with the step dt,
+    For systems that equal, sampled with the step dt,
 
     .. math::
         \dot x_i = x_{i+1} + \varphi_i(x_1, \dots, x_i, u), \quad i = 1, \dots, n - 1, \qquad
         \dot x_n = \varphi_n(x, u), \qquad y = x_1
 
-    or are close to it: the one output is the first state itself, each state enters the rate
-    of the one before it with the factor 1, and the :math:`\varphi_i` are Lipschitz continuous.
-    A position with its derivatives is the common case. The order of the states, and y = x_1
-    without factor, matter; another model has to be brought to these coordinates first.
+    or are close to it: the only output is the first state itself, each state enters the rate of the
+    previous one with factor 1, and the :math:`\varphi_i` are Lipschitz continuous. A position with
+    its derivatives is the common case. Transform any other model to these coordinates first, with
+    this order of states and y = x_1 without a factor.
 
-    In continuous time the gain is :math:`(\alpha_1/\varepsilon, \alpha_2/\varepsilon^2,
-    \dots, \alpha_n/\varepsilon^n)`, so that the chain alone, without :math:`\varphi`, has the
-    poles :math:`r_i/\varepsilon` where the :math:`r_i` are the roots of
-    :math:`s^n + \alpha_1 s^{n-1} + \dots + \alpha_n`. One Euler step of that observer is
-    stable only where dt is small against :math:`\varepsilon`. Here the gain of the
-    discrete-time observer gives the *sampled* chain, A_d, the same poles sampled:
+    In continuous time the gain :math:`(\alpha_1/\varepsilon, \alpha_2/\varepsilon^2, \dots,
+    \alpha_n/\varepsilon^n)` gives the chain without :math:`\varphi` the poles
+    :math:`r_i/\varepsilon`, where the :math:`r_i` are the roots of :math:`s^n + \alpha_1 s^{n-1} +
+    \dots + \alpha_n`. One Euler step of that observer is stable only if dt is small against
+    :math:`\varepsilon`. Here the discrete-time gain gives the *sampled* chain, A_d, the sampled
+    poles:
 
     .. math::
         \operatorname{eig}(A_d - K e_1^\top) = e^{r_i\, dt/\varepsilon}, \qquad L(z, v) = K v
 
     For dt small against :math:`\varepsilon` this is dt times the continuous-time gain; for
-    :math:`\varepsilon \to 0` it is a deadbeat observer of the chain. Smaller
-    :math:`\varepsilon` means faster convergence and less effect of :math:`\varphi`, but more
-    noise in the estimate and a higher peak at the start, both like
-    :math:`\varepsilon^{1-n}`; (eq:kappa) holds with :math:`\kappa = |K|`. Nothing saturates
-    the peak: bound the disturbance set W if corrections as large as that are not to be
-    candidates, or start near y.
+    :math:`\varepsilon \to 0` it is a deadbeat observer of the chain. Smaller :math:`\varepsilon`
+    means faster convergence and less effect of :math:`\varphi`, but more noise in the estimate and
+    a higher peak at the start, both like :math:`\varepsilon^{1-n}`; (eq:kappa) holds with
+    :math:`\kappa = |K|`. Nothing saturates the peak: bound the disturbance set W to exclude such
+    large corrections as candidates, or start near y.
 
     Parameters
     ----------
@@ -58,11 +57,11 @@ class HighGain(Luenberger):
     dt : float
         Sampling time, above 0. Steps of another length keep the gain.
     coefficients : (n,) array_like, optional
-        :math:`\alpha_1, \dots, \alpha_n`, without unit, of a polynomial with all roots in the
-        open left half plane; those of :math:`(s + 1)^n` if left out.
+        :math:`\alpha_1, \dots, \alpha_n`, without unit, of a polynomial with all roots in the open
+        left half plane; by default those of :math:`(s + 1)^n`.
     sampling : {"exact", "euler"}
-        How the system was discretised: ``exact``, which one Runge-Kutta step also is for a
-        chain of up to 5 states, or by one ``euler`` step.
+        How the system was discretised: ``exact``, as by one Runge-Kutta step for a chain of up to 5
+        states, or by one ``euler`` step.
 
     Attributes
     ----------
@@ -72,12 +71,12 @@ class HighGain(Luenberger):
     Raises
     ------
     OptionError, ShapeError
-        If epsilon or dt is not positive, there are not n coefficients, a root is not in the left
-        half plane, or the sampling is unknown.
+        If epsilon or dt is not positive, the number of coefficients is not n, a root is not in the
+        left half plane, or the sampling is unknown.
     ShapeError, InvalidInputError, ModelError
-        Where the observer meets the system: if that has another number of states, another
-        sampling time, or not one output, or if A - K C, with the Jacobians at the initial state
-        (and zero input), is not stable. The text names its spectral radius.
+        When an estimator is made: if the system has another number of states, another sampling
+        time, or more than one output, or if A - K C, with the Jacobians at the initial state (and
+        zero input), is not stable. The message gives its spectral radius.
 
     References
     ----------
@@ -120,8 +119,8 @@ class HighGain(Luenberger):
         n = self.gain.shape[0]
         if system.p != 1:
             raise ShapeError(
-                f"the system has {system.p} outputs; expected 1: a high-gain observer sees a "
-                "chain of states through its first. Take design_luenberger for several."
+                f"the system has {system.p} outputs; expected 1: a high-gain observer measures the "
+                "first state of a chain. Use design_luenberger for several outputs."
             )
         if system.n != n:
             raise ShapeError(f"the high-gain observer is for n = {n}; expected {system.n} states.")
@@ -137,8 +136,8 @@ class HighGain(Luenberger):
             raise ModelError(
                 f"A - K C has the spectral radius {radius:.6g} at the initial state "
                 f"{initial_state.tolist()}; expected less than 1. The output must be the first "
-                f"state (C is {c.tolist()}), each state the rate of the one before, and "
-                "sampling as in the system; else try another epsilon."
+                f"state (C is {c.tolist()}), each state the rate of the previous "
+                "one, and sampling as in the system; otherwise try another epsilon."
             )
 
 

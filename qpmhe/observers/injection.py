@@ -1,4 +1,4 @@
-"""An observer with a correction that the user writes."""
+"""An observer with a user-defined correction."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ class OutputInjection(Observer):
     Parameters
     ----------
     correction : callable
-        correction(z, v): z (n,) and the fitting error v (p,) to (n,). Where it meets the
-        system, a `ModelError` is raised if its value has the wrong shape, is not finite, or
-        does not vanish for v = 0.
+        correction(z, v): maps z (n,) and the fitting error v (p,) to (n,). An estimator raises a
+        `ModelError` if the value has the wrong shape, is not finite, or does not vanish for v = 0.
     metric : (n, n) array_like, optional
-        As of `Luenberger`.
+        As for `Luenberger`.
     """
 
     def __init__(
@@ -78,8 +77,8 @@ class OutputInjection(Observer):
             )
         if not np.all(value == 0.0):
             raise ModelError(
-                f"correction is {value.tolist()} at z = {z.tolist()} and v = 0; an observer in "
-                "output-injection form must not correct where the output fits: L(z, 0) = 0."
+                f"correction is {value.tolist()} at z = {z.tolist()} and v = 0; an "
+                "observer in output-injection form must satisfy L(z, 0) = 0."
             )
 
     @property

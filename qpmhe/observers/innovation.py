@@ -1,4 +1,4 @@
-"""What a Kalman-type observer makes of innovations that its covariance does not explain."""
+"""Rules for innovations that the covariance of a Kalman-type observer does not explain."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LONGEST = 10
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The observer's covariance, and what it says of the q outputs that are there.
+    """The observer's covariance, and its prediction of the q available outputs.
 
     Parameters
     ----------
@@ -62,18 +62,18 @@ class Prediction:
 
 
 class Verdict(NamedTuple):
-    """What an observer corrects by.
+    """The data of an observer's correction.
 
     Parameters
     ----------
     covariance : (n, n) array or None
         A larger P; None for the one that it has.
     kept : (q,) bool array or None
-        Which of the outputs that are there correct; None for all.
+        Which of the available outputs correct; None for all.
     noise : (q, q) array or None
         Covariance of the noise of all outputs that are there; None for the one that it has.
     rejections : (s,) int array or None
-        For each sensor how often in a row it has failed, this sample included.
+        Consecutive failures of each sensor, this sample included.
     """
 
     covariance: Array | None = None
@@ -87,7 +87,7 @@ UNJUDGED = Verdict()
 
 
 class Innovation(ABC):
-    """A rule by which a Kalman-type observer judges the innovations of its sensors."""
+    """A rule by which a Kalman-type observer tests the innovations of its sensors."""
 
     #: Samples in a row after which a sensor that fails is due.
     reopen: int
@@ -97,7 +97,7 @@ class Innovation(ABC):
 
     @abstractmethod
     def sensors(self, outputs: int) -> tuple[tuple[int, ...], ...]:
-        """The outputs of each sensor, of so many outputs."""
+        """The outputs of each sensor, for this number of outputs."""
 
     @abstractmethod
     def limits(self, outputs: int) -> Array:
@@ -118,7 +118,7 @@ class Innovation(ABC):
         observed : (p,) bool array
             Which outputs are there.
         rejections : (s,) int array
-            For each sensor how often in a row it has failed before this sample.
+            Consecutive failures of each sensor before this sample.
         """
 
     def _judged(
@@ -207,58 +207,57 @@ class _Judged(NamedTuple):
 
 @dataclass(frozen=True)
 class Gate(Innovation):
-    r"""A chi-square gate for each sensor, which opens again when it has shut for too long.
+    r"""A chi-square gate for each sensor, which reopens after it has been shut for too long.
 
-    A sensor s is one output, or one of the groups. With the rows C of the Jacobian of h, its
-    innovation is tested in its own covariance:
+    A sensor s is one output, or one of the groups. With its rows C of the Jacobian of h, its
+    innovation is tested against its covariance:
 
     .. math::
         v_s^\top S_{ss}^{-1} v_s \le \chi^2_{p_s}(\text{probability}), \qquad
         S = C P C^\top + R
 
-    with :math:`p_s` its outputs that are there. A sensor that fails is rejected: the observer
-    corrects, and its covariance proceeds, as if its outputs were missing.
+    with :math:`p_s` its number of available outputs. A sensor that fails is rejected: the observer
+    corrects, and propagates its covariance, as if its outputs were missing.
 
-    A gate can shut on the truth, where P is too small for the observer's error. A sensor that has
-    been rejected ``reopen`` times in a row and fails once more is therefore due: P becomes
+    A gate can reject correct measurements if P is too small for the observer's error. A sensor that
+    has been rejected ``reopen`` times in a row and fails once more is therefore due: P becomes
     :math:`T P T` with
 
     .. math::
         T_{ii}^2 = 1 + (4^{k+1} - 1) \frac{r_i}{\max_j r_j}, \qquad
         r_i = \frac{(P C_s^\top S_{ss}^{-1} C_s P)_{ii}}{P_{ii}}
 
-    and the least k from 1 to 20 with which, with :math:`4^k` in place of :math:`4^{k+1}`, each of
+    and the smallest k from 1 to 20 for which, with :math:`4^k` in place of :math:`4^{k+1}`, each of
     its outputs would pass alone. :math:`r_i` is the share by which the sensor would reduce the
-    variance of :math:`x_i`: the states that it shows grow, and correlations stay. The sensor opens
-    if with this P its innovation passes given those of the sensors that passed before. The observer
-    then corrects by it, too, and its count starts anew; where several open at once, each
-    :math:`T_{ii}` is the largest of theirs.
-    So the covariance explains what the observer corrects by, and the gain is near one along it.
+    variance of :math:`x_i`: the variances of the states that it shows grow, correlations stay. The
+    sensor opens if, with this P, its innovation passes given the innovations of the sensors that
+    passed before. The observer then also corrects with it, and its count restarts; if several open
+    at once, each :math:`T_{ii}` is their largest. So the covariance explains the innovations used,
+    and the gain is near one along them.
 
-    Otherwise the sensors that pass contradict it, and it stays rejected for another ``reopen``
-    samples. So a sensor with a lasting fault stays shut where others show the same, and is followed
-    where it alone does. As it may be the others that are wrong, they are not asked where they have
-    fewer outputs than the sensors that were rejected so often, nor about a sensor that was rejected
-    ten times ``reopen`` times in a row, which opens at the latest then. When one sensor is due, so
-    are all that were rejected ``reopen`` times. A sensor stays shut where no k makes it pass: P
-    spans nothing of what it sees, or its outputs contradict each other. Samples in which a sensor
-    is missing do not count.
+    Otherwise the passing sensors contradict it, and it stays rejected for another ``reopen``
+    samples. So a sensor with a lasting fault stays shut if others measure the same, and is followed
+    if it alone does. The others may be wrong instead: they are ignored if they have fewer outputs
+    than the sensors rejected that often, and for a sensor rejected 10 ``reopen`` times in a row,
+    which then opens at the latest. When one sensor is due, so are all that were rejected ``reopen``
+    times. A sensor stays shut if no k makes it pass: P does not span what it measures, or its
+    outputs contradict each other. Samples in which a sensor is missing do not count.
 
     Parameters
     ----------
     probability : float
-        Probability with which a sensor without fault passes, above 0 and below 1.
+        Probability that a sensor without fault passes, above 0 and below 1.
     reopen : int
-        Rejections in a row after which a sensor opens, at least 1.
+        Consecutive rejections after which a sensor reopens, at least 1.
     groups : sequence of sequences of int, optional
-        Outputs that are one sensor, as the components of a position; each output in at most one
-        group. The others are sensors of their own, and sensors are in the order of their first
+        Outputs that form one sensor, such as the components of a position; each output in at most
+        one group. Every other output is a sensor by itself. Sensors are ordered by their first
         outputs.
 
     Raises
     ------
     OptionError
-        If a value is out of its range, or an output is in two groups or not one of the system's.
+        If a value is out of range, or an output is in two groups or not one of the system's.
 
     References
     ----------
@@ -276,8 +275,8 @@ class Gate(Innovation):
         probability = finite(self.probability)
         if probability is None or not 0.0 < probability < 1.0:
             raise OptionError(
-                f"probability is {shown(self.probability)}; expected a number above 0 and below 1, "
-                "as 0.997."
+                f"probability is {shown(self.probability)}; expected a number above 0 and "
+                "below 1, such as 0.997."
             )
         object.__setattr__(self, "probability", probability)
         object.__setattr__(self, "reopen", _checked_reopen(self.reopen))
@@ -317,39 +316,38 @@ class Gate(Innovation):
 
 @dataclass(frozen=True)
 class HuberInnovation(Innovation):
-    r"""Innovations beyond a threshold count less, as in Huber's M-estimate.
+    r"""Weight innovations beyond a threshold less, as in Huber's M-estimate.
 
-    Each output's innovation is taken in its own standard deviation, and gets Huber's weight:
+    Each output's innovation, in its standard deviation, gets Huber's weight:
 
     .. math::
         \nu_j = v_j / \sqrt{S_{jj}}, \qquad
         \omega_j = \min(1, c / |\nu_j|), \qquad S = C P C^\top + R
 
-    The observer then corrects with the noise covariance
-    :math:`\tilde R = R + \operatorname{diag}(S_{jj} (1 / \omega_j - 1))`, so that the variance of
-    an innovation is :math:`S_{jj} / \omega_j`. With one output this is the correction
-    :math:`K \omega v` and the covariance :math:`P - \omega P C^\top S^{-1} C P` behind it: an
-    outlier corrects by no more than one of c standard deviations does, and the covariance says how
-    little was learnt from it.
+    The observer then corrects with the noise covariance :math:`\tilde R = R +
+    \operatorname{diag}(S_{jj} (1 / \omega_j - 1))`, so that the variance of an innovation is
+    :math:`S_{jj} / \omega_j`. With one output this is the correction :math:`K \omega v` with the
+    covariance :math:`P - \omega P C^\top S^{-1} C P` after it: an outlier corrects by no more than
+    an innovation of c standard deviations, and the covariance decreases accordingly less.
 
-    Alone, this would bring an observer whose covariance is too small back by c standard deviations
-    a sample at most. Where an output has been beyond the threshold ``reopen`` times in a row, P
-    therefore grows before each further sample at which it is, as in `Gate` with k = 0: standard
-    deviations at most double in a sample, so that the model is linearised often on the way. As
-    there, P does not grow while the outputs within the threshold contradict.
+    This alone would correct an observer with too small a covariance by at most c standard
+    deviations per sample. Once an output has been beyond the threshold ``reopen`` times in a row, P
+    therefore grows before each further such sample, as in `Gate` with k = 0: standard deviations at
+    most double per sample, so that the model is relinearised often on the way. As there, P does not
+    grow while the outputs within the threshold contradict this.
 
     Parameters
     ----------
     threshold : float
-        c, without unit, above 0. 1.345 has 95 % of the efficiency of least squares where the noise
-        is Gaussian.
+        c, dimensionless, above 0. 1.345 has 95 % of the efficiency of least squares with Gaussian
+        noise.
     reopen : int
-        Samples in a row beyond the threshold after which P grows, at least 1.
+        Consecutive samples beyond the threshold after which P grows, at least 1.
 
     Raises
     ------
     OptionError
-        If the threshold is not positive, or ``reopen`` no integer above 0.
+        If the threshold is not positive, or ``reopen`` is not an integer above 0.
 
     References
     ----------
@@ -413,13 +411,13 @@ def _checked_groups(groups: Any) -> tuple[tuple[int, ...], ...] | None:
         given = [list(group) for group in groups]
     except TypeError as error:
         raise OptionError(
-            f"groups is {shown(groups)}; expected lists of outputs, as [[0, 1], [2, 3]]."
+            f"groups is {shown(groups)}; expected lists of outputs, such as [[0, 1], [2, 3]]."
         ) from error
     checked = [[integer(output) for output in group] for group in given]
     flat = [output for group in checked for output in group]
     if not all(checked) or any(output is None or output < 0 for output in flat):
         raise OptionError(
-            f"groups is {shown(groups)}; expected lists of outputs, numbers from 0 on."
+            f"groups is {shown(groups)}; expected lists of outputs, integers >= 0."
         )
     if len(set(flat)) < len(flat):
         raise OptionError(f"groups is {shown(groups)}; expected each output in one group at most.")

@@ -20,13 +20,12 @@ class Luenberger(Observer):
     Parameters
     ----------
     gain : (n, p) array_like
-        K, of the discrete-time observer; a vector (n,) will do where p is 1. An
-        `InvalidInputError` is raised if it is not finite; its shape is checked where it meets
-        the system.
+        K of the discrete-time observer, or a vector (n,) if p is 1. An `InvalidInputError` is
+        raised if it is not finite; an estimator checks its shape.
     metric : (n, n) array_like, optional
         M, symmetric positive definite (a `WeightError` is raised otherwise), in which the error
-        is proved to contract: |x(t+1) - z(t+1)|_M <= rho |x(t) - z(t)|_M without noise. The
-        observer is projected onto X in it; see `qpmhe.MovingHorizonEstimator`.
+        provably contracts: |x(t+1) - z(t+1)|_M <= rho |x(t) - z(t)|_M without noise. The observer
+        is projected onto X in it; see `qpmhe.MovingHorizonEstimator`.
     """
 
     def __init__(self, gain: ArrayLike, metric: ArrayLike | None = None) -> None:
@@ -39,8 +38,8 @@ class Luenberger(Observer):
         shape = (system.n, system.p)
         if self.gain.shape != shape:
             raise ShapeError(
-                f"gain has shape {self.gain.shape}; expected (n, p) = {shape}: a row for each "
-                "state, a column for each output."
+                f"gain has shape {self.gain.shape}; expected (n, p) = {shape}: "
+                "one row for each state, one column for each output."
             )
         self._check_metric(system)
 

@@ -16,40 +16,39 @@ from .design import linearize, stationary
 
 
 class SteadyStateKalman(Observer):
-    r"""Constant gain of the stationary Kalman predictor, with the covariance that it has.
+    r"""Constant gain of the stationary Kalman predictor, with its covariance.
 
-    With A and C the Jacobians of f and h at a point, found once, at construction:
+    With A and C the Jacobians of f and h at a point, computed once at construction:
 
     .. math::
         S = C P C^\top + R, \quad K = A P C^\top S^{-1}, \quad L(z, v) = K v, \quad
         P = A P A^\top + Q - K S K^\top
 
-    It costs what a `Luenberger` observer costs in stability and (eq:kappa), with
-    :math:`\kappa` the spectral norm of K, and offers a covariance besides, so that
-    `qpmhe.ObserverPrior` can weigh the prior. That covariance is the one of this observer's
-    own error on the linearisation,
+    Stability and (eq:kappa) are as for a `Luenberger` observer, with :math:`\kappa` the spectral
+    norm of K. In addition it has a covariance, so that `qpmhe.ObserverPrior` can weight the prior:
+    the covariance of this observer's error on the linearisation,
 
     .. math::
         P(t+1) = (A - K C) P(t) (A - K C)^\top + Q + K R K^\top
 
-    which stays at P from P(0) = P on, and leaves it only where outputs are missing (their
-    columns of K are zero then) or a sample comes with another noise weight. The gain itself
-    never changes. On a linear system with P(0) = P it is the Kalman predictor.
+    which stays at P from P(0) = P on, except where outputs are missing (their columns of K are then
+    zero) or a sample has another noise weight. The gain itself never changes. On a linear system
+    with P(0) = P it is the Kalman predictor.
 
     Parameters
     ----------
     system : System
-        The system for which the gain is; the estimator's, or one of the same dimensions.
+        The system of the gain; the estimator's, or one of the same dimensions.
     at : (n,) array_like
         The state about which to linearise; it should be typical of the operation.
     u : (m,) array_like, optional
-        The input there; needed exactly if the system has inputs.
+        The input there; required if the system has inputs.
     disturbance, noise : (r, r) and (p, p) array_like
         Covariances Q of w and R of v (squared units), symmetric; R is positive definite, Q may be
         singular. With the system's ``disturbance_matrix`` G, G Q G' takes the place of Q above.
     prior : (n, n) array_like, optional
-        Covariance P(0) of the initial error x(0) - z(0); the stationary one if left out,
-        which suits an observer that has run for long and is too sure of itself otherwise.
+        Covariance P(0) of the initial error x(0) - z(0); the stationary one if left out, which is
+        realistic after a long run and overconfident otherwise.
 
     Attributes
     ----------
@@ -62,8 +61,8 @@ class SteadyStateKalman(Observer):
         If an argument has the wrong shape, or a covariance is not symmetric and positive
         definite.
     ModelError
-        If the model cannot be linearised at the point, or its linearisation is not
-        detectable there; the text names the mode that is not observed.
+        If the model cannot be linearised at the point, or its linearisation is not detectable
+        there; the message names the unobserved mode.
 
     References
     ----------

@@ -38,20 +38,20 @@ class UnscentedKalman(KalmanType):
         P^+ &= \textstyle\sum_j (F_j - K H_j)(F_j - K H_j)^\top + K R K^\top + Q
         \end{aligned}
 
-    It differs from the textbook's filter, for a reason: an observer in output-injection
-    form (eq:observer) steps from z to f(z) where the output fits, L(z, 0) = 0, whereas the
-    textbook's steps to the mean of the f(z + d_j) and compares y with the mean of the
-    h(z + d_j). Deviations are therefore taken from f(z) and h(z). So K is the gain of least
-    mean square error among corrections of the form K v, and the bias that remains is part
-    of :math:`P^+`, which is positive definite whatever the spread. On a linear system both
-    are the Kalman filter; as the spread vanishes this one becomes `ExtendedKalman`.
+    It differs from the textbook filter for a reason: an observer in output-injection form
+    (eq:observer) steps from z to f(z) where the output fits, L(z, 0) = 0, while the textbook filter
+    steps to the mean of the f(z + d_j) and compares y with the mean of the h(z + d_j). Deviations
+    are therefore taken from f(z) and h(z). K then has the least mean square error among corrections
+    K v, and :math:`P^+` includes the remaining bias; it is positive definite for any spread. On a
+    linear system both are the Kalman filter; as the spread vanishes this one becomes
+    `ExtendedKalman`.
 
-    Linear in v, so that (eq:kappa) holds with the largest :math:`|K(t)|` met. The model is
-    evaluated at 2n + 1 states in each step. Where X has bounds, the two sigma points of a
-    direction are drawn nearer to z, with a larger weight, so far that they satisfy the
-    bounds, but not nearer than a thousandth; where z is on a bound, both lie inside of it.
-    Where f or h cannot be evaluated at a sigma point, the stage fails as it does where they
-    cannot be evaluated at z. Steps of unusual length and missing outputs are taken as they are.
+    The correction is linear in v, so (eq:kappa) holds with the largest :math:`|K(t)|` that occurs.
+    The model is evaluated at 2n + 1 states per step. If X has bounds, the two sigma points of a
+    direction move towards z, with a larger weight, until they satisfy the bounds, but at most to a
+    thousandth of their distance; if z is on a bound, both lie inside it. If f or h cannot be
+    evaluated at a sigma point, the stage fails as if they could not be evaluated at z. Steps of
+    unusual length and missing outputs are supported.
 
     Parameters
     ----------
@@ -63,15 +63,15 @@ class UnscentedKalman(KalmanType):
         :math:`\sqrt{n + \lambda}` or :math:`\alpha \sqrt{n + \kappa}` of the textbooks.
         :math:`\sqrt 3` matches the fourth moments of a Gaussian along each direction.
     innovation : Gate or HuberInnovation, optional
-        As for `ExtendedKalman`, with :math:`\sum_j H_j H_j^\top` in place of
-        :math:`C P C^\top`. Where P grows, sigma points are drawn anew.
+        As for `ExtendedKalman`, with :math:`\sum_j H_j H_j^\top` in place of :math:`C P C^\top`. If
+        P grows, sigma points are drawn again.
 
     Raises
     ------
     WeightError, ShapeError
         If a covariance is not square, symmetric and positive semidefinite, R definite.
     OptionError
-        If the spread is not positive, or ``innovation`` is none of these.
+        If the spread is not positive, or ``innovation`` is neither.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""The error of a run and bounds of it."""
+"""The error of a run, and its bounds."""
 
 from __future__ import annotations
 

@@ -38,11 +38,11 @@ def label_list(labels: Sequence[str], n: int | None = None) -> list[str]:
     given = list(labels) if np.iterable(labels) and not isinstance(labels, str) else None
     if given is None or not all(isinstance(label, str) for label in given):
         raise InvalidInputError(
-            f"labels are {labels!r}; expected a sequence of strings, one a state."
+            f"labels are {labels!r}; expected a sequence of strings, one per state."
         )
     if len(given) != n if n is not None else not given:
         raise ShapeError(
-            f"labels are {given}; expected {'at least 1' if n is None else n}, one a state."
+            f"labels are {given}; expected {'at least 1' if n is None else n}, one per state."
         )
     return given
 
@@ -51,12 +51,12 @@ def sample_times(times: ArrayLike) -> NDArray[Any]:
     """The times of samples, (T + 1,), numbers or dates, checked."""
     given = np.asarray(times)
     if given.ndim != 1:
-        raise ShapeError(f"times have shape {given.shape}; expected (T + 1,), one a state.")
+        raise ShapeError(f"times have shape {given.shape}; expected (T + 1,), one per state.")
     return given
 
 
 def curve(name: str, values: ArrayLike, length: int, n: int) -> Array:
-    """A row of n states at each of the times, (length, n); (length,) will do for n = 1."""
+    """A row of n states at each of the times, (length, n); (length,) is accepted for n = 1."""
     array = numbers(name, values, finite=False)
     if array.ndim == 1 and n == 1:
         array = array[:, None]
@@ -71,7 +71,7 @@ def curve(name: str, values: ArrayLike, length: int, n: int) -> Array:
 def named_curves(
     estimates: Mapping[str, ArrayLike], length: int, n: int, most: int
 ) -> dict[str, Array]:
-    """The `curve` of each label, at most so many."""
+    """The `curve` of each label, at most `most`."""
     if not isinstance(estimates, Mapping):
         raise InvalidInputError(
             f"estimates are of type {type(estimates).__name__}; expected a mapping of labels to "
@@ -80,7 +80,7 @@ def named_curves(
     if len(estimates) > most:
         raise InvalidInputError(
             f"estimates are {len(estimates)}: {', '.join(map(str, estimates))}; expected at most "
-            f"{most}, which readers can distinguish. Draw the others into other axes."
+            f"{most}, so that readers can distinguish them. Draw the others into other axes."
         )
     return {
         label: curve(f"estimates[{label!r}]", values, length, n)

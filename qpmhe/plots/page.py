@@ -1,4 +1,4 @@
-"""What a notebook shows of a run: its facts, and small plots of states and costs."""
+"""What a notebook shows of a run: its main numbers, and small plots of states and costs."""
 
 from __future__ import annotations
 

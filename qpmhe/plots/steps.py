@@ -1,4 +1,4 @@
-"""What the steps of a run came to: costs, outcomes, times."""
+"""The steps of a run: costs, outcomes, times."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def costs(
 ) -> Any:
     """True cost J of estimates and candidates, on a logarithmic axis; kept steps are marked.
 
-    Errors are those of `states`.
+    Raises the errors of `states`.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def outcomes(
     Parameters
     ----------
     run, dt, time_label, axes
-        As for `costs`, errors too.
+        As for `costs`, with the same errors.
     """
     check_run(run)
     times, when = run_times(run, dt, time_label)
@@ -95,12 +95,12 @@ def outcomes(
 
 
 def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> Any:
-    """Share of the steps that took longer than a time, with the solver's part beside.
+    """Share of the steps that took longer than a time, and the same for the solver's part.
 
     Parameters
     ----------
     run, axes
-        As for `costs`, errors too.
+        As for `costs`, with the same errors.
     deadline : float, optional
         Seconds, drawn as a line.
     """

@@ -69,7 +69,7 @@ LIGHT: Any = {
 
 
 def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
-    """How lines are drawn: the observer and the estimate as ever, the others as they come."""
+    """Line styles: fixed for the observer and the estimate, in turn for the others."""
     names = [str(label).lower() for label in labels]
     found: dict[int, dict[str, Any]] = {
         k: OBSERVER for k, name in enumerate(names)
@@ -85,7 +85,7 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
 def run_times(
     run: Run, dt: float | None, time_label: str | None
 ) -> tuple[NDArray[np.float64], str]:
-    """Times of the states of a run, and the label of their axis: seconds where steps are known."""
+    """Times of the states of a run, and the label of their axis: seconds if steps are known."""
     source, count = run.source, len(run)
     if dt is None and source is not None:
         dt = source.system.dt
@@ -145,10 +145,10 @@ def save(
     Parameters
     ----------
     figure : matplotlib.figure.Figure
-        The figure; of axes, ``axes.figure``.
+        The figure; for axes, ``axes.figure``.
     stem : str or Path
-        Path without suffix; its folder is made. ``.png``, ``.svg`` or ``.pdf`` at its end is taken
-        off, any other dot belongs to the name: of ``run_0.5`` comes ``run_0.5.png``.
+        Path without suffix; its folder is made. ``.png``, ``.svg`` or ``.pdf`` at its end is
+        removed; any other dot belongs to the name: ``run_0.5`` gives ``run_0.5.png``.
     width : {"single", "double"} or float, optional
         The width in a paper: a column of 84 mm, two columns of 174 mm, or inches. The files are as
         wide as that, with letters of 7 points, embedded in the PDF.
@@ -156,16 +156,16 @@ def save(
     Raises
     ------
     InvalidInputError
-        If the figure is none, or the path names no file.
+        If it is not a figure, or the path names no file.
     OptionError
-        If the width is neither.
+        If the width is neither a name nor in range.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     if not isinstance(figure, Figure):
         raise InvalidInputError(
-            f"figure is of type {type(figure).__name__}; expected a matplotlib Figure: of axes, "
+            f"figure is of type {type(figure).__name__}; expected a matplotlib Figure; for axes, "
             "axes.figure."
         )
     try:

@@ -32,8 +32,8 @@ def trajectories(
     truth : (T + 1, n) array or None
         The real states, where they are known.
     estimates : mapping of label to (T + 1, n) array
-        At most six estimates, drawn in this order; "observer" and "candidate" have a colour of
-        their own, which is the same in all figures.
+        At most six estimates, drawn in this order; "observer" and "candidate" have the same colours
+        in all figures.
     labels : sequence of str
         Axis labels of the states, with units.
     time_label : str
@@ -41,15 +41,16 @@ def trajectories(
     axes : sequence of n matplotlib Axes, optional
         Where to draw; a figure is made if left out: ``axes[0].figure`` of the axes returned.
     residual : optional
-        The system's ``state_residual``: the estimates of angles are drawn on the turn on which
-        the truth is.
+        The system's ``state_residual``: estimates of angles are drawn in the same turn as the
+        truth.
 
     Raises
     ------
     ShapeError
-        If labels, curves and axes are not of the same states, or curves not of these times.
+        If labels, curves and axes do not fit the same states, or curves do not fit the times.
     InvalidInputError
-        If something is no array, labels no strings, axes no axes, or the estimates too many.
+        If something is not an array, labels are not strings, axes are not Axes, or there are too
+        many estimates.
     """
     names, when = label_list(labels), sample_times(times)
     length, n = when.size, len(names)
@@ -76,12 +77,12 @@ def states(
     band: tuple[ArrayLike, ArrayLike] | None = None, axes: Any = None,
     residual: Residual | None = None,
 ) -> list[Any]:
-    """The estimates of a run, with bands of their covariances and of what is proved.
+    """The estimates of a run, with bands of their covariances and of the proved set.
 
     Parameters
     ----------
     run : Run
-        Of `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
+        From `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
     dt : float, optional
         Time between samples, in the unit of ``time_label``; the system's if left out.
     time_label : str, optional
@@ -91,15 +92,15 @@ def states(
     sigmas : float
         Half the width of a band, in standard deviations.
     band : (lower, upper), optional
-        Sides (T + 1, n) of what holds the true state, as ``lower`` and ``upper`` of a
+        Sides (T + 1, n) of a box that contains the true state, as ``lower`` and ``upper`` of a
         `qpmhe.certificates.Band`; nothing is drawn where they are NaN.
 
     Raises
     ------
     InvalidInputError
-        If run is no `Run`, labels are no strings or axes no axes.
+        If run is not a `Run`, labels are not strings or axes not Axes.
     ShapeError
-        If labels, truth, axes or band are not of the run's states and times.
+        If labels, truth, axes or band do not fit the run's states and times.
     OptionError
         If a number is not above zero.
     """
@@ -147,12 +148,12 @@ def window(
     estimate: Estimate, *, dt: float | None = None, labels: Sequence[str] | None = None,
     time_label: str | None = None, axes: Any = None,
 ) -> list[Any]:
-    """The window of one estimate: the observer's candidate, and what became of it.
+    """The window of one estimate: the observer's candidate, and the estimated trajectory.
 
     Parameters
     ----------
     estimate : Estimate
-        Of `MovingHorizonEstimator.update`.
+        From `MovingHorizonEstimator.update`.
     dt, labels, time_label, axes
         As for `states`; an estimate does not know the time between samples.
 

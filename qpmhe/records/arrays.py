@@ -16,8 +16,8 @@ from .steps import Steps
 class RecordArrays(NamedTuple):
     """Outputs (T, p), NaN in gaps; inputs (T, m) or None; and what else a record has.
 
-    ``lengths`` (T,) are those of the steps where they differ, ``usual`` is the usual one, and
-    ``states`` (T, n) are the true states, where columns for them are named.
+    ``lengths`` (T,) are the step lengths if they differ, ``usual`` is the usual one, and ``states``
+    (T, n) are the true states, if columns for them are named.
     """
 
     measurements: Array
@@ -69,7 +69,7 @@ def _read(
     finally:
         reader.close()
     if not ys:
-        raise reader.error("it has a header and no samples; expected a line for each.", None)
+        raise reader.error("it has a header but no samples; expected one line per sample.", None)
     dt = None
     if any(each is not None for each in lengths):
         typical = steps.usual or np.nan

@@ -24,14 +24,14 @@ _SECONDS = 30.0
 
 @dataclass(frozen=True)
 class BoundOptions:
-    """What the bound is for; what is left out comes from the model and its scenario.
+    """Sets and sizes for the bound; the model and its scenario supply what is left out.
 
     Parameters
     ----------
     box, input_box : Box, optional
-        The set in which state and observer stay, and the one in which the inputs do.
+        The sets in which state and observer stay, and in which the inputs stay.
     initial_error, max_disturbance, max_noise : float or array_like, optional
-        What bounds x_0 - z_0, w and v: one number for the length, or one for each component.
+        Bounds of x_0 - z_0, w and v: one number for the length, or one for each component.
     """
 
     box: Box | None = None
@@ -41,7 +41,7 @@ class BoundOptions:
     max_noise: ArrayLike | None = None
 
     def identity(self) -> dict[str, Any]:
-        """What a run that resumes must share, as plain numbers."""
+        """What a resumed run must share, as plain numbers."""
         found: dict[str, Any] = {}
         for name in (each.name for each in fields(self)):
             value = getattr(self, name)
@@ -52,7 +52,7 @@ class BoundOptions:
 
 
 class RowBounds:
-    """Follows the bound through a record, and gives the columns of each row.
+    """Follows the bound through a record, and provides the columns of each row.
 
     A `NotCertifiedError` or `CertificateError` is raised if nothing is certified, an `OptionError`
     if the model does not give what the options leave out.
@@ -79,8 +79,8 @@ class RowBounds:
             start = _size("--initial-error", options.initial_error, n, 0.0)
         if start is None:
             raise OptionError(
-                "--initial-error is missing, and the model has no scenario that says how far the "
-                "first state is from the first estimate; give it, one number for each state."
+                "--initial-error is missing, and the model has no scenario that states how far the "
+                "first state is from the first estimate; give one number for each state."
             )
         self.proved: ObserverBound = bound_observer(
             system, mhe.observer, mhe.cost, region, sizes=sizes, seconds=_SECONDS
@@ -98,7 +98,7 @@ class RowBounds:
         ]
 
     def check(self, estimate: Estimate, u: Array, dt: float | None, time: str) -> None:
-        """Take an estimate in; what ends the bound is reported once."""
+        """Process an estimate; report once what ends the bound."""
         held = self._watch.lost is None
         usual = self._estimator.usual.parameters
         full = u if usual is None else np.append(u, usual)

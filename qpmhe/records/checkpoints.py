@@ -1,4 +1,4 @@
-"""The checkpoint beside the results: all that it takes to resume, written atomically."""
+"""The checkpoint beside the results: all that a resumed run needs, written atomically."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class WriteError(InvalidInputError):
 
 
 def versions() -> dict[str, str]:
-    """Of what computes the results."""
+    """Versions of the software that computes the results."""
     return {"qpmhe": __version__, "numpy": np.__version__, "machine": platform.machine()}
 
 
@@ -37,8 +37,8 @@ def versions() -> dict[str, str]:
 class Checkpoint:
     """Where an estimation stands after a number of samples.
 
-    `identity` is the model and the options, which a run that resumes must share; `offset` is
-    the length of the results; `time` and `inputs` are those of the last sample.
+    `identity` is the model and the options, which a resumed run must share; `offset` is the length
+    of the results; `time` and `inputs` are those of the last sample.
     """
 
     identity: dict[str, Any]
@@ -57,7 +57,7 @@ class Checkpoint:
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; whatever happens, the old or the new one is there.
+    """Write a checkpoint; after any interruption the old or the new one is complete.
 
     The file is a digest, and a JSON text with all bits of arrays: nothing in it can run.
     """
@@ -92,13 +92,13 @@ def load(path: Path) -> Checkpoint | None:
         return None
     except (OSError, ValueError, TypeError) as error:
         raise CheckpointError(
-            f"the checkpoint {path} cannot be read ({error}); start again by --overwrite, or "
+            f"the checkpoint {path} cannot be read ({error}); start again with --overwrite, or "
             "resume with the version of qpmhe that made it."
         ) from error
 
 
 def plain(identity: dict[str, Any]) -> dict[str, Any]:
-    """The identity as a checkpoint gives it back; objects by the name of their type."""
+    """The identity as a checkpoint restores it; objects become the name of their type."""
     found: dict[str, Any] = json.loads(json.dumps(identity, default=_named))
     return found
 

@@ -34,7 +34,7 @@ class _Kept(NamedTuple):
 
 
 class KeptRun:
-    """Collects samples and estimates, of steps of any length."""
+    """Collects samples and estimates, with steps of any length."""
 
     def __init__(self, estimator: MovingHorizonEstimator, steps: Steps) -> None:
         self._estimator, self._steps = estimator, steps

@@ -37,8 +37,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 class Measurement:
     """One sample: y is NaN where it is missing, u holds its last value there.
 
-    `complete` says that nothing that comes later in the record can change it or its step;
-    `line` is 0 if it comes from a checkpoint.
+    `complete` says that no later line of the record can change it or its step; `line` is 0 if it
+    comes from a checkpoint.
     """
 
     line: int
@@ -96,7 +96,7 @@ class RecordReader:
         return RecordError(what, self.name, line, column, self._table.unit)
 
     def place(self, sample: Measurement) -> str:
-        """What texts call a sample of this record."""
+        """How messages name a sample of this record."""
         line = f", {self._table.unit} {sample.line}" if sample.line else ""
         return f"{self.name}{line} (time {sample.time.text})"
 
@@ -140,12 +140,20 @@ class RecordReader:
         except ValueError as error:
             field = row.fields[position].strip()
             shown = field if len(field) <= 40 else f"{field[:40]}..."
-            is_time = position == self._columns.time
-            remedy = (
-                "expected a number, or a date such as 2026-05-04T12:00:00 or 04.05.2026 12:00:00; "
-                "choose another form by --time-format, such as '%d/%m/%Y %H:%M:%S'" if is_time
-                else "correct it, or leave it blank if it is missing"
-            )
+            if position != self._columns.time:
+                remedy = "correct it, or leave it blank if it is missing"
+                if str(error) == "is not a number":
+                    remedy += ", or declare it missing with --missing"
+            else:
+                remedy = (
+                    "correct the line or --time-format; %f is a fraction of a second"
+                    if self._reader.has_format
+                    else "expected a number, or a date such as 2026-05-04T12:00:00 or 04.05.2026 "
+                    "12:00:00; choose another form with --time-format, such as "
+                    "'%d/%m/%Y %H:%M:%S', followed by '.%f' for fractions of a second"
+                )
+                if not any(mark.isdigit() for mark in field):
+                    remedy += "; delete the line if it holds units or a comment"
             what = f"{shown!r} {error}; {remedy}." if shown else f"the time {error}."
             if not row.ended:
                 what += " It is the last line, which has no end and may be cut off."
@@ -184,8 +192,8 @@ class Columns(NamedTuple):
 class ColumnNames:
     """The model's names of y and u, and the options --time, --outputs and --inputs.
 
-    With ``option="truth"`` the true states stand in the place of the outputs; those without a
-    column have no truth.
+    With ``option="truth"`` the true states take the place of the outputs; those without a column
+    have no truth.
     """
 
     outputs: tuple[str, ...]
@@ -199,16 +207,17 @@ class ColumnNames:
         """The columns in a header; RecordError where one is missing or ambiguous."""
         table = _Header([name.strip() for name in header], file, line)
         times = _TIMES if self.time is None else (self.time,)
-        time = table.find(times, "the time", "name it by --time COLUMN.")
+        time = table.find(times, "the time", "name it with --time COLUMN.")
         outputs = _find(table, self.option, self.outputs, self.output_columns)
         inputs = _find(table, "inputs", self.inputs, self.input_columns)
         if all(position < 0 for position in outputs):
             kind = _KINDS[self.option][1]
-            raise OptionError(f"--{self.option} leaves all {kind}s out; expected a column for one.")
+            raise OptionError(f"--{self.option} leaves out all {kind}s; expected a column for at "
+                              "least one.")
         if time in (*outputs, *inputs):
             raise OptionError(
                 f"column {header[time]!r} is both the time and something else; choose a different "
-                f"column for each by --time, --{self.option} and --inputs."
+                f"column for each with --time, --{self.option} and --inputs."
             )
         return Columns(time, outputs, inputs)
 
@@ -221,9 +230,9 @@ def _find(
     found = []
     for i, name in enumerate(names):
         guesses = [name, f"{letter}{i + 1}", f"{letter}_{i + 1}", *[letter] * (len(names) == 1)]
-        remedy = f"name it by --{option} {letter}{i + 1}=COLUMN"
+        remedy = f"name it with --{option} {letter}{i + 1}=COLUMN"
         if option == "outputs":
-            remedy += f", or leave it out by --outputs {letter}{i + 1}= (no column)"
+            remedy += f", or leave it out with --outputs {letter}{i + 1}= (no column)"
         elif option == "truth":
             remedy += ", or leave it out: then the state has no truth"
             guesses = [""]
@@ -293,7 +302,7 @@ def _chosen(
         name, equals, column = (part.strip() for part in item.partition("="))
         if not equals or name not in indices:
             raise OptionError(
-                f"--{option} has {item!r}; expected NAME=COLUMN between commas with a name of "
+                f"--{option} has {item!r}; expected comma-separated NAME=COLUMN with a name of "
                 f"{known}, or {len(names)} columns in order."
             )
         if indices[name] in found:
@@ -314,7 +323,7 @@ class Time(NamedTuple):
 
 
 def seconds_between(before: Time, after: Time) -> float:
-    """Difference of two times of one kind: of numbers in their unit, of dates in seconds."""
+    """Difference of two times of one kind: numbers in their unit, dates in seconds."""
     difference = after.value - before.value
     return float(difference) if after.kind == "number" else difference / 1e9
 
@@ -342,6 +351,11 @@ class FieldReader:
             except ValueError:
                 continue
 
+    @property
+    def has_format(self) -> bool:
+        """Whether the user gave the form of the times."""
+        return self._format is not None
+
     def number(self, field: str) -> float:
         """The value of a field, NaN where it is missing; ValueError where it is no number."""
         text = field.strip()
@@ -352,7 +366,7 @@ class FieldReader:
         if mark and mark != self._mark:
             raise ValueError(
                 f"has the decimal mark {mark!r}, where {self._mark!r} is expected; use the same "
-                "one in all numbers, or choose it by --decimal"
+                "one in all numbers, or choose it with --decimal"
             )
         return math.nan if value in self._numbers else value
 

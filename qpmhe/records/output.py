@@ -108,7 +108,7 @@ class Output:
         self._rows: Any = csv.writer(cast(Any, _Echo()), lineterminator="\n")
         if str(out) == "-":
             if sys.stdout is None:
-                raise OptionError("standard output is closed; name a file by --out.")
+                raise OptionError("standard output is closed; name a file with --out.")
             return
         self.path = self.target = path = Path(out)
         if path.suffix not in (".csv", ".parquet"):
@@ -125,12 +125,12 @@ class Output:
 
     @property
     def name(self) -> str:
-        """What texts call the place where rows are."""
+        """How messages name the place of the rows."""
         return "standard output" if self.path is None else str(self.path)
 
     @property
     def digest(self) -> str:
-        """Of all bytes so far."""
+        """Digest of all bytes so far."""
         return self._hash.hexdigest()
 
     def use(self, stream: BinaryIO) -> None:
@@ -138,7 +138,7 @@ class Output:
         self._stream = stream
 
     def begin(self) -> None:
-        """Open a file anew; its old checkpoint goes."""
+        """Open a new file, and remove its old checkpoint."""
         if self.path is None or self.checkpoint is None:
             return
         try:
@@ -147,12 +147,12 @@ class Output:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = self.path.open("wb", buffering=0)
         except OSError as error:
-            raise self._failed(error, " Name another place by --out.") from error
+            raise self._failed(error, " Name another place with --out.") from error
 
     def resume(self, offset: int, digest: str) -> None:
-        """Open a file to continue after `offset` bytes, of which `digest` is known."""
+        """Open a file to continue after `offset` bytes, whose `digest` is known."""
         assert self.path is not None
-        again = "start again by --overwrite."
+        again = "start again with --overwrite."
         try:
             stream = cast(BinaryIO, self.path.open("r+b", buffering=0))
             self._stream = stream
@@ -162,14 +162,14 @@ class Output:
                 self._hash.update(stream.read(min(left, _PIECE)))
             if self.digest != digest:
                 raise CheckpointError(
-                    f"{self.path} was changed after its checkpoint was written; undo that, or "
-                    f"{again}"
+                    f"{self.path} was changed after its checkpoint was written; undo the change, "
+                    f"or {again}"
                 )
             stream.truncate()
             self.offset = offset
         except FileNotFoundError as error:
             raise CheckpointError(
-                f"{self.path} is gone, but its checkpoint {self.checkpoint} is there; {again}"
+                f"{self.path} is missing, but its checkpoint {self.checkpoint} exists; {again}"
             ) from error
         except OSError as error:
             raise self._failed(error) from error
@@ -188,7 +188,7 @@ class Output:
         return [next(csv.reader([line]))[0] for line in lines if line.endswith("\n")]
 
     def write(self, fields: Sequence[str]) -> None:
-        """Write a row at once; where that fails, the file still ends with a whole row."""
+        """Write a row at once; if that fails, the file still ends with a whole row."""
         stream = self._stream
         assert stream is not None
         line = self._rows.writerow(fields).encode()
@@ -223,7 +223,7 @@ class Output:
         self._stream = None
 
     def finish(self, time_type: Any = None) -> None:
-        """Convert to Parquet if that is wanted; the CSV file and the checkpoint go."""
+        """Convert to Parquet if the target is one, and remove the CSV file and the checkpoint."""
         self.close()
         if self.target is None or self.path is None or self.path == self.target:
             return
@@ -273,7 +273,7 @@ def _to_parquet(source: Path, target: Path, time_type: Any) -> None:
 
 @contextlib.contextmanager
 def standard_output_for_rows() -> Iterator[BinaryIO]:
-    """Give a stream to standard output; all other prints go to standard error meanwhile.
+    """Give a stream to standard output; meanwhile all other output goes to standard error.
 
     The C code of solvers prints on file descriptor 1, past ``sys.stdout``. So the rows go to a
     duplicate of the descriptor, and 1 itself is pointed at standard error, in the whole process.

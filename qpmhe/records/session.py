@@ -46,15 +46,15 @@ class Summary:
     Attributes
     ----------
     engine : str
-        What ran the steps: ``python``, ``compiled``, or ``compiled, then python`` where the model
-        has changed meanwhile. An estimation that resumes keeps it.
+        What ran the steps: ``python``, ``compiled``, or ``compiled, then python`` if the model
+        changed meanwhile. A resumed estimation keeps its engine.
     samples, before : int
         Samples of this run, and of the earlier run that it resumed.
     improved, incomplete : int
         How many of the samples improved on the observer, and how many lacked outputs.
     inserted, held, repeated : int
         Samples without measurement that fill gaps; missing inputs that were replaced by the last
-        value; lines that were skipped because their time was there already.
+        value; lines that were skipped because they repeat a time.
     failed, stale : int
         Steps at which the model failed (``MODEL_FAILED``), and others whose window still has
         such a step (``FAILED_STAGE``).
@@ -65,9 +65,9 @@ class Summary:
     notes : list of str
         What else the user should know.
     run : Run or None
-        The samples of this run, inserted ones included, where they were to be kept.
+        The samples of this run, inserted ones included, if they were to be kept.
     model : RecordModel or None
-        What made them.
+        The model that made the estimates.
     """
 
     engine: str = "python"
@@ -120,10 +120,10 @@ def estimate_record(
 ) -> Summary:
     """Estimate the states of a measured record, and write them sample by sample.
 
-    Where the model was made by `qpmhe.System.from_ode`, each step has the length that the
-    record says, so a row is written when the time of the next sample is known. Otherwise, or
-    with ``equal_steps``, the times must be those of equal steps. A gap of k steps is filled
-    by k - 1 samples without measurement, with the inputs held.
+    If `qpmhe.System.from_ode` made the model, each step has its length in the record, so a row is
+    written when the time of the next sample is known. Otherwise, or with ``equal_steps``, the steps
+    must be equal. A gap of k steps is filled by k - 1 samples without measurement, with the inputs
+    held.
 
     Parameters
     ----------
@@ -147,18 +147,18 @@ def estimate_record(
     dt, time_scale : float, optional
         Usual step of a discrete-time model, in its unit of time; the record's unit in the model's.
     equal_steps, skip_repeated : bool
-        Whether steps must be equal also where the model takes any; whether to skip lines whose
-        time repeats the line before.
+        Whether steps must be equal even if the model takes any; whether to skip lines whose time
+        repeats the line before.
     max_gap : int, optional
-        Most samples without measurement in a row, 500 by default.
+        Largest number of samples without measurement in a row, 500 by default.
     covariances, step_time : {"none", "std", "full"}, bool
         What to write of the covariances; whether to write the seconds of each step.
     bound : BoundOptions or bool
         Whether to write, for each predicted state, the sides of the proved set around the
-        observer and the bound of the estimate's error, blank from where they no longer hold. What
-        the options leave out comes from the model and its scenario.
+        observer and the bound on the estimate's error, blank once they no longer hold. The model
+        and its scenario supply what the options leave out.
     resume, overwrite : bool
-        Whether to resume at the checkpoint beside ``out``, if there is one; whether to replace
+        Whether to resume from the checkpoint beside ``out``, if there is one; whether to replace
         existing files.
     checkpoint_every, checkpoint_seconds : int, float, optional
         Samples from checkpoint to checkpoint, 100 by default, and the least time between two
@@ -253,8 +253,8 @@ def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
         for path in filter(None, (output.path, output.target)):
             if os.path.isfile(path) and path.stat().st_size:
                 raise InvalidInputError(
-                    f"{path} exists already, without a checkpoint to resume at; give another "
-                    "--out, or replace it by --overwrite."
+                    f"{path} exists already, without a checkpoint to resume from; give another "
+                    "--out, or replace it with --overwrite."
                 )
         return None
     if not found.samples and not output.times_after(0):
@@ -264,7 +264,7 @@ def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
     state = "a finished estimation" if found.finished else "an estimation that was interrupted"
     raise CheckpointError(
         f"{output.name} holds {state} (its checkpoint was taken after {found.samples} samples); "
-        "continue by --resume (a finished one, if the record has grown), start again by "
+        "continue with --resume (a finished one, if the record has grown), start again with "
         "--overwrite, or give another --out."
     )
 
@@ -306,7 +306,7 @@ class _Session:
             self._estimate(samples, last)
             if not self._taken:
                 raise RecordError(
-                    "it has a header and no samples; expected a line for each.", reader.name
+                    "it has a header but no samples; expected one line per sample.", reader.name
                 )
             self._newest, self._is_saved = replace(self._newest, finished=True), False
             self._save()
@@ -325,7 +325,7 @@ class _Session:
             self._save()  # no row is in the file without a checkpoint beside it
             self._output.write(self._rows.header)
         except WriteError as error:
-            raise WriteError(f"{error} Make room, or name another place by --out.") from error
+            raise WriteError(f"{error} Make room, or name another place with --out.") from error
         return self._reader.samples(), None
 
     def _resume(self, found: Checkpoint) -> tuple[Iterator[Measurement], Measurement | None]:
@@ -338,7 +338,7 @@ class _Session:
         if differing:
             raise CheckpointError(
                 f"the checkpoint {output.checkpoint} was made with {'; '.join(differing)}. Use "
-                "the same model and options, or start again by --overwrite."
+                "the same model and options, or start again with --overwrite."
             )
         last = self._last_sample(found)
         samples = reader.samples(last.u if last is not None and reader.is_stream else None)
@@ -348,8 +348,8 @@ class _Session:
         self._summary.before = found.samples
         if found.versions != versions():
             self._summary.notes.append(
-                f"the checkpoint was made with {found.versions}, and this is {versions()}: the "
-                "last bits of the results may differ."
+                f"the checkpoint was made with {found.versions}, and this run uses {versions()}: "
+                "the last bits of the results may differ."
             )
         if last is None:
             self._begin()
@@ -412,7 +412,7 @@ class _Session:
                 f"{self._reader.name} does not contain the sample of time {times[0]}; its row "
                 f"and those after it would be lost, since the checkpoint knows {known}. Give "
                 "the record from there, or from its beginning; or another --out; or start "
-                "again by --overwrite."
+                "again with --overwrite."
             )
 
     def _estimate(self, samples: Iterator[Measurement], last: Measurement | None) -> None:
@@ -514,8 +514,8 @@ class _Session:
             return ""
         there = f" The {self._taken} samples before are in {self._output.name}; "
         if isinstance(error, WriteError):
-            return f"{there}make room, and continue by --resume."
-        return f"{there}correct the record, and continue by --resume."
+            return f"{there}make room, and continue with --resume."
+        return f"{there}correct the record, and continue with --resume."
 
     def _finished(self) -> Summary:
         reader, summary = self._reader, self._summary

@@ -39,15 +39,15 @@ class Steps:
             self.usual or 0.0, system.dt, rel_tol=_ROUNDING
         ):
             raise OptionError(
-                f"--dt is {usual!r}, and the model's own step {system.dt}; leave --dt out, or "
+                f"--dt is {usual!r}, but the model's step is {system.dt}; leave --dt out, or "
                 "make the model with that step."
             )
 
     def between(self, spacing: float, magnitude: float) -> Step:
         """The step from one sample to the next, whose times differ by `spacing`.
 
-        `magnitude` is the size of the times, which are rounded to some digits. Raises
-        ValueError if it is no step, with what to do.
+        `magnitude` is the size of the times, which are rounded to some digits. Raises ValueError,
+        with the remedy, if it is not a step.
         """
         length = spacing * self._scale
         if self.usual is None:
@@ -66,7 +66,7 @@ class Steps:
         if abs(length - number * self.usual) > _JITTER * self.usual + rounding:
             raise ValueError(
                 f"a step of {length:.6g} is no multiple of the usual one, {self.usual:.6g}; "
-                "resample the record, give the usual step by --dt if it is another, or make "
+                "resample the record, give the usual step with --dt if it is another, or make "
                 "the model by System.from_ode, which takes steps of any length"
             )
         return Step(None, number - 1)

@@ -37,7 +37,7 @@ _UNREADABLE = {
 class RecordError(InvalidInputError):
     """A record that cannot be read or used; the text names file, line, column and remedy.
 
-    ``what`` is wrong, and what to do about it; ``unit`` is ``line``, or ``row`` of a Parquet file.
+    ``what`` states the fault and the remedy; ``unit`` is ``line``, or ``row`` of a Parquet file.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Row(NamedTuple):
 def open_table(
     record: str, separator: str | None, encoding: str, skip_lines: int = 0
 ) -> CsvTable | ParquetTable:
-    """Open a record, a file or ``-`` for standard input, as the kind that its first bytes say."""
+    """Open a record, a file or ``-`` for standard input; its first bytes show its kind."""
     piped = record == "-"
     name = "standard input" if piped else record
     if piped and sys.stdin is None:
@@ -95,7 +95,7 @@ def open_table(
 
 
 class CsvTable:
-    """A header, and rows below it, each available as soon as its line is there."""
+    """A header, and rows below it, each available as soon as its line arrives."""
 
     unit = "line"
 
@@ -146,8 +146,8 @@ class CsvTable:
         word = _SEPARATORS.get(self._separator, repr(self._separator))
         #: What an error of the columns adds.
         self.hint = (
-            f" The separator is taken to be {word}; choose another one by --separator. Skip "
-            "lines above the header by --skip-lines N, and delete comments."
+            f" The separator is taken to be {word}; choose another one with --separator. Skip "
+            "lines above the header with --skip-lines N, and delete comments."
         )
 
     def __iter__(self) -> Iterator[Row]:

@@ -40,9 +40,9 @@ _KEPT = 20
 class Cell:
     """What distinguishes one run from all others of a study.
 
-    ``backend`` is `OBSERVER` where no QP is solved; ``qps`` is None to converge, and
-    ``solver_iterations``, the cap inside each QP, None for the solver's default. ``noise_level``
-    multiplies the standard deviations of what is simulated.
+    ``backend`` is `OBSERVER` if no QP is solved. ``qps`` is None to iterate to convergence;
+    ``solver_iterations``, the cap inside each QP, is None for the solver's default. ``noise_level``
+    multiplies the standard deviations of the simulated disturbance and noise.
     """
 
     model: str
@@ -94,7 +94,7 @@ class Task:
 
     @property
     def hard_limit(self) -> float:
-        """Seconds after which a process that hangs in the cell is ended."""
+        """Seconds after which a process that hangs in the cell is terminated."""
         return 1.5 * self.timeout + 1.0
 
 
@@ -103,7 +103,7 @@ class OutOfTimeError(Exception):
 
 
 def compute(task: Task) -> Result:
-    """Run a cell; whatever is raised in it becomes a row."""
+    """Run a cell; an exception in it becomes a row."""
     began = perf_counter()
     with _ended_after(task.hard_limit):
         try:

@@ -21,7 +21,7 @@ _PACKAGES = ("numpy", "scipy", "qpsolvers", "cvxpy", "casadi", "jax", "joblib")
 
 @lru_cache(maxsize=1)
 def environment() -> dict[str, Any]:
-    """What this process runs on."""
+    """The software and the machine that this process runs on."""
     packages = {*_PACKAGES, *(entry.distribution for entry in backends() if entry.distribution)}
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {

@@ -22,9 +22,9 @@ from ..records.record_model import load_record_model
 
 @dataclass(frozen=True)
 class Source:
-    """A model, and the record that it is to be run on; None where its scenario simulates.
+    """A model, and the record to run it on; None if its scenario simulates one.
 
-    ``reading`` are the options of reading, ``digest`` is the record's own.
+    ``reading`` holds the options for reading the record, ``digest`` identifies its content.
     """
 
     model: ModelSource
@@ -50,7 +50,7 @@ class Source:
 
     @property
     def fingerprint(self) -> str:
-        """Differs where the figures may differ: of the model's files and the record."""
+        """Digest of the model's files and the record: it changes if results may change."""
         if self.record is None:
             return self.model.fingerprint
         return f"{self.model.fingerprint} {self.digest} {self.reading}"
@@ -68,12 +68,12 @@ def _digest(name: str, place: Path) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What an estimator is made of and run on.
+    """The parts of an estimator, and the records that it runs on.
 
-    ``parts`` are system, observer and cost, ``options`` those of the estimator that a study does
-    not vary; ``record`` gives the record of a seed, a number of steps and a noise level. Its steps
-    have the length ``dt``, or those in ``lengths``, in ``time_unit``. From the sample ``settled``
-    on the initial error counts as decayed.
+    ``parts`` are system, observer and cost; ``options`` are the estimator's options that a study
+    does not vary. ``record`` returns the record for a seed, a number of steps and a noise level.
+    Its steps have the length ``dt``, or those in ``lengths``, in ``time_unit``. From the sample
+    ``settled`` on, the initial error counts as decayed.
     """
 
     parts: tuple[Any, ...]
@@ -131,8 +131,8 @@ def _measured(source: Source) -> Experiment:
     assert source.record is not None
     if _digest(source.record, source.place or Path()) != source.digest:
         raise ModelError(
-            f"the record {source.record!r} is another here than where the study was started; copy "
-            "the same file to all machines, and leave it alone while the study runs."
+            f"the record {source.record!r} differs from the one that the study was started with; "
+            "copy the same file to all machines, and do not change it while the study runs."
         )
     model = load_record_model(source.model)
     y, u, lengths, usual, known = read_record(str(source.place), model, **dict(source.reading))

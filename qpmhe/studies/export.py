@@ -72,7 +72,7 @@ def _text(value: Any) -> str | None:
 
 
 def tables(store: Store | str | Path, keys: Set[str] | None = None) -> str:
-    """One table a model and horizon, of the cells with these keys; of all if left out."""
+    """One table per model and horizon, of the cells with these keys; of all if left out."""
     held = store if isinstance(store, Store) else Store(store)
     frame = held.frame()
     if keys is not None:

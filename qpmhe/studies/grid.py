@@ -43,7 +43,7 @@ READING = {
 
 
 class StudyError(OptionError):
-    """A study that cannot run as it is written, or not on the cluster that it names."""
+    """A study that cannot run as written, or not on the named cluster."""
 
 
 @report_unknown_options
@@ -51,11 +51,10 @@ class StudyError(OptionError):
 class Study:
     """A grid of estimators, each run on simulated records of many seeds, or on measured ones.
 
-    All run ``engine="python"``, which alone calls the backends.
+    All cells run with ``engine="python"``, the only engine that calls the backends.
 
-    Cells that would be the same are one: with ``qps=0`` no QP is solved, so there is one cell,
-    whose backend is called ``observer``; a backend without a cap has one cell for all
-    ``solver_iterations``.
+    Identical cells run once: with ``qps=0`` no QP is solved, so there is one cell, whose backend is
+    called ``observer``; a backend without a cap has one cell for all ``solver_iterations``.
 
     Parameters
     ----------
@@ -139,8 +138,8 @@ class Study:
         models = _distinct(find(text, folder) for text in self.models)
         if self.records and self.noise_levels != (1.0,):
             raise StudyError(
-                f"noise_levels is {list(self.noise_levels)}, but the noise of measured records is "
-                "what it is; leave noise_levels or records out."
+                f"noise_levels is {list(self.noise_levels)}, but the noise of measured records "
+                "cannot be scaled; leave noise_levels or records out."
             )
         sources = tuple(Source(model) for model in models) if not self.records else tuple(
             Source.measured(model, str(record), self.reading, folder)
@@ -195,7 +194,7 @@ class Study:
         return cls(**options, folder=path.parent)
 
     def settings(self) -> dict[str, Any]:
-        """The grid as plain lists and numbers; what the store keeps of it."""
+        """The grid as plain lists and numbers, as the store keeps it."""
         found = ((name, getattr(self, name)) for name in _CHECKS)
         return {key: list(one) if isinstance(one, tuple) else one for key, one in found}
 
@@ -226,7 +225,7 @@ class Study:
         return tuple(made)
 
     def to_latex(self, store: Store | str | Path) -> str:
-        r"""The results of this study as LaTeX tables, one a model and horizon.
+        r"""The results of this study as LaTeX tables, one per model and horizon.
 
         Numbers are means ± standard errors of the means over the seeds,
         :math:`s / \sqrt n`, rounded to two digits of the error. Comments above each table say so,
@@ -235,12 +234,12 @@ class Study:
         Parameters
         ----------
         store : Store, str or Path
-            What holds the results.
+            The results.
 
         Raises
         ------
         StoreError, InvalidInputError
-            If it cannot be read, or has none of this study.
+            If the store cannot be read, or has no results of this study.
         """
         from .export import tables
 

@@ -41,12 +41,13 @@ class IpoptEstimator:
             )
         if system.held:
             raise InvalidInputError(
-                "the comparison with Ipopt holds no parameters; make the system without hold."
+                "the comparison with Ipopt does not support held parameters; make the system "
+                "without hold."
             )
         if cost.directions(system.disturbance_matrix) is not None:
             raise InvalidInputError(
                 "the comparison with Ipopt takes no disturbance_matrix and no singular covariance "
-                "of the disturbance; give each state a disturbance of its own."
+                "of the disturbance; give each state its own disturbance."
             )
         if system.extensions:
             raise InvalidInputError(

@@ -32,8 +32,8 @@ def accuracy(
         s_j^2 = \frac1{T+1} \sum_{t=0}^T (x_j(t) - \hat x_j(0))^2
 
     with the scales of `scales`: 1 is the error of keeping the initial estimate for ever. NaN
-    where no time counts as settled. Differences are those of the system's state residual. Where
-    the true state is unknown, NaN, there is no error.
+    where no time counts as settled. Differences are those of the system's state residual. Where the
+    true state is unknown (NaN), there is no error.
     """
     known = np.isfinite(states)
     with np.errstate(all="ignore"):
@@ -49,7 +49,7 @@ def accuracy(
 
 
 def scales(states: Array, initial_estimate: Array, residual: Residual | None = None) -> Array:
-    """Each state's root mean square distance from its initial estimate, which is a scale (n,).
+    """Scales (n,): each state's root mean square distance from its initial estimate.
 
     A state that never leaves its initial estimate has its own size as scale, and one that is
     always zero has its unit.
@@ -106,11 +106,11 @@ def outcomes(run: Run) -> dict[str, Any]:
     """How the steps ended, what they cost, and how many QPs and iterations they used.
 
     ``cost`` is the mean of the true cost J where it is finite. Shares of steps: ``improved``;
-    ``kept``, where the candidate is the estimate and nothing failed; ``fallback``, where it is
-    because something failed or no iterate lowered the cost; ``cap_hits``, where a QP ended at its
-    cap or unconfirmed. Further ``reasons``, the number of
-    steps of each flag of `qpmhe.Status`, and the means ``qps_mean`` and
-    ``solver_iterations_mean`` per step, NaN where the solver does not report them.
+    ``kept``, where the candidate is the estimate and nothing failed; ``fallback``, where the
+    candidate is the estimate because something failed or no iterate lowered the cost; ``cap_hits``,
+    where a QP ended at its cap or unconfirmed. Also ``reasons``, the number of steps of each flag
+    of `qpmhe.Status`, and the means ``qps_mean`` and ``solver_iterations_mean`` per step, NaN where
+    the solver does not report them.
     """
     flags, total = run.flags, max(1, len(run))
     improved = (flags & Status.IMPROVED.value) != 0

@@ -114,13 +114,13 @@ class Reproduction:
     study, backend : PaperStudy, str
         The record, and the backend of ``rows``.
     rows : list of Row
-        i = 0, 1, 2, 5 and converged; then Ipopt's, where asked for.
+        i = 0, 1, 2, 5 and converged; then Ipopt's, if requested.
     backends : list of Row
         Every installed backend at each cap, with i = 2.
     files : list of Path
         What was written.
     seeds : int
-        Records that ``rows`` are means over, from that of ``study`` on.
+        Number of records that ``rows`` are means over; ``study`` is the first.
     converged_cost : float
         Mean J of the converged estimates on the first record.
     """
@@ -134,7 +134,7 @@ class Reproduction:
     converged_cost: float
 
     def excess(self, row: Row) -> float:
-        """How far the mean cost of a row of ``backends`` is above the converged one, relative."""
+        """Relative excess of the mean cost of a row of ``backends`` over the converged cost."""
         return row.mean_cost / self.converged_cost - 1.0
 
 
@@ -159,16 +159,16 @@ def reproduce(
     seed, steps, method
         As of `PaperStudy`.
     seeds : int
-        Records of the paper's rows: those of ``seed``, ``seed`` + 1, ... Figure and backends have
+        Records of the paper's rows: those of ``seed``, ``seed`` + 1, ... Figure and backends use
         the first one.
     backend_name : str
         QP backend of the paper's rows.
     ipopt : bool
-        Whether to run CasADi with Ipopt, the paper's tool, as well.
+        Whether to run CasADi with Ipopt, the paper's tool, too.
     progress : callable, optional
         Called with the numbers of finished and of all steps.
     width : {"single", "double"} or float, optional
-        For a paper: the figure is a PDF file, too, of this width; see `qpmhe.plots.save`.
+        For a paper: also write the figure as PDF of this width; see `qpmhe.plots.save`.
 
     Returns
     -------

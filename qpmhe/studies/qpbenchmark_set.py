@@ -78,12 +78,12 @@ def export_qpbenchmark(
     Parameters
     ----------
     files_or_folder : path, or iterable of paths
-        Files of `qpmhe.solvers.dump`, and folders of such.
+        Files of `qpmhe.solvers.dump`, or folders of them.
     out : str or path
         The folder for ``mhe_qpbenchmark.py`` and a folder of problems.
     matrices : {"sparse", "dense"}
-        What solvers that take both kinds get. With ``sparse``, solvers without a sparse interface
-        do not take part. The files are dense in any case, of (K n)^2 numbers and more.
+        Matrices for solvers that take both kinds. With ``sparse``, solvers without a sparse
+        interface do not take part. The files are dense in any case, of (K n)^2 numbers and more.
     title : str
         Title of the report.
 
@@ -95,8 +95,8 @@ def export_qpbenchmark(
     Raises
     ------
     InvalidInputError, OptionError
-        If there is nothing to export, a file is none of `dump`, ``out`` holds problems already or
-        cannot be written, or ``matrices`` is neither.
+        If there is nothing to export, a file was not written by `dump`, ``out`` holds problems
+        already or cannot be written, or ``matrices`` is neither.
     """
     if matrices not in get_args(Matrices):
         raise OptionError(f"matrices is {matrices!r}; expected 'sparse' or 'dense'.")

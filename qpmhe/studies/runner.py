@@ -51,8 +51,8 @@ def run(
     """Run the cells of a study that the store does not have, and store each as it ends.
 
     A study that is stopped or killed loses no finished cell; the same call resumes it. A cell
-    that fails is a row with its reason. Where a cell kills its worker process, it runs once
-    more alone, then with the solver in another process; no other cell is lost.
+    that fails is a row with its reason. If a cell kills its worker process, it runs once more
+    alone, then with the solver in another process; no other cell is lost.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def run(
     store : Store, str or Path
         Where results go. It may hold cells of other studies.
     jobs : int, optional
-        Cells at a time on this machine; by default the number of cores, or one if only times are
-        measured.
+        Cells that run at a time on this machine; by default the number of cores, or one if only
+        times are measured.
     scheduler : str, optional
         Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, whose workers run the cells
         instead; best with one thread each.
@@ -82,7 +82,7 @@ def run(
     Raises
     ------
     StoreError, StudyError
-        If the store, or the cluster, cannot be used, or no longer.
+        If the store or the cluster cannot be used, or fails during the run.
     InvalidInputError
         If an argument does not fit, or a package is missing.
     """
@@ -162,7 +162,7 @@ class _Cluster:
         self._address = address
         try:
             if "workers" not in _identity(distributed, address, _CONNECT):
-                raise ValueError("what answers is no scheduler")
+                raise ValueError("no scheduler answers there")
             self._client = distributed.Client(address, timeout=_CONNECT, set_as_default=False)
         except Exception as error:  # anything may answer at an address
             raise self._refused(error) from error

@@ -78,14 +78,14 @@ _REMEDIES = {
 
 
 class StoreError(QpmheError):
-    """A store that cannot be read or written; what it holds stays as it is."""
+    """A store that cannot be read or written; its content stays as it is."""
 
 
 class Store:
-    """A file of results, which `run` writes and everybody may read meanwhile.
+    """A file of results, which `run` writes and others may read meanwhile.
 
     ``path`` is the file, which need not exist until something is read. Reading raises `StoreError`
-    where there is no store, or none that can be read.
+    if the store is missing or unreadable.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -198,9 +198,9 @@ class Writer:
             for name, fingerprint in fingerprints.items():
                 if known.get(name, fingerprint) != fingerprint:
                     raise StoreError(
-                        f"model {name!r} has changed since cells of it were put into "
-                        f"{self._path}: its file, one that it imports, or its record and how that "
-                        "is read. Name another store for the new one, or change it back."
+                        f"model {name!r} has changed since its cells were stored in "
+                        f"{self._path}: its file, a file that it imports, its record, or the "
+                        "options for reading that. Name another store, or undo the change."
                     )
                 connection.execute(
                     "INSERT OR IGNORE INTO models VALUES (?, ?)", (name, fingerprint)
@@ -211,7 +211,7 @@ class Writer:
             )
 
     def present(self, retry_failed: bool) -> dict[str, frozenset[str]]:
-        """The parts that each cell has; if failed cells are to be retried, without those."""
+        """The parts that each cell has; failed cells are left out if they are to be retried."""
         where = "WHERE outcome = 'done'" if retry_failed else ""
         with _explained(self._path):
             rows = self._connection.execute(f"SELECT key, parts FROM cells {where}").fetchall()

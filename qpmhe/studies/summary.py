@@ -50,17 +50,17 @@ def measure(rows: DataFrame) -> str:
 
 
 def summarise(frame: DataFrame) -> DataFrame:
-    r"""One row a configuration: means over seeds, their 95 % confidence limits, Pareto front.
+    r"""One row per configuration: means over seeds, their 95 % confidence limits, Pareto front.
 
     With :math:`n` finished seeds of mean :math:`\bar m` and standard deviation :math:`s`, the
     limits of a metric's mean are :math:`\bar m \pm t_{0.975, n-1}\, s / \sqrt n` (Student's),
-    cut where the metric cannot lie: shares at 0 and 1, errors and times at 0. One seed has no
+    clipped to the range of the metric: shares to 0 and 1, errors and times to 0. One seed has no
     limits (NaN).
 
     Parameters
     ----------
     frame : pandas.DataFrame
-        One row a cell, with the columns of the store.
+        One row per cell, with the columns of the store.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def summarise(frame: DataFrame) -> DataFrame:
           ``rmse_excess`` is ``rmse`` relative to the most accurate configuration of the same
           problem (`PROBLEM`), minus 1, seed by seed, so that what the seeds have in common
           cancels;
-        - ``rmse_states`` and ``rmse_settled_states``: lists, a value a state in its unit, with
+        - ``rmse_states`` and ``rmse_settled_states``: lists, one value per state in its unit, with
           ``_low`` and ``_high``;
         - ``reasons``: dict, share of the steps with each flag of `qpmhe.Status`;
         - ``pareto``: whether no configuration of the same problem is faster (``time_median``)
@@ -92,7 +92,7 @@ def summarise(frame: DataFrame) -> DataFrame:
     if missing:
         raise InvalidInputError(
             f"the frame lacks the column {', '.join(missing)}; expected what the store's frame() "
-            "gives, one row a cell."
+            "returns, one row per cell."
         )
     cells = frame.reset_index(drop=True)
     cells["done"], cells["shared"] = cells["outcome"] == "done", cells["shared"].eq(True)

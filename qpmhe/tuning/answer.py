@@ -1,4 +1,4 @@
-"""What tuning has found: weights, their intervals, what is not identified, held-out scores."""
+"""The result of tuning: weights, their intervals, what is not identified, held-out scores."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class HorizonScore:
     score : float
         The held-out score, as a share of the start weights' score.
     seconds : float
-        For a sample.
+        Per sample.
     """
 
     horizon: int
@@ -66,20 +66,20 @@ class Tuning:
     Attributes
     ----------
     weights : Weights
-        What was found, as a whole.
+        All that was tuned.
     start, values : dict
-        What each name stands for: standard deviations of disturbance, noise and prior in the
-        units of state and output (a group has the unit of its first component); parameters. At the
-        start, and as tuned.
+        The value of each name: standard deviations of disturbance, noise and prior in the units of
+        state and output (a group has the unit of its first component); parameters. At the start,
+        and as tuned.
     intervals : dict
-        Its 95 % interval (low, high) by the likelihood's curvature. That is honest where the
-        model is right; errors of the model make intervals too narrow.
+        The 95 % interval (low, high) of each, by the likelihood's curvature. It is reliable if the
+        model is right; model errors make it too narrow.
     likeliest : dict
-        The values of largest likelihood, about which the intervals are.
+        The values of largest likelihood, around which the intervals lie.
     unidentified : tuple of str
         What the records do not determine, in words.
     judgement : str
-        Whether the search on the estimator's own error was taken, and why.
+        Whether the search on the estimator's own error was used, and why.
     seconds : dict
         How long each search took.
     notes : tuple of str
@@ -109,8 +109,8 @@ class Tuning:
         )
         self._find_intervals(theta, hessian)
         self.notes = tuple(
-            f"input {j + 1} is constant in all records, so nothing that it acts by is identified; "
-            "vary it." for j in constant
+            f"input {j + 1} is constant in all records, so its effect cannot be identified; vary "
+            "it." for j in constant
         ) + ((f"the model failed at some points of the search ({likelihood.failure}), which were "
               "avoided.",) if likelihood.failure else ())
 
@@ -138,7 +138,8 @@ class Tuning:
     def cost_per_sample(self) -> float:
         """The negative log likelihood per sample at ``likeliest``, of the blocks that tune.
 
-        Among several starts or models for the same records, the least one is the likeliest.
+        Of several starts or models for the same records, the one with the least cost is the
+        likeliest.
         """
         samples = sum(int(mask.sum()) for mask in self._likelihood.tuned)
         return self._likelihood.value(self._likeliest) / samples
@@ -148,7 +149,7 @@ class Tuning:
         return self.weights.cost()
 
     def observer(self) -> Observer:
-        """The observer that goes with it."""
+        """The observer with these weights."""
         return self.weights.observer(self._score.kind)
 
     def save(self, path: str | Path) -> Path:
@@ -181,7 +182,7 @@ class Tuning:
         if loss > spread:
             return points[0], (
                 f"as at the start: the estimator's mean square {what} on {blocks} is larger with "
-                "what was found. The model's error is no white noise, or the records are too "
+                "the tuned weights. The model's error is not white noise, or the records are too "
                 "short; tune with the truth, fewer parameters, or a better model."
             )
         if best == 2:
@@ -244,7 +245,7 @@ class Tuning:
             same = all(correlations[members[0], k] > 0.0 for k in members)
             return (
                 f"{', '.join(names[:-1])} and {names[-1]}: they can change "
-                f"{'together' if same else 'one against the other'}, and fit the records as well; "
+                f"{'together' if same else 'in opposite directions'}, and fit the records as well; "
                 "fix one of them, or tie them in a group."
             )
         (name,) = names

@@ -1,4 +1,4 @@
-"""Extended Kalman filters side by side, each with its own idea of what a record means."""
+"""Extended Kalman filters side by side, each with its own interpretation of a record."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _GAP = 10
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What one filter takes the record for."""
+    """How one filter interprets the record."""
 
     measurements: Array  # (T, p), NaN where missing
     inputs: Array  # (T, m)
@@ -40,7 +40,7 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """What the filters have found: all but `logs` of the first filter alone.
+    """Results of the filters: all but `logs` are those of the first filter.
 
     `logs` are log likelihoods, for as many measurements as the first has; -infinity in all
     samples where the filter failed.
@@ -109,7 +109,7 @@ class FilterBank:
         return np.clip(turned, states.lower, states.upper)
 
     def full_inputs(self, inputs: Array, step: float = 1.0) -> Array:
-        """The inputs of `model`: with the length of the step behind them where it takes one."""
+        """The inputs of `model`, followed by the length of the step if it takes one."""
         if not self._is_timed or self._steps is None:
             return inputs
         lengths = np.broadcast_to(step * self._steps[: len(inputs)], (len(inputs),))

@@ -108,7 +108,7 @@ class Data:
         return len(self.y)
 
     def inputs(self, system: System, parameters: Mapping[str, float]) -> Array:
-        """The inputs, with the model's parameters behind where these are inputs."""
+        """The inputs, followed by the model's parameters where these are inputs."""
         behind = list(parameters.values())[: system.m - self.u.shape[1]]
         return np.hstack((self.u, np.tile(behind, (len(self), 1)))) if behind else self.u
 
@@ -168,7 +168,7 @@ def checked_data(
 
 
 def hold_out(data: list[Data], share: float, least: int) -> None:
-    """Cut each record into blocks of at least so many samples; hold some of them out."""
+    """Cut each record into blocks of at least `least` samples; hold out some of them."""
     part = finite(share)
     if part is None or not 0.0 <= part <= 0.5:
         raise OptionError(f"held_out is {shown(share)}; expected a share from 0 to 0.5.")

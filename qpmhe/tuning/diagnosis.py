@@ -1,4 +1,4 @@
-"""Whether an estimator is healthy, without knowing the truth."""
+"""Check whether an estimator is healthy, without knowing the truth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _WIDTH = 92  # of the text
 
 
 class Diagnosis(Examination):
-    """What `diagnose` has found; its text begins with the findings.
+    """The result of `diagnose`; its text begins with the findings.
 
     Attributes
     ----------
@@ -44,9 +44,9 @@ class Diagnosis(Examination):
     nis : (T,) array
         Normalised innovation squared, e^T S^-1 e.
     nis_limits : (float, float)
-        What 99 % of the values lie within, for complete measurements.
+        Limits that contain 99 % of the values, for complete measurements.
     nis_mean, nis_mean_limits : float, (float, float)
-        Mean of the NIS for each component measured, and what 99 % of such means lie within.
+        Mean NIS per measured component, and limits that contain 99 % of such means.
     correlations : Correlations
         Of the innovations.
     outliers, clipped : (p,) array
@@ -128,9 +128,9 @@ def diagnose(
     * steps of another length, measurements that are late or early, clocks that drift;
     * an input with the wrong sign, or another gain.
 
-    Beside it, it reports directions of the state that the data do not see, innovations that are
-    correlated with themselves or with the inputs, steps that kept the candidate, and why, and how
-    much the prior still matters.
+    It also reports directions of the state that the data do not see, innovations that are
+    correlated with themselves or with the inputs, steps that kept the candidate, with the reason,
+    and how much the prior still matters.
 
     Parameters
     ----------
@@ -151,8 +151,8 @@ def diagnose(
     Raises
     ------
     InvalidInputError, ShapeError
-        If the run is none, was not made by `MovingHorizonEstimator.run`, has fewer than 30 samples
-        with measurements, or if a name is missing.
+        If this is not a run, or `MovingHorizonEstimator.run` did not make it; if it has fewer than
+        30 samples with measurements, or a name is missing.
 
     Notes
     -----
@@ -185,8 +185,8 @@ def _source(run: Run) -> RunSource:
     source = run.source
     if source is None:
         raise InvalidInputError(
-            "the run does not know its measurements: it was put together from single estimates, or "
-            "unpickled. Diagnose what MovingHorizonEstimator.run returns."
+            "the run has no measurements: it was assembled from single estimates, or unpickled. "
+            "Diagnose a run that MovingHorizonEstimator.run returns."
         )
     seen = np.isfinite(source.measurements).any(axis=1)
     if not seen.any():

@@ -50,11 +50,11 @@ class Correlations:
     Attributes
     ----------
     own : (L + 1, p) array
-        Autocorrelation of each sensor's at lags 0, ..., L.
+        Autocorrelation of each sensor's innovations at lags 0, ..., L.
     inputs : (L + 1, p, 2 m) array
-        With the inputs and with their changes, so many samples before.
+        Correlation with the inputs and with their changes, at these lags before.
     limit : float
-        What 95 % of the correlations of white innovations are within.
+        Limit that contains 95 % of the correlations of white innovations.
     """
 
     own: Array
@@ -290,7 +290,7 @@ class Examination:
                 f"The estimator predicts its measurements {number(ratio)} times worse than an "
                 "extended Kalman filter with the same weights.",
                 "Raise max_qps." if self.source.settings.max_qps == 0 or kept > _KEPT
-                else "Raise max_qps or the horizon, or take qpmhe.ObserverPrior.", "warning",
+                else "Raise max_qps or the horizon, or use qpmhe.ObserverPrior.", "warning",
             )
 
     def _prior_shares(self, disturbance: Array) -> Array:
@@ -318,8 +318,8 @@ class Examination:
                 yield note(one.kind, told.text, "The cost is robust.")
         yield note(
             "innovations",
-            f"The mean NIS of a measurement is {number(self.nis_mean)}; {low:.2f} to {high:.2f} is "
-            "to be expected.",
+            f"The mean NIS of a measurement is {number(self.nis_mean)}; expected {low:.2f} to "
+            f"{high:.2f}.",
         )
         missing = np.mean(~np.isfinite(self.source.measurements), axis=0)
         some = [f"{share:.0%} of {names.outputs[j]}" for j, share in enumerate(missing) if share]

@@ -85,7 +85,7 @@ _KINDS = {
     ),
     "outliers": _Kind(
         0.0, "There are outliers: {shares} beyond 4 sigma.",
-        "Take a qpmhe.RobustCost, with qpmhe.Huber for the noise.", local=True,
+        "Use a qpmhe.RobustCost, with qpmhe.Huber for the noise.", local=True,
     ),
 }
 
@@ -94,7 +94,7 @@ _KINDS = {
 class Fault:
     """A fault that explains the record better than none.
 
-    The value is a factor; of a shift or a clock samples, of a bias in the units of the sensor.
+    The value is a factor; for a shift or a clock, samples; for a bias, in the sensor's unit.
     """
 
     kind: str
@@ -137,7 +137,7 @@ class Fault:
 
     @property
     def matters(self) -> bool:
-        """Whether its effect is worth a word."""
+        """Whether its effect is large enough to report."""
         size, noise = self.value, self.hypothesis.noise
         if self.kind in ("noise", "disturbance", "gain"):
             size = np.log(size)
@@ -151,10 +151,10 @@ class Fault:
 def search(
     bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array] = (), most: int = 3
 ) -> tuple[list[Fault], Filtered]:
-    """Faults, the one that explains most first; each later one beside those before.
+    """Faults, the one that explains most first, each given those before it.
 
-    Also the filter that knows of these. `starts` are further states where a filter may begin if
-    those of the estimator are none, as where units are wrong.
+    Also the filter that corrects for them. `starts` are further states where a filter may start if
+    those of the estimator are useless, as with wrong units.
     """
     found: list[Fault] = []
     for _ in range(most):

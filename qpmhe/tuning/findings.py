@@ -1,4 +1,4 @@
-"""What a diagnosis says, in words."""
+"""The findings of a diagnosis, in words."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Names:
-    """How the signals of a run are called, its times (T,), and their unit, or ``samples``."""
+    """Names of the signals of a run, its times (T,), and their unit, or ``samples``."""
 
     labels: Sequence[str]
     outputs: Sequence[str]
@@ -97,7 +97,7 @@ def number(value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """A share in per cent, without a zero that is none."""
+    """A share in per cent; a share that is not zero is never written as 0 %."""
     return "less than 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
 
 

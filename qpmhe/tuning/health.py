@@ -200,7 +200,7 @@ def _observability(diagnosis: Diagnosis, axes: Any) -> None:
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.6 * _FLOOR if (values < _FLOOR).any() else None)
     axes.margins(x=0.01)
-    _finish(diagnosis, axes, f"begin of the window, {_time(diagnosis)}", "data against prior",
+    _finish(diagnosis, axes, f"start of the window, {_time(diagnosis)}", "data against prior",
             spans=True)
 
 

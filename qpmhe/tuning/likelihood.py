@@ -37,8 +37,8 @@ class Likelihood:
     for normal noise, and no outlier counts for more than k^2. States are clipped to the bounds
     of X.
 
-    A system that is traced has the exact gradient, by one sweep back through the filter; of others
-    it is made of central differences, for all of which the filter runs at once.
+    For a traced system, the gradient is exact, from one backward sweep through the filter. For
+    others, it consists of central differences; the filter runs for all of them at once.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Likelihood:
         self.failure = ""
 
     def value(self, theta: Array, chosen: list[Mask] | None = None) -> float:
-        """At theta, of the samples chosen in each record; infinite where the model fails."""
+        """The value at theta, over each record's chosen samples; infinite where the model fails."""
         return float(self._values([self.structure.weights(theta)], chosen or self.tuned)[0])
 
     def gradient(self, theta: Array, chosen: list[Mask] | None = None) -> tuple[float, Array]:

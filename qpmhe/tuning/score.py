@@ -31,7 +31,7 @@ class Score:
     y(t+k); or with the true x(t+1), where the records have one. With e the error of a component
     and s its root mean square at the start weights (1.48 times the median of :math:`|e|` with a
     robust loss), a sample's score is the mean of :math:`e^2 / s^2` over the components, in which
-    errors beyond 3 s count with their size only, if the loss is robust.
+    errors beyond 3 s count linearly, if the loss is robust.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ _HESSIAN_STEP = 1e-3
 
 
 class TuningCheckpointError(QpmheError):
-    """A checkpoint of a search that is damaged, or of another search."""
+    """A checkpoint that is damaged, or belongs to another search."""
 
 
 class Checkpoint:
@@ -64,7 +64,8 @@ class Checkpoint:
             )
         if found != identity:
             raise TuningCheckpointError(
-                f"the checkpoint {path} is of another search: records, model or options differ. "
+                f"the checkpoint {path} belongs to another search: records, model or options "
+                "differ. "
                 "Remove it to start again, or name another file."
             )
 
@@ -210,9 +211,9 @@ def polish(likelihood: Likelihood, theta: Array) -> tuple[Array, Array]:
 def limit(
     likelihood: Likelihood, theta: Array, hessian: Array, k: int, sign: float
 ) -> float | None:
-    """Where component k is, one way, when the likelihood's minimum has risen to the 95 % limit.
+    """Value of component k, on one side, where the likelihood's minimum reaches the 95 % limit.
 
-    The others follow. None if it never rises so far within the component's range.
+    The minimum is over the others. None if it stays below within the component's range.
     """
     structure = likelihood.structure
     least, end = likelihood.value(theta), structure.limits[k][1 if sign > 0 else 0]
@@ -272,7 +273,7 @@ def refine(
 ) -> Array:
     """The minimum of the estimator's score, by differences of runs.
 
-    It begins at the likelihood's weights or, where these are worse, at those of the start.
+    It starts at the likelihood's weights or, if these are worse, at the start weights.
     """
     known, value, done = checkpoint.known("estimator")
     if done and known is not None:

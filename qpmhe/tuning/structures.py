@@ -26,7 +26,7 @@ class Factors:
     """Factors of the standard deviations of a covariance, one for each group of components.
 
     The covariance is D S D with S the one to start from, and D the diagonal of exp(E theta), where
-    E says which component belongs to which group.
+    E assigns components to groups.
     """
 
     def __init__(self, kind: str, start: Array, groups: Mapping[str, Sequence[int]]) -> None:
@@ -95,7 +95,7 @@ class Structure:
     """All that is tuned, as one vector theta: parts of covariances, parameters, and others.
 
     `start` is theta of `first`, the weights before. The likelihood depends on the first `seen`
-    components, of which the first `covariances` are of these; discount and threshold are behind.
+    components, of which the first `covariances` are covariances; discount and threshold come last.
     """
 
     def __init__(

@@ -52,7 +52,7 @@ def stuck(
                 "saturated",
                 f"Sensor {name} is saturated: {at_end[seen].mean():.0%} of its samples are stuck "
                 f"at {number(value)}, the {which} one.",
-                "Pass NaN where it is at the end of its range, or take one with a wider range.",
+                "Pass NaN where it is at the end of its range, or use one with a wider range.",
                 where=names.span(*np.flatnonzero(at_end)[[0, -1]]),
             )
             if at_end[first]:

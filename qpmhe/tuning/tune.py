@@ -69,8 +69,8 @@ def tune(
     First it maximises the likelihood of the innovations of an extended Kalman filter: that gives
     the size of each covariance, its 95 % interval, and what the records do not identify. Then it
     lowers the error of the estimator itself: of its predictions, or of its states where the
-    records have the truth. Some blocks of the records are held out of both; they judge, and
-    what does not improve on them by more than its standard error is not taken.
+    records have the truth. Some blocks of the records are held out of both; they judge, and a
+    change that does not improve on them by more than its standard error is rejected.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def tune(
         of simulated records. NaN in Y is a missing measurement.
     prior, disturbance, noise : (n, n), (r, r) and (p, p) array_like
         Covariances of the initial error, of w and of v to start from, in squared units. A guess
-        within a factor of a hundred will do. A disturbance without variance stays without.
+        within a factor of a hundred will do. Zero variances of a disturbance stay zero.
     horizon : int
         N of the estimator.
     initial_state : (n,) array_like, optional
@@ -98,7 +98,8 @@ def tune(
         all records have it.
     parameters : dict, optional
         Parameters of the model to be tuned, with values to start from: arguments of the function
-        that makes the system, or the last inputs of the system, in their order. Signs stay.
+        that makes the system, or the last inputs of the system, in their order. Their signs do not
+        change.
     threshold : float, optional
         Threshold of Huber's loss of the noise, in standard deviations, for records with outliers.
     discount : float
@@ -121,11 +122,11 @@ def tune(
     jobs : int
         Processes for several starts.
     checkpoint : str or Path, optional
-        File by which the same call resumes a search that was stopped; removed at the end.
+        File from which the same call resumes a stopped search; removed at the end.
     progress : bool or rich.console.Console
         Whether, and where, to show a progress bar.
     **options
-        Of `qpmhe.MovingHorizonEstimator`, such as ``engine`` and ``max_qps``, by default 2.
+        Options of `qpmhe.MovingHorizonEstimator`, such as ``engine`` and ``max_qps``, by default 2.
 
     Returns
     -------
@@ -136,7 +137,7 @@ def tune(
     ------
     InvalidInputError
         If something does not fit: records too short, without measurements, or with gaps in the
-        truth; a covariance that is none; a model that fails at the start.
+        truth; an invalid covariance; a model that fails at the start.
 
     Examples
     --------
@@ -251,7 +252,7 @@ def _maker(
 def _made_observer(kind: Any, start: Weights) -> Observer:
     """Make one, so that what is wrong shows before the search."""
     expected = (
-        "expected what makes an observer of prior, disturbance and noise, such as "
+        "expected a callable that makes an observer from prior, disturbance and noise, such as "
         "qpmhe.ExtendedKalman."
     )
     if not callable(kind):

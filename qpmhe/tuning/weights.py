@@ -1,4 +1,4 @@
-"""Weights as covariances: what estimators are made with, and a TOML file of it."""
+"""Weights as covariances, and the TOML file that holds them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class WeightsError(QpmheError):
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Covariances with what else makes a cost and an observer.
+    """Covariances, and the other settings of a cost and an observer.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Weights:
     discount : float
         As for `qpmhe.QuadraticCost`.
     threshold : float or None
-        That of Huber's loss of the noise, in standard deviations; None for a quadratic loss.
+        Threshold of Huber's loss of the noise, in standard deviations; None for a quadratic loss.
     arrival : {"observer", "constant"}
         What weighs the prior: the observer's own covariance, or the one of the initial error.
     parameters : dict
@@ -92,7 +92,7 @@ class Weights:
         ]
         if self.threshold is not None:
             lines.append(f"threshold = {float(self.threshold)!r}")
-        lines += ["", "# In squared units, a row a line.", "[covariances]"]
+        lines += ["", "# In squared units, one row per line.", "[covariances]"]
         for kind in KINDS:
             rows = ",\n".join(f"  {row}" for row in getattr(self, kind).tolist())
             lines.append(f"{kind} = [\n{rows},\n]")
@@ -144,7 +144,7 @@ def load(path: str | Path) -> Weights:
         content |= {kind: np.atleast_2d(numbers(kind, given[kind])) for kind in KINDS}
         unknown = sorted(set(content) - {one.name for one in fields(Weights)})
         if unknown:
-            raise ValueError(f"it has {', '.join(map(repr, unknown))}, which is no field of them")
+            raise ValueError(f"it has {', '.join(map(repr, unknown))}, which weights do not have")
         found = Weights(**content)
         dimension("horizon", found.horizon, 1)
         choice("arrival", found.arrival, ARRIVALS)

@@ -1,4 +1,4 @@
-"""QP backends for trajectories: convex QPs in, judged solutions out, estimation unknown."""
+"""QP backends for trajectories: convex QPs in, verified solutions out."""
 
 from .backend import Backend
 from .conformance import Capabilities, Conformance, Finding, check, measure

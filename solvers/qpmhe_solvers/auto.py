@@ -1,4 +1,4 @@
-"""The default: a banded factorisation where that is exact, a QP solver where it is not."""
+"""The default: a banded factorisation where it is exact, otherwise a QP solver."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LARGE_ORDER = ("piqp", "clarabel", "osqp", "proxqp")
 
 
 class AutoSolver(Solver):
-    """Solve by `BandedSolver`; where its result violates an inequality, by a QP solver."""
+    """Solve by `BandedSolver`, or by a QP solver if the result violates an inequality."""
 
     _judges = True
 
@@ -56,13 +56,13 @@ class AutoSolver(Solver):
         return solution
 
     def forget(self) -> None:
-        """Let the QP solvers drop what they keep; see `Solver.forget`."""
+        """Reset the QP solvers; see `Solver.forget`."""
         self._shifts = 0
         for other in chain.from_iterable(self._others.values()):
             other.forget()
 
     def shift(self) -> None:
-        """Count, for the QP solvers, which most steps do not need; see `Solver.shift`."""
+        """Count the shift for the QP solvers, which most steps skip; see `Solver.shift`."""
         self._shifts += 1
 
     def _pass_shifts_on(self, stages: int) -> None:
@@ -73,7 +73,7 @@ class AutoSolver(Solver):
         self._shifts = 0
 
     def prepare(self, size: int) -> None:
-        """Make the QP solvers: theirs is a long import."""
+        """Make the QP solvers, whose import takes long."""
         for small in {True, size <= _SMALL}:
             self._others[small] = others = self._choose(small)
             for other in others:

@@ -1,4 +1,4 @@
-"""Description of a backend: its capabilities, and how its solver is made."""
+"""Description of a backend: its capabilities and its solver factory."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class Backend:
     Parameters
     ----------
     name : str
-        The name that users write: letters, digits, and any of ``_ . : + -``, the first one a
-        letter, a digit or ``_``.
+        The public name: letters, digits, and any of ``_ . : + -``, the first one a letter, a digit
+        or ``_``.
     factory : callable
         ``factory(options)`` makes a `Solver`. Called only if the backend is available.
     method : str
         The kind of algorithm, in a word or two.
     module : str or None
-        The module whose presence makes it available; None if nothing more is needed.
+        The module that it requires; None if it needs no package.
     distribution : str or None
-        What ``pip install`` calls that module.
+        The module's name for ``pip install``.
     matrices : str
         The view of the QP that it reads: ``banded``, ``csc`` or ``dense``.
     inequalities : bool
@@ -41,23 +41,22 @@ class Backend:
     iteration_cap : bool
         Whether ``SolverOptions.max_iterations`` is honoured.
     iterate_at_cap : bool
-        Whether there is an iterate to judge when the cap stops it.
+        Whether it returns an iterate when the cap stops it.
     warm_start : bool
         Whether the start given to ``solve`` is used.
     time_limit : bool
         Whether ``SolverOptions.time_limit`` is honoured.
     keeps_duals : bool
-        Whether multipliers of the last solve start the next one, moved by ``Solver.shift``.
+        Whether the last multipliers, moved by ``Solver.shift``, start the next solve.
     reports_infeasibility : bool
-        Whether its message says "infeasible" where a QP has no feasible point.
+        Whether its message says "infeasible" if a QP has no feasible point.
     keeps_workspace : bool
-        Whether the solver is set up once and updated from then on, not anew for each QP.
+        Whether the solver is set up once and then updated, not set up for each QP.
 
     Raises
     ------
     BackendError
-        If the name cannot be written as above, the factory cannot be called, or anything else
-        has a wrong type.
+        If the name is not as above, the factory is not callable, or a value has the wrong type.
     """
 
     name: str
@@ -108,7 +107,7 @@ class Backend:
 
     @property
     def available(self) -> bool:
-        """Whether its module can be found; nothing is imported to find out."""
+        """Whether its module can be found, without importing it."""
         if self.module is None:
             return True
         try:
@@ -126,16 +125,16 @@ class Backend:
 
 
 def make_solver(backend: Backend, options: SolverOptions) -> Solver:
-    """Make the solver of a backend, registered or not, whose package is there."""
+    """Make the solver of a backend, registered or not, whose package is installed."""
     try:
         solver: object = backend.factory(options)
     except QpmheError:
         raise
     except (Exception, SystemExit) as error:
         remedy = (
-            f"reinstall {backend.distribution}, or take another backend"
+            f"reinstall {backend.distribution}, or use another backend"
             if backend.distribution
-            else "correct the factory: factory(options) is to return a Solver"
+            else "correct the factory: factory(options) must return a Solver"
         )
         raise BackendError(
             f"backend {backend.name!r} cannot be made: {type(error).__name__}: {error}; {remedy}."

@@ -23,12 +23,12 @@ _COST_UNITS = 0.5, 1.0
 
 
 class BandedSolver(Solver):
-    """Solve ``H d = -g``, exact wherever the result meets every inequality.
+    """Solve ``H d = -g``, exact if the result satisfies every inequality.
 
-    Where it does not, the minimiser without inequalities comes back with the status
-    UNCONSTRAINED: a legal trial, not the QP's solution. LAPACK's banded Cholesky
-    factorisation (``pbsv``) takes O(K n^3) time and no iterations. Equality rows are kept:
-    the optimality conditions, ordered by stages, are banded too, and solved by ``gbsv``.
+    Otherwise it returns the minimiser without inequalities with the status UNCONSTRAINED: a valid
+    trial, not the QP's solution. LAPACK's banded Cholesky factorisation (``pbsv``) takes O(K n^3)
+    time and no iterations. Equality rows are kept: the optimality conditions, ordered by stages,
+    are banded too, and solved by ``gbsv``.
     """
 
     _judges, _keeps = True, False

@@ -1,4 +1,4 @@
-"""Whether a backend is what it says, and does what every backend must: small QPs show it."""
+"""Check a backend on small QPs: its declared capabilities, and every backend's duties."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _all_kinds = partial(sample, 7, 3, 2, bounds="part", sides="mixed")
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a backend was seen to do; see `Backend` for the flags."""
+    """Capabilities, declared or measured; see `Backend` for the flags."""
 
     inequalities: bool
     iteration_cap: bool
@@ -41,13 +41,13 @@ class Capabilities:
 
     @staticmethod
     def declared(backend: Backend) -> Capabilities:
-        """What a ``backend`` says of itself."""
+        """The capabilities that a ``backend`` declares."""
         return Capabilities(*(getattr(backend, one.name) for one in fields(Capabilities)))
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The outcome of one ``check``: whether it ``passed``, and the ``detail`` of what is wrong."""
+    """The outcome of one ``check``: whether it ``passed``, and the ``detail`` of a failure."""
 
     check: str
     passed: bool
@@ -56,14 +56,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Conformance:
-    """Whether a backend is what it says, and does what is asked; printed, what it did wrong.
+    """Result of a backend's conformance check; ``print`` shows the failures.
 
     Parameters
     ----------
     name : str
         The backend.
     declared, measured : Capabilities
-        What it says of itself, and what was seen.
+        Its declared and its measured capabilities.
     findings : tuple of Finding
         All checks, passed or not.
     """
@@ -75,7 +75,7 @@ class Conformance:
 
     @property
     def passed(self) -> bool:
-        """Whether every check passed, and all was declared as measured."""
+        """Whether every check passed, and all capabilities are as declared."""
         return self.declared == self.measured and all(one.passed for one in self.findings)
 
     def __str__(self) -> str:
@@ -89,7 +89,7 @@ class Conformance:
 
 
 def check(name: str) -> Conformance:
-    """Put the backend registered as ``name``, built in or your own, through all checks.
+    """Run all checks on the backend registered as ``name``, built in or your own.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def check(name: str) -> Conformance:
 
 
 def measure(name: str) -> Capabilities:
-    """Find out what the backend registered as ``name`` can do, whatever it says.
+    """Measure the capabilities of the backend registered as ``name``.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def _judged(solver: Solver, qp: QP, what: str) -> tuple[Array | None, list[str]]
         if not np.array_equal(getattr(qp, array), values):
             faults.append(f"{what}: it wrote into {array}")
     faults += [
-        f"{what}: it wrote into {array}, which is to be read only; copy before scaling in place"
+        f"{what}: it wrote into {array}, which is read-only; copy before scaling in place"
         for array in solver._wrote
     ]
     return solution.d, faults
@@ -207,7 +207,7 @@ def _as_fresh(
         yield from faults
         anew = fresh[k]
         if anew is None or found is None or np.abs(anew - found).max() > _SAME:
-            yield f"{what} {k}: not the solution of a solver made anew"
+            yield f"{what} {k}: differs from the solution of a new solver"
 
 
 def _each(qps: Callable[[Bounds, Sides], dict[str, QP]]) -> _Check:

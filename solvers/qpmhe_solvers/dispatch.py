@@ -1,4 +1,4 @@
-"""Every solver that qpsolvers offers, through one translation table."""
+"""Every solver of qpsolvers, through one translation table."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Point = NDArray[np.float64] | None
 
 
 class DispatchSolver(NativeSolver):
-    """Hand the QP to one solver through ``qpsolvers.solve_problem``.
+    """Pass the QP to one solver through ``qpsolvers.solve_problem``.
 
-    Only the arrays are kept; a solver gets the finite limits only.
+    Only the arrays are kept; the solver gets only finite limits.
     """
 
     package = "qpsolvers"  # imports every solver that is installed

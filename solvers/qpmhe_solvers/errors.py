@@ -1,4 +1,4 @@
-"""The root of every exception that this project raises on purpose."""
+"""The root of every exception that this project raises deliberately."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ T = TypeVar("T")
 
 
 class QpmheError(Exception):
-    """Root of the tree: catch this to catch everything that is ours."""
+    """Base class of all exceptions of this project."""
 
 
 class InvalidInputError(QpmheError, ValueError):
-    """An argument that can never work; the text names value, expectation and remedy."""
+    """An invalid argument; the message gives its value, what was expected, and the remedy."""
 
 
 class ShapeError(InvalidInputError):
@@ -28,15 +28,15 @@ class OptionError(InvalidInputError):
 
 
 class UnknownOptionError(OptionError, TypeError):
-    """An unknown keyword; also the TypeError that Python would raise."""
+    """An unknown keyword; also a TypeError, as Python would raise."""
 
 
 class BackendError(InvalidInputError):
-    """A QP backend that is unknown, not installed, described wrongly, or makes no solver."""
+    """A QP backend that is unknown, not installed or misdescribed, or fails to make a solver."""
 
 
 def report_unknown_options(cls: type[T]) -> type[T]:
-    """Make a class answer an unknown keyword with the ones that it knows."""
+    """Make a class report its known keywords if one is unknown."""
     plain = cls.__init__
     known = [name for name in inspect.signature(plain).parameters if name != "self"]
 

@@ -35,12 +35,12 @@ _PROBLEM = (
 
 @dataclass(frozen=True, eq=False)
 class StoredQP:
-    """What a file of `dump` holds.
+    """The contents of a file written by `dump`.
 
-    ``path`` is the file; ``qp`` the problem, to the last bit as it was; ``solution`` what the
-    ``backend`` answered (None, and an empty name, where nothing is stored), asked with ``options``
-    from ``start``, (K, n) or None; ``versions`` those of Python, of this package, and of what
-    solves QPs; and ``written`` when, in ISO 8601.
+    ``path`` is the file; ``qp`` the problem, identical to the last bit; ``solution`` the answer of
+    ``backend`` (None, and an empty name, if not stored) with ``options`` from ``start``, (K, n) or
+    None; ``versions`` the versions of Python, this package and the solvers; and ``written`` the
+    time in ISO 8601.
     """
 
     path: Path
@@ -62,25 +62,25 @@ def dump(
     options: SolverOptions | None = None,
     start: Array | None = None,
 ) -> Path:
-    """Write a QP into an ``.npz`` file, so that it can be solved again elsewhere.
+    """Write a QP to an ``.npz`` file, to solve it again elsewhere.
 
-    NumPy alone reads the file: its entry ``header`` is a JSON text that explains the arrays
-    beside it. Nothing in it is pickled. The file appears whole or not at all.
+    NumPy alone reads the file: its entry ``header`` is a JSON text that explains the other arrays.
+    Nothing is pickled. The write is atomic.
 
     Parameters
     ----------
     qp : QP
         The problem; it need not be finite.
     path : str or path
-        The file, by custom with the ending ``.npz``. An existing one is replaced.
+        The file, usually ``.npz``. An existing file is replaced.
     solution : Solution, optional
-        What a backend answered.
+        A backend's answer.
     backend : str
-        The name of that backend.
+        The backend's name.
     options : SolverOptions, optional
-        What it was asked for.
+        The options of the solve.
     start : (K, n) array, optional
-        The point it was started from.
+        The start of the solve.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def dump(
     Raises
     ------
     InvalidInputError
-        If an argument is of another kind, or the file cannot be written.
+        If an argument has another type, or the file cannot be written.
     """
     for name, value, kind, optional in (
         ("qp", qp, QP, False), ("solution", solution, Solution, True),
@@ -123,7 +123,7 @@ def dump(
 
 
 def load(path: str | os.PathLike[str]) -> StoredQP:
-    """Read a file of `dump`.
+    """Read a file written by `dump`.
 
     Parameters
     ----------
@@ -133,12 +133,12 @@ def load(path: str | os.PathLike[str]) -> StoredQP:
     Returns
     -------
     StoredQP
-        The QP, and what is known of where it came from.
+        The QP, and its stored origin.
 
     Raises
     ------
     InvalidInputError
-        If there is no such file, or it is damaged, of another kind, or of a newer version.
+        If the file does not exist, is damaged, or has another format or a newer version.
     """
     source = Path(path)
     header, arrays = _read(source)
@@ -147,8 +147,8 @@ def load(path: str | os.PathLike[str]) -> StoredQP:
     version = header.get("version")
     if isinstance(version, int) and version > _VERSION:
         raise InvalidInputError(
-            f"{source} has version {version} of the format, and this qpmhe reads up to "
-            f"{_VERSION}; upgrade qpmhe to one that is no older than the file."
+            f"{source} has version {version} of the format, but this qpmhe reads only up to "
+            f"{_VERSION}; upgrade qpmhe."
         )
     try:
         if version != _VERSION:
@@ -159,7 +159,7 @@ def load(path: str | os.PathLike[str]) -> StoredQP:
 
 
 def qp_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """The files that are meant by files, and by folders with those inside them."""
+    """All QP files among these files, and inside these folders."""
     found: list[Path] = []
     for path in map(Path, paths):
         if path.is_dir():
@@ -173,7 +173,7 @@ def qp_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
         elif path.exists():
             found.append(path)
         else:
-            raise InvalidInputError(f"there is no file {path}; look at the spelling.")
+            raise InvalidInputError(f"there is no file {path}; check the spelling.")
     return found
 
 
@@ -271,8 +271,8 @@ def _write(target: Path, header: dict[str, Any], arrays: Mapping[str, NDArray[An
             raise
     except OSError as error:
         raise InvalidInputError(
-            f"cannot write {target}: {error.strerror or error}; give a path in an existing "
-            "folder that can be written to and has space left."
+            f"cannot write {target}: {error.strerror or error}; give a path in an existing, "
+            "writable folder with free space."
         ) from error
 
 
@@ -283,7 +283,7 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             magic = file.read(4)
     except OSError as error:
         raise InvalidInputError(
-            f"cannot read {source}: {error.strerror or error}; expected a file of "
+            f"cannot read {source}: {error.strerror or error}; expected a file written by "
             "qpmhe.solvers.dump."
         ) from error
     if not magic.startswith(b"PK"):
@@ -309,7 +309,8 @@ def _read(source: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 def _foreign(source: Path) -> InvalidInputError:
     """The error for a file of another kind."""
     return InvalidInputError(
-        f"{source} is no QP file of qpmhe; expected one of qpmhe.solvers.dump or Recording."
+        f"{source} is not a QP file of qpmhe; expected a file written by qpmhe.solvers.dump or "
+        "Recording."
     )
 
 

@@ -1,4 +1,4 @@
-"""A backend in a separate process, whose crashes and hangs end one QP only."""
+"""A backend in a separate process, so that a crash or hang fails only one QP."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _PROGRAM = (
 class IsolatedSolver(Solver):
     """Solve by a backend in a child process.
 
-    The process is started once, and ends with this solver. Where it dies, or exceeds the time
-    limit, the QP has FAILED and another process takes its place. That one starts meanwhile; a
-    QP that comes before it is ready waits for it, for half of the time limit at most.
+    The process is started once, and ends with this solver. If it dies, or exceeds the time limit,
+    the QP has FAILED and a new process replaces it. Until that is ready, a QP waits for it, but at
+    most for half the time limit.
     """
 
     _judges = True
@@ -186,7 +186,7 @@ class _Child:
 
     def _death(self) -> str:
         if self._late:
-            return "out of time: its process was ended at the time limit"
+            return "out of time: its process was killed at the time limit"
         return _death(self._process)
 
 
@@ -237,8 +237,8 @@ def _packed(backend: Backend) -> bytes:
     except Exception as error:
         raise BackendError(
             f"backend {backend.name!r} cannot be isolated: its factory cannot be sent to another "
-            f"process ({type(error).__name__}: {error}); let it be a class or a function of a "
-            "module that can be imported."
+            f"process ({type(error).__name__}: {error}); make it a class or a function of an "
+            "importable module."
         ) from error
     if b"__main__" in sent:
         raise BackendError(
@@ -254,7 +254,7 @@ def _write(pipe: IO[bytes], message: object) -> None:
 
 
 def serve(parent: int) -> None:
-    """What the child process does: make a solver, then answer until the pipe is closed."""
+    """Main loop of the child process: make a solver, then answer until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for who waits for the answer
     # What backends print must not get between the answers.
     back, commands = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")

@@ -1,4 +1,4 @@
-"""A QP as native solvers take it: laid out once for a structure, then filled in place."""
+"""A QP in the form of native solvers: laid out once per structure, then filled in place."""
 
 from __future__ import annotations
 

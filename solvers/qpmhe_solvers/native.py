@@ -27,7 +27,7 @@ _KNOWN = 64
 
 
 class Answer(NamedTuple):
-    """What a solver said."""
+    """A solver's answer."""
 
     x: Array | None
     duals: Array | None
@@ -182,7 +182,7 @@ def _finite(values: Array | None) -> bool:
 class ClarabelSolver(NativeSolver):
     """Solve by Clarabel.
 
-    It knows no start: it begins anew each time.
+    It does not warm-start: every solve is a cold start.
     """
 
     package, translation = "clarabel", "clarabel"
@@ -247,8 +247,8 @@ _STOPPED = (_AT_CAP, -7)
 class DaqpSolver(NativeSolver):
     """Solve by DAQP.
 
-    It starts with the limits that the start lies on, or those that were active last, as
-    active; where it stops at a cap or time limit, there is no iterate.
+    It warm-starts the active set with the limits that the start lies on, or with the last active
+    ones; if it stops at a cap or time limit, it returns no iterate.
     """
 
     package, translation = "daqp", "daqp"
@@ -369,8 +369,8 @@ class OsqpSolver(NativeSolver):
 class PiqpSolver(NativeSolver):
     """Solve by PIQP's sparse solver, which factorises stage by stage.
 
-    Its multistage factorisation wants the unknowns in the order of the stages, as they are.
-    PIQP knows no start: it begins anew each time.
+    Its multistage factorisation needs the unknowns in the order of the stages, as they are. PIQP
+    does not warm-start: every solve is a cold start.
     """
 
     package, translation = "piqp", "piqp"
@@ -423,8 +423,8 @@ class PiqpDenseSolver(PiqpSolver):
 class ProxqpSolver(NativeSolver):
     """Solve by ProxQP's dense solver.
 
-    It begins at the minimiser under the equality rows each time: starts with the multipliers
-    of the last solve took as many iterations or more, and longer.
+    Every solve starts at the minimiser under the equality rows: warm starts with the last
+    multipliers took no fewer iterations, and longer.
     """
 
     package, translation = "proxsuite", "proxqp"
@@ -473,7 +473,7 @@ class ProxqpSolver(NativeSolver):
 class ProxqpSparseSolver(ProxqpSolver):
     """Solve by ProxQP with sparse matrices.
 
-    It begins at the minimiser under the equality rows each time, like the dense one.
+    Every solve starts at the minimiser under the equality rows, as with the dense solver.
     """
 
     style = Style("csc", bounds="rows")

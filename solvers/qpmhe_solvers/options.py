@@ -1,4 +1,4 @@
-"""What a caller may ask of any QP solver, in one vocabulary."""
+"""Options of any QP solver, under common names."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class SolverOptions:
         Cap on the solver's own iterations, at least 1. None leaves the solver's default.
         A backend without a cap (see its capabilities) solves fully.
     absolute_tolerance : float
-        Tolerance on the primal and dual residuals, > 0. It has no unit: every QP is scaled
-        before a solver sees it, by powers of two, so that the Hessian's diagonal, the rows and
-        the step are of order one (see Notes).
+        Tolerance on the primal and dual residuals, > 0. It is dimensionless: every QP is scaled by
+        powers of two before the solve, so that the Hessian's diagonal, the rows and the step are of
+        order one (see Notes).
     relative_tolerance : float
-        Tolerance relative to the size of the residuals' terms, >= 0. Backends that know
-        only one tolerance use the absolute one.
+        Tolerance relative to the size of the residuals' terms, >= 0. Backends with only one
+        tolerance use the absolute one.
     time_limit : float or None
         Seconds for one solve, > 0. Backends without a clock ignore it.
     warm_start : bool
-        Whether the start that ``Solver.solve`` is given is handed to backends that use one.
+        Whether the start given to ``Solver.solve`` is passed to backends that use one.
 
     Raises
     ------
@@ -40,11 +40,11 @@ class SolverOptions:
 
     Notes
     -----
-    A claim of success is judged in the scaled numbers as well, so that the verdict (SOLVED or
+    A claim of success is also verified in the scaled numbers, so that the verdict (SOLVED or
     INACCURATE) does not depend on the units of states, rows and cost. Iterate, multipliers and
-    residuals of a `Solution` are in the caller's units. There is one factor for each component
-    of the state, at all stages; one for each row, at all stages; and one for the cost. `banded`
-    solves QPs without equality rows as they are, since a Cholesky factor depends on no unit.
+    residuals of a `Solution` are in the caller's units. There is one factor for each component of
+    the state and one for each row, equal at all stages, and one for the cost. `banded` solves QPs
+    without equality rows as they are, since a Cholesky factor depends on no unit.
     """
 
     max_iterations: int | None = None
@@ -59,7 +59,7 @@ class SolverOptions:
             raise OptionError(
                 f"max_iterations is {shown(self.max_iterations)}; expected an integer >= 1 or "
                 f"None{f', at most {_MOST_ITERATIONS}' if cap and cap > 1 else ''}. "
-                "To skip the QP altogether, ask the estimator for max_qps=0."
+                "To skip the QPs, set the estimator's max_qps=0."
             )
         _positive("absolute_tolerance", self.absolute_tolerance, zero=False)
         _positive("relative_tolerance", self.relative_tolerance, zero=True)

@@ -125,9 +125,8 @@ class QP:
         a_k \le F_k d_k + G_k d_{k+1} \le b_k
 
     H is symmetric, block-tridiagonal and positive definite. The lower triangle is held in
-    stage-wise band panels (see `band_index`), which LAPACK reads in place; the CSC and
-    dense views are made from these same numbers. Whatever is assigned to an array is written
-    into it.
+    stage-wise band panels (see `band_index`), which LAPACK reads in place; the CSC and dense views
+    are made from these same numbers. Assigning to an array attribute writes into the array.
 
     Parameters
     ----------
@@ -151,9 +150,9 @@ class QP:
     row_lower, row_upper : (K, rows) array
         a and b; equal entries make an equality row.
     bounded : bool
-        Whether bounds are looked at, True in a new QP. False is a promise that no entry of
-        ``lower`` and ``upper`` is finite, and saves the look; where it is broken, some backends
-        leave the bounds out.
+        Whether bounds are read, True in a new QP. False promises that no entry of ``lower`` and
+        ``upper`` is finite, and saves time; if the promise is broken, some backends ignore the
+        bounds.
 
     Raises
     ------
@@ -251,7 +250,7 @@ class QP:
         return float(np.vdot(d, 0.5 * self.hessian_times(d) + self.gradient))
 
     def violation(self, d: Array) -> float:
-        """The largest amount by which increments ``d`` (K, n) miss a bound or a row."""
+        """The largest violation of a bound or a row by increments ``d`` (K, n)."""
         value = np.concatenate((d, self.rows_times(d)), axis=None) if self.rows else d.reshape(-1)
         worst = float(np.maximum(self.all_lower - value, value - self.all_upper).max())
         # Comparisons with NaN are false: a NaN among the numbers must not pass as feasible.
@@ -263,7 +262,7 @@ class QP:
         return bool(np.isfinite(data).all()) and not np.isnan(self.limits).any()
 
     def fault(self) -> str:
-        """What no solver must be given: NaN hangs some and comes back as success from others."""
+        """Why the QP must not reach a solver: some hang on NaN, others return it as success."""
         data = self.numbers[: self.numbers.size - self.limits.size]
         # Squares may overflow where the numbers do not: then each one is looked at.
         finite = math.isfinite(data.dot(data)) or np.isfinite(data).all()

@@ -1,4 +1,4 @@
-"""QPs collected while something else solves them."""
+"""Record QPs while a backend solves them."""
 
 from __future__ import annotations
 
@@ -28,57 +28,54 @@ Which = Literal["suspicious", "failed", "all"]
 
 
 class RecordingWarning(UserWarning):
-    """QPs that should have been recorded were not; what solved them went on undisturbed."""
+    """Some QPs were not recorded; solving them was not affected."""
 
 
 class Recording:
-    """A backend that solves as another one does, and keeps QPs as files of `dump`.
+    """A backend that solves with another one, and saves QPs with `dump`.
 
-    Inside ``with``, ``recording.backend`` can be named wherever a backend is named::
+    Inside ``with``, use ``recording.backend`` as the name of a backend::
 
         with qpmhe.solvers.Recording("folder", "osqp") as recording:
             mhe = qpmhe.MovingHorizonEstimator(..., backend=recording.backend)
             mhe.run(measurements)
 
-    Every QP goes to the solver as it is, and what comes back is handed on as it is: results
-    are those of the backend itself. No failure to record reaches the caller; it ends the
-    recording, and a warning reports it when the block ends. Files are written at once, so that
-    those before a crash are safe; only where the solver has a time limit, they wait for the
-    end of the block, so that no step runs late on their account.
+    QPs and solutions pass through unchanged: the results are the backend's. A failure to record
+    never reaches the caller; it ends the recording, and a warning reports it when the block ends.
+    Files are written at once, so that those before a crash are safe. Only if the solver has a time
+    limit, they are written at the end of the block, so that they delay no step.
 
     Parameters
     ----------
     folder : str or path
-        Where the files go; it is made. Their names, ``qp-000012-failed.npz``, hold a running
-        number of all QPs that were solved, which goes on behind files that are there
-        already, and the verdict.
+        Folder for the files, created if needed. Their names, ``qp-000012-failed.npz``, hold a
+        running number over all solved QPs, which continues after existing files, and the verdict.
     backend : str
         The backend that solves.
     only : {"suspicious", "failed", "all"}
-        Which QPs are kept. ``failed`` are those without an iterate. ``suspicious`` are these,
-        those with a claim of success that the residuals do not confirm, those that a solver
-        gave up without having been limited, and those whose inequalities were ignored by a
-        backend that handles them.
+        Which QPs are kept. ``failed`` keeps those without an iterate. ``suspicious`` also keeps
+        those with a claim of success that the residuals do not confirm, those that a solver gave up
+        without a limit, and those whose inequalities were ignored by a backend that handles them.
     limit : int
         Most files to write, at least 1.
     isolated : bool
-        As in `create`: a QP that ends the solver's process is then kept as one that failed.
+        As in `create`: a QP that kills the solver's process is then kept as a failed one.
 
     Attributes
     ----------
     files : list of Path
         The files, in the order of their QPs.
     seen, wanted : int
-        QPs that were solved, and how many of them were to be kept.
+        Numbers of QPs that were solved, and that qualified to be kept.
 
     Raises
     ------
     BackendError
         If the backend is unknown.
     OptionError
-        If ``only`` or ``limit`` is none of these.
+        If ``only`` or ``limit`` is invalid.
     InvalidInputError
-        If the folder cannot be made or written to.
+        If the folder cannot be created or written to.
     """
 
     def __init__(
@@ -108,7 +105,7 @@ class Recording:
 
     @property
     def backend(self) -> str:
-        """The name under which it solves, within the block.
+        """The backend's name within the block.
 
         Raises
         ------
@@ -117,15 +114,15 @@ class Recording:
         """
         if not self._name:
             raise InvalidInputError(
-                "the recording has not begun; use its backend within "
-                "`with Recording(...) as recording:`."
+                "the recording has not started; use its backend within `with Recording(...) as "
+                "recording:`."
             )
         return self._name
 
     def __enter__(self) -> Recording:
         with self._lock:
             if self._name:
-                raise InvalidInputError("the recording has begun already; make another one.")
+                raise InvalidInputError("the recording has already started; create another one.")
             taken, name = {one.name for one in backends()}, f"recorded:{self._backend.name}"
             names = chain([name], (f"{name}:{number}" for number in count(2)))
             self._name = next(name for name in names if name not in taken)
@@ -147,7 +144,7 @@ class Recording:
             fault, self._fault = self._fault, ""
         if fault:
             warnings.warn(
-                f"recording QPs ended after {len(self.files)} files in {self._folder}: {fault}",
+                f"recording QPs stopped after {len(self.files)} files in {self._folder}: {fault}",
                 RecordingWarning, stacklevel=2,
             )
 

@@ -1,4 +1,4 @@
-"""The registered backends, and how users add theirs."""
+"""The registry of backends."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _looked = False
 
 
 def register(backend: Backend) -> None:
-    """Add a backend, so that its name can be used wherever a backend is named.
+    """Register a backend under its name.
 
-    An installed package adds its own without being imported by anyone: by an entry point of
-    the group ``qpmhe.backends`` to a `Backend`, or to a function without arguments that
-    returns one, or several. These are loaded when a backend is first looked up.
+    An installed package registers backends without being imported, by an entry point of the group
+    ``qpmhe.backends`` to a `Backend`, or to a function without arguments that returns one or
+    several. Entry points are loaded when a backend is first looked up.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def register(backend: Backend) -> None:
     Raises
     ------
     BackendError
-        If the name is taken, or ``backend`` is no `Backend`.
+        If the name is taken, or ``backend`` is not a `Backend`.
     """
     if not isinstance(backend, Backend):
         raise BackendError(
@@ -56,7 +56,7 @@ def unregister(name: str) -> None:
     Raises
     ------
     BackendError
-        If there is none of that name.
+        If there is no backend of that name.
     """
     backend(name)
     del _REGISTRY[name]
@@ -69,7 +69,7 @@ def backends() -> tuple[Backend, ...]:
 
 
 def available() -> tuple[str, ...]:
-    """Names of the backends that can be used here."""
+    """Names of the installed backends."""
     _look_for_plugins()
     return tuple(name for name, known in _REGISTRY.items() if known.available)
 
@@ -80,7 +80,7 @@ def backend(name: str) -> Backend:
     Raises
     ------
     BackendError
-        If there is none of that name; the text lists the names there are.
+        If there is no backend of that name; the message lists the known names.
     """
     _look_for_plugins()
     found = _REGISTRY.get(name) if isinstance(name, str) else None
@@ -103,16 +103,16 @@ def create(
     options : SolverOptions, optional
         Limits and accuracy; the defaults if left out.
     isolated : bool
-        Whether it solves in a separate process: a crash is then a FAILED solution, and a time
-        limit holds for every backend. It adds some tenths of a millisecond to each QP.
+        Whether it solves in a separate process: a crash then only fails the QP, and a time limit
+        holds for every backend. It adds some tenths of a millisecond to each QP.
 
     Raises
     ------
     BackendError
-        If the name is unknown, its package is not installed, its factory makes no `Solver`, or
-        it cannot be sent to another process.
+        If the name is unknown, its package is not installed, its factory does not make a `Solver`,
+        or it cannot be sent to another process.
     OptionError
-        If ``options`` is something else.
+        If ``options`` has another type.
     """
     if not isinstance(isolated, bool):
         raise OptionError(f"isolated is {shown(isolated)}; expected True or False.")
@@ -150,7 +150,7 @@ def _look_for_plugins() -> None:
                 register(one)
         except (Exception, SystemExit) as error:  # a broken package must not break ours
             warnings.warn(
-                f"the entry point {point.name!r} ({point.value}) of the group {_GROUP!r} brings "
+                f"the entry point {point.name!r} ({point.value}) of the group {_GROUP!r} provides "
                 f"no backend: {type(error).__name__}: {error}. Correct or uninstall its package.",
                 stacklevel=3,
             )

@@ -1,4 +1,4 @@
-"""Small random QPs that put a backend to the test."""
+"""Small random QPs to test a backend."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def sample(
     around: float = 0.2,
     seed: int = 0,
 ) -> QP:
-    """Make a random QP with a point inside of all its limits."""
+    """Make a random QP with a strictly feasible point."""
     rng = np.random.default_rng(seed)
     qp = QP(stages, n, rows)
     for k in range(stages):
@@ -60,7 +60,7 @@ def sample(
 
 
 def contradiction(stages: int = 6, n: int = 2) -> QP:
-    """Make a QP of two rows that want the same sum above 5 and below -5."""
+    """Make an infeasible QP: two rows require the same sum above 5 and below -5."""
     qp = sample(stages, n, 2, sides="two")
     middle = stages // 2
     qp.row_own[middle], qp.row_next[middle] = 1.0, 0.0

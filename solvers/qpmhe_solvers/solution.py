@@ -1,4 +1,4 @@
-"""The solution of a QP, judged by the QP's data and never by the solver's word."""
+"""The solution of a QP, verified with the QP's data, independently of the solver's status."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _largest = np.maximum.reduce  # the method of an array comes to this, by detours
 
 
 class SolveStatus(enum.Enum):
-    """How a QP solve ended. The value says what to do about it."""
+    """The outcome of a QP solve; the value gives the remedy."""
 
     SOLVED = "solved: the recomputed residuals confirm it"
     STOPPED = (
@@ -28,37 +28,37 @@ class SolveStatus(enum.Enum):
     )
     INACCURATE = (
         "success claimed, but the recomputed residuals do not confirm it: usable as a trial; "
-        "tighten the tolerances, rescale the weights or take another backend"
+        "tighten the tolerances, rescale the weights or use another backend"
     )
     UNCONSTRAINED = (
-        "the exact minimiser without inequalities, and it violates some: usable as a trial; "
-        "take a backend that handles inequalities for accuracy"
+        "the exact minimiser without inequalities, which violates some: usable as a trial; "
+        "use a backend that handles inequalities for accuracy"
     )
-    FAILED = "no usable iterate: read the message, and take another backend"
+    FAILED = "no usable iterate: read the message, and use another backend"
 
     @property
     def usable(self) -> bool:
-        """Whether there is a finite iterate of the right shape."""
+        """Whether a finite iterate of the right shape exists."""
         return self is not SolveStatus.FAILED
 
 
 @dataclass(frozen=True)
 class RawSolution:
-    """What a backend hands over before it is judged.
+    """A backend's result before verification.
 
     Parameters
     ----------
     d : array_like or None
         The iterate, K n numbers in stage order; None if there is none.
     claimed : bool
-        Whether the solver says that it solved the QP.
+        Whether the solver reports success.
     iterations : int or None
-        The solver's own count, None where it gives none.
+        The solver's iteration count, None if it reports none.
     bound_duals, row_duals : array or None
-        Multipliers of the bounds (K n) and rows (K rows), positive on the upper side; None
-        where the solver gives none.
+        Multipliers of the bounds (K n) and rows (K rows), positive on the upper side; None if the
+        solver reports none.
     message : str
-        The solver's own words.
+        The solver's message.
     """
 
     d: object
@@ -78,7 +78,7 @@ class Residuals:
     primal : float
         Largest violation of a bound or row.
     dual : float
-        ``|H d + g + z + [F, G]^T y|_inf``; NaN where the solver gave no multipliers.
+        ``|H d + g + z + [F, G]^T y|_inf``; NaN if the solver reported no multipliers.
     gap : float
         Distance between primal and dual objective,
         ``|d^T H d + g^T d + sum of multipliers times their bounds|``; NaN likewise.
@@ -98,7 +98,7 @@ class Residuals:
 
 
 class Errors:
-    """What an iterate misses optimality by, entry by entry; bounds and rows in one array each.
+    """The optimality errors of an iterate, entry by entry; bounds and rows in one array each.
 
     ``missed``, (K n + K rows,), is the amount by which each constraint is missed, negative where
     it is met, and empty where there is none; ``force``, (K n,), the size of the gradient of the
@@ -159,23 +159,23 @@ def _peak(force: Array | None) -> float:
 
 
 class Solution:
-    """A judged solution.
+    """A verified solution.
 
     Attributes
     ----------
     d : (K, n) array or None
-        The iterate; None exactly when the status is FAILED.
+        The iterate; None if and only if the status is FAILED.
     status : SolveStatus
-        The verdict.
+        The verified status.
     iterations : int or None
-        The solver's own count.
+        The solver's iteration count.
     residuals : Residuals or None
-        Recomputed from the data; None where there is no iterate, and for the unconstrained
-        minimiser of a Cholesky factorisation, whose residuals are rounding.
+        Recomputed from the data; None without an iterate, and for the unconstrained minimiser of a
+        Cholesky factorisation, whose residuals are only rounding.
     bound_duals, row_duals : array or None
         Multipliers as in `RawSolution`.
     message : str
-        The solver's own words, or what was wrong with its answer.
+        The solver's message, or why its answer was rejected.
     """
 
     __slots__ = (
@@ -198,7 +198,7 @@ class Solution:
 
     @property
     def residuals(self) -> Residuals | None:
-        """Recomputed from the data, when they are first asked for."""
+        """Recomputed from the data at the first access."""
         found = self._residuals
         if callable(found):
             found = self._residuals = found()

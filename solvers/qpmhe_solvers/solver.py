@@ -1,4 +1,4 @@
-"""The contract of a QP solver, and the wall that contains whatever it does."""
+"""The contract of a QP solver, and the containment of its failures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NUMBERS = count(1)
 
 
 class Solver(ABC):
-    """One QP solver with its options; subclasses implement `_solve` and nothing more.
+    """One QP solver with its options; subclasses only implement `_solve`.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ class Solver(ABC):
     Attributes
     ----------
     time_limit : float or None
-        Seconds for the next solve, > 0. It begins as that of the options; a caller with a
-        deadline sets it anew before each solve, to what remains. Backends with a clock read it
-        when they set their clock.
+        Seconds for the next solve, > 0, initially the options' ``time_limit``. A caller with a
+        deadline sets it to the remaining time before each solve. Backends with a time limit read it
+        there.
     """
 
     time_limit: float | None = None
@@ -77,29 +77,28 @@ class Solver(ABC):
         """Solve qp. It may raise, and it may lie: `solve` contains all of it."""
 
     def shift(self) -> None:  # noqa: B027 - most keep nothing
-        """Say that the trajectory moved on by one stage since the last solve.
+        """Report that the trajectory moved by one stage since the last solve.
 
-        What is kept for stage k + 1 now belongs to stage k; the last stage is new. A solver
-        that keeps nothing from solve to solve has nothing to do.
+        Data kept for stage k + 1 now belong to stage k; the last stage is new. A solver that keeps
+        no data between solves ignores this.
         """
 
     def forget(self) -> None:
-        """Drop what is kept from solve to solve: the next one is as the first.
+        """Drop all data kept between solves: the next solve is a cold start.
 
-        What a solver keeps may change the last digits of what it finds. So whoever wants the
-        same numbers twice asks for this in between. A subclass that keeps something drops it
-        here, and calls ``super().forget()``.
+        Kept data may change the last digits of a solution; call this to reproduce a solve exactly.
+        A subclass that keeps data drops them here, and calls ``super().forget()``.
         """
         if self._scaling is not None:
             self._scaling.forget()
 
     def prepare(self, size: int) -> None:  # noqa: B027 - most have nothing to prepare
-        """Do beforehand what the first QPs would otherwise wait for, such as imports.
+        """Do in advance what would delay the first QPs, such as imports.
 
         Parameters
         ----------
         size : int
-            Unknowns K n of the largest QP to come.
+            Unknowns K n of the largest expected QP.
         """
 
     def _rehearse(self) -> None:
@@ -109,7 +108,7 @@ class Solver(ABC):
         self.forget()
 
     def solve(self, qp: QP, start: Array | None = None) -> Solution:
-        """Solve a QP; whatever the solver raises ends here, and it is never believed.
+        """Solve a QP, contain every exception of the solver, and verify its answer.
 
         Parameters
         ----------
@@ -127,10 +126,10 @@ class Solver(ABC):
         Raises
         ------
         InvalidInputError
-            If ``qp`` is no `QP`.
+            If ``qp`` is not a `QP`.
         KeyboardInterrupt
-            If the user interrupts. Nothing else gets out: a solver that wants to end the process
-            with SystemExit has failed, too.
+            If the user interrupts. No other exception passes: a solver that raises SystemExit has
+            also failed.
         """
         if type(qp) is not QP:
             _expect_qp(qp)
@@ -158,7 +157,7 @@ class Solver(ABC):
             return self._judged(scaled, scale, self._solve(scaled, usable))
         solution = self._judged(scaled, scale, self._solve_lent(scaled, usable))
         if self._wrote and solution.status is not SolveStatus.SOLVED:
-            note = f"it wrote into {', '.join(self._wrote)} of the QP, which is to be read only"
+            note = f"it wrote into {', '.join(self._wrote)} of the QP, which is read-only"
             solution.message = f"{solution.message}; {note}" if solution.message else note
         return solution
 
@@ -248,8 +247,8 @@ class ContainedSolver:
     `Solver.solve` contains what `Solver._solve` does. This contains the rest: a user's class may
     override `solve` itself, and its `shift`, `forget` and `prepare` may raise.
 
-    Several of these may share one solver. Whenever it passes from one to another, it starts
-    afresh: nothing that it keeps from one trajectory warm-starts the other.
+    Several of these may share one solver. It starts cold whenever its user changes, so that no data
+    of one trajectory warm-start another.
     """
 
     def __init__(self, solver: Solver) -> None:
@@ -285,12 +284,12 @@ class ContainedSolver:
         solver._user = self._number
 
     def shift(self) -> None:
-        """Say that the trajectory moved on by one stage; see `Solver.shift`."""
+        """Report that the trajectory moved by one stage; see `Solver.shift`."""
         if self.solver._user in (0, self._number):  # else it keeps nothing of this trajectory
             _quietly(self.solver.shift)
 
     def forget(self) -> None:
-        """Drop what is kept from solve to solve; see `Solver.forget`."""
+        """Drop all data kept between solves; see `Solver.forget`."""
         if self.solver._user in (0, self._number):
             self._start_afresh()
 
@@ -299,7 +298,7 @@ class ContainedSolver:
         Solver.forget(self.solver)  # which a user's class need not call
 
     def prepare(self, size: int) -> None:
-        """Do beforehand what the first QPs would wait for; see `Solver.prepare`."""
+        """Do in advance what would delay the first QPs; see `Solver.prepare`."""
         _quietly(self.solver.prepare, size)
 
 
@@ -337,8 +336,8 @@ def _expect_qp(qp: object) -> None:
     """Refuse what is no QP."""
     if not isinstance(qp, QP):
         raise InvalidInputError(
-            f"qp is {qp!r}; expected a qpmhe.solvers.QP: make one by its sizes and fill its "
-            "arrays, or load one by qpmhe.solvers.load."
+            f"qp is {qp!r}; expected a qpmhe.solvers.QP: create one from its "
+            "sizes and fill its arrays, or load one with qpmhe.solvers.load."
         )
 
 

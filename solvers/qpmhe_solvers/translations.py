@@ -1,4 +1,4 @@
-"""What each solver calls our caps and tolerances, and how it wants its matrices."""
+"""Each solver's names for our caps and tolerances, and its matrix format."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .options import SolverOptions
 
 @dataclass(frozen=True)
 class Translation:
-    """How our vocabulary reads in one solver's own; the style is what qpsolvers is to be given."""
+    """Our options under one solver's names; the style is the matrix format for qpsolvers."""
 
     method: str
     package: str
@@ -29,7 +29,7 @@ class Translation:
     others: tuple[tuple[str, float], ...] = ()
 
     def keywords(self, options: SolverOptions) -> dict[str, Any]:
-        """The options in the solver's own words, but for the time limit."""
+        """The options under the solver's names, without the time limit."""
         words: dict[str, Any] = dict(self.others)
         words.update(dict.fromkeys(self.absolute, options.absolute_tolerance))
         words.update(dict.fromkeys(self.relative, options.relative_tolerance))

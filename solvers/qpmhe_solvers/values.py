@@ -1,4 +1,4 @@
-"""What a caller's value is: a number or none, and how an error text shows it."""
+"""Read a caller's value as a number, and show it in messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LONGEST = 600
 
 
 def finite(value: Any) -> float | None:
-    """The finite real number that a value is; None for all else, booleans and arrays included."""
+    """The value as a finite real number; None for anything else, such as booleans and arrays."""
     if isinstance(value, (bool, np.timedelta64)):  # NumPy's durations pass for integers
         return None
     if not isinstance(value, (int, float, np.integer, np.floating)):
@@ -26,14 +26,14 @@ def finite(value: Any) -> float | None:
 
 
 def integer(value: Any) -> int | None:
-    """The integer that a value is; None for all else, booleans and arrays included."""
+    """The value as an integer; None for anything else, such as booleans and arrays."""
     if isinstance(value, (bool, np.timedelta64)) or not isinstance(value, (int, np.integer)):
         return None
     return operator.index(value)
 
 
 def shown(value: Any) -> str:
-    """A value as an error text shows it; never raises."""
+    """A value as text for a message; never raises."""
     try:
         text = repr(value)
     except Exception:  # a user's __repr__, or an integer of more digits than Python writes

@@ -153,5 +153,5 @@ def test_functions_of_other_packages_must_become_systems_first():
     x, theta = ca.SX.sym("x"), ca.SX.sym("theta")
     f = ca.Function("f", [x, theta], [theta * x])
     for written in (f, [x]):
-        with pytest.raises(qpmhe.errors.ModelError, match="Make a System of a model"):
+        with pytest.raises(qpmhe.errors.ModelError, match="make a System with"):
             qpmhe.augment_parameters(written, lambda x, theta: x, n=1, p=1, nominal=[0.5])

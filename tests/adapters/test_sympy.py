@@ -36,7 +36,7 @@ def test_discrete_time_inputs_and_constants():
         (["(", X[1]], [X[0]], "expected SymPy expressions"),
         ([X[0] > 0, X[1]], [X[0]], "f contains x1 > 0; expected SymPy expressions"),
         (X, [], "h is empty"),
-        ([X[0] * sympy.Symbol("t"), X[1]], [X[0]], "f contains t, .* on time an input"),
+        ([X[0] * sympy.Symbol("t"), X[1]], [X[0]], "f contains t, .*varying quantities inputs"),
         ([X[0], sympy.Symbol("x2", real=True)], [X[0]], "x2 has the name .* real=True"),
         ([sympy.Function("g")(X[0]), X[1]], [X[0]], r"f contains g\(.*unknown functions"),
         ([sympy.I * X[0], X[1]], [X[0]], "finite real value"),
@@ -117,7 +117,7 @@ def test_states_may_be_functions_of_time():
     same(pickle.loads(pickle.dumps(system)), plain, POINTS, inputs, 1e-7)
     with pytest.raises(ModelError, match=r"Derivative\(q\(t\), t\).*solve the equations"):
         from_sympy([speed], [q], [q])
-    with pytest.raises(ModelError, match=r"f contains t, .*on time an input"):
+    with pytest.raises(ModelError, match=r"f contains t, .*time-varying quantities inputs"):
         from_sympy([q * t], [q], [q])
 
 

@@ -207,7 +207,7 @@ def test_what_cannot_be_certified_is_named(reactor):
         ({"system": None}, ModelError, "system is None"),
         ({"system": linear(np.diag([0.5, 1.1]), [[1.0, 0.0]]), "region": unit_box(2),
           "observer": qpmhe.Luenberger([[0.2], [0.0]]), "detectability": None},
-         NotCertifiedError, r"eigenvalue 1\.1.*not in the output"),
+         NotCertifiedError, r"eigenvalue 1\.1.*not appear in the output"),
     ):
         given = parts | arguments
         with pytest.raises(error, match=words):

@@ -123,7 +123,7 @@ def test_an_undetectable_mode_is_named(shown, tmp_path):
     report = tmp_path / "failed.json"
     done, text = shown("(growth=1.1)", report=report, box=SQUARE, details=True)
     assert not done
-    assert text.startswith("No bound of the observer's error is proved.")
+    assert text.startswith("No bound on the observer's error is proved.")
     for words in ("Not certified", "eigenvalue 1.1", "What may help", "another gain"):
         assert words in text, words
     assert "candidate, at each step and with any solver" in " ".join(text.split())

@@ -84,7 +84,7 @@ EVENTS = {  # what happens in place of the sample 7, the sample that is lost, an
     "amended": (lambda mhe, y: [mhe.update(y), mhe.amend(6, [3.0])], 7, "late measurement"),
     "amended in secret": (
         lambda mhe, y: [mhe.amend(6, [3.0]) and mhe.update(y)], 7, "late measurement"),
-    "began again": (lambda mhe, y: [mhe.reset() or mhe.update(y)], 0, "began again"),
+    "began again": (lambda mhe, y: [mhe.reset() or mhe.update(y)], 0, "restarted"),
     "not shown": (
         lambda mhe, y: [mhe.update(y) and mhe.update(y)], 8, "from 7 to 7 were not shown"),
     # z = 10.4, and the truth may be in the region
@@ -119,7 +119,7 @@ def test_each_event_ends_the_bound_at_its_sample(certificate, event):
 def test_a_candidate_that_starts_again_has_no_such_bound(certificate):
     mhe = estimator(certificate, candidate="reinitialized")
     reading = followed(certificate, mhe).check(mhe.update([0.1]))
-    assert "starts again at each sample" in reading.reason
+    assert "restarts at each sample" in reading.reason
     run = estimator(certificate, candidate="reinitialized").run(record()[1])
     band = certificate.observer_bound.along(run, initial_error=START)
     assert (band.lost, band.reason) == (0, reading.reason)
@@ -328,7 +328,7 @@ def test_a_monitor_continues_from_its_state(certificate):
         })
         assert watch.state_dict()["radius"] == pytest.approx(mine["radius"], rel=1e-9)
     for wrong in ({}, {**state, "observer": [1.0]}, {**state, "radius": "x"}):
-        with pytest.raises(InvalidInputError, match="no monitor of this observer"):
+        with pytest.raises(InvalidInputError, match="not come from a monitor of this observer"):
             watch.load_state_dict(wrong)
     with pytest.raises(InvalidInputError, match=r"pass certificate\.observer_bound"):
         Monitor(certificate, estimator(certificate), initial_error=1.0).state_dict()

@@ -84,6 +84,7 @@ def test_synthesis_beats_the_paper_observer_and_trades_disturbance_against_noise
     sizes = [0.3, 0.3], [0.6]
     made = synthesise_gain(system, REACTOR, sizes=sizes)
     assert made.stability.evidence is Evidence.PROVED
+    assert f"rate {made.stability.rho:.4g} a sample (proved)" in str(made)
     paper = certify_observer(system, observer, REACTOR, sizes=sizes)
     assert (limit(made.stability, *sizes) < 0.7 * limit(paper, *sizes)).all()
     noisy, disturbed = ([0.01, 0.01], [1.0]), ([1.0, 1.0], [0.01])

@@ -331,7 +331,7 @@ def test_what_fits_nothing_is_refused():
         (Gate, {"reopen": 0}, "reopen is 0"),
         (Gate, {"groups": 3}, "groups is 3"),
         (Gate, {"groups": [[]]}, "groups is"),
-        (Gate, {"groups": [[0, -1]]}, "numbers from 0 on"),
+        (Gate, {"groups": [[0, -1]]}, "integers >= 0"),
         (Gate, {"groups": [[0, 1], [1, 2]]}, "one group at most"),
         (Huber, {"threshold": 0.0}, "threshold is 0.0"),
         (Huber, {"threshold": math.inf}, "threshold is inf"),

@@ -192,5 +192,5 @@ def test_a_correction_is_tried_near_the_start_in_any_unit(unit):
     mhe = estimator(system, unit, qpmhe.OutputInjection(correction), start, unit**2)
     assert np.isfinite(mhe.update([3.1 * unit]).state).all()
     wrong = qpmhe.OutputInjection(lambda z, v: 0.2 * v + (z - 3.0 * unit))
-    with pytest.raises(ModelError, match="must not correct where the output fits"):
+    with pytest.raises(ModelError, match=r"must satisfy L\(z, 0\) = 0"):
         estimator(system, unit, wrong, start, unit**2)

@@ -62,7 +62,7 @@ def test_a_horizon_beyond_the_memory(monkeypatch):
         raise MemoryError("Unable to allocate 745. GiB")
 
     monkeypatch.setattr("qpmhe.estimation.estimator.engine_for", exhausted)
-    words = ["horizon is 10000000", "745. GiB", "take a shorter one"]
+    words = ["horizon is 10000000", "745. GiB", "take a shorter horizon"]
     check(OptionError, words, lambda: estimator(horizon=10_000_000))
 
 
@@ -184,3 +184,8 @@ def begun():
 )
 def test_samples_that_do_not_fit_leave_the_estimator_as_it_was(build, wrong, sample):
     unharmed(build, wrong, sample)
+
+
+def test_a_late_measurement_needs_a_sample():
+    text = ["time is 0", "no sample yet", "call update first"]
+    check(InvalidInputError, text, estimator().amend, 0, [1.0])

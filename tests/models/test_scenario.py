@@ -129,10 +129,10 @@ def test_a_state_that_cannot_stay_inside():
     of = qpmhe.System(
         lambda x: x + 1.0, lambda x: x, n=1, p=1, states=qpmhe.Box([0.0], [3.0])
     )
-    with pytest.raises(ModelError, match="cannot go on inside of the sets at sample 2"):
+    with pytest.raises(ModelError, match="cannot stay inside the sets at sample 2"):
         scenario(of, disturbance_covariance=[[1e-6]]).simulate(0)
     exploding = qpmhe.System(lambda x: 1e200 * x, lambda x: x, n=1, p=1)
-    with pytest.raises(ModelError, match=r"is \[inf\] without"), np.errstate(over="ignore"):
+    with pytest.raises(ModelError, match=r"disturbance it is \[inf\]"), np.errstate(over="ignore"):
         scenario(exploding).simulate(0)
 
 

@@ -94,7 +94,9 @@ def test_results_that_do_not_belong_to_the_checkpoint(cut):
 def test_damaged_checkpoints(cut):
     sound = get(CHECKPOINT)
     generator = np.random.default_rng(0)
-    damaged = [b"", b"x", sound[: len(sound) // 2], sound[:-1]]
+    other = sound.replace(b'"samples": 40', b'"samples": 20')
+    assert other != sound
+    damaged = [b"", b"x", sound[: len(sound) // 2], sound[:-1], other]
     for _ in range(20):
         wrong = bytearray(sound)
         wrong[generator.integers(len(sound) // 2)] ^= 0xFF

@@ -85,7 +85,7 @@ def test_resume_and_overwrite(call):
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["--max-qps", "many"], "'none'"), (["--max-solver-iterations", "1.5"], "'none'"),
-    (["--initial-state", "0;1"], "between commas"), (["--engine", "steam"], "steam"),
+    (["--initial-state", "0;1"], "separated by commas"), (["--engine", "steam"], "steam"),
 ])
 def test_options_that_are_no_numbers(call, arguments, words):
     answer = call(*arguments)

@@ -133,7 +133,7 @@ def test_full_while_rows_or_a_checkpoint_are_written(text):
     # Checkpoints have room, all rows have not.
     limit = Path("record.out.csv").stat().st_size - 300
     assert limit > whole
-    with room(limit), pytest.raises(WriteError, match="continue by --resume") as caught:
+    with room(limit), pytest.raises(WriteError, match="continue with --resume") as caught:
         estimate(DISCRETE, **OPTIONS)
     done = rows("out.csv") - 1
     assert 100 < done < 200
@@ -194,7 +194,7 @@ def test_a_disk_that_does_not_synchronise(text, monkeypatch):
     ("line", "words"),
     [
         ("record.csv > /dev/full", "cannot write standard output: No space left"),
-        ("record.csv >&-", "standard output is closed; name a file by --out"),
+        ("record.csv >&-", "standard output is closed; name a file with --out"),
         ("- <&-", "standard input: it is closed; pipe a record into it"),
         ("- --out record.csv --overwrite < record.csv", "record itself"),
     ],

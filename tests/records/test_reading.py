@@ -44,7 +44,9 @@ WRONG_LINES = [
     (",0.5,0\n", ["column 'time'", "blank"]),
     ("inf,0.5,0\n", ["column 'time'", "not finite"]),
     ("noon,0.5,0\n", ["column 'time'", "'noon' is not a number", "2026-05-04T12:00:00"]),
-    ("04/05/2026,0.5,0\n", ["'04/05/2026' is not a number", "--time-format"]),
+    ("04/05/2026,0.5,0\n", ["'04/05/2026' is not a number", "--time-format", "'.%f'"]),
+    ("s,V,A\n", ["'s' is not a number", "delete the line if it holds units"]),
+    ("0.3,n/v,0\n", ["'n/v' is not a number", "leave it blank", "--missing"]),
     ("32.05.2026,0.5,0\n", ["'32.05.2026' is not a number", "--time-format"]),
     ("2026-01-01 00:00:00,0.5,0\n", ["column 'time'", "a date, and in line 4 a number"]),
     ("0.3;0.5;0\n", ["it has 1 field, and the header 3", "correct"]),
@@ -71,6 +73,8 @@ def test_wrong_lines(here):
         # The good ones are estimated all the same.
         assert get("out.csv").count(b"\n") >= 3
         assert get("expected.csv").startswith(get("out.csv"))
+    assert "%f is a fraction" in refused(b"time,y,u\n04/05/2026 12:00:00.5,0,0\n",
+                                         time_format="%d/%m/%Y %H:%M:%S")
     # With the right encoding it is a text, and no number.
     assert "'°' is not a number" in refused(GOOD.encode() + b"0.3,\xb0,0\n", encoding="cp1252")
 
@@ -90,8 +94,8 @@ NO_SAMPLES = [
     (b"PK\x03\x04" + bytes(100), "spreadsheet"), (b"BZh91AY" + bytes(100), "bzip2"),
     (b"\xfd7zXZ\0" + bytes(100), "xzcat"), (b"\x28\xb5\x2f\xfd" + bytes(100), "zstd"),
     (GOOD.replace("\n", "\r").encode(), "end lines in LF"),
-    (f"# logger v1\n{GOOD}".encode(), "Skip lines above the header by --skip-lines"),
-    (f"Logger,v1\n\nserial,77\n{GOOD}".encode(), "Skip lines above the header by --skip-lines"),
+    (f"# logger v1\n{GOOD}".encode(), "Skip lines above the header with --skip-lines"),
+    (f"Logger,v1\n\nserial,77\n{GOOD}".encode(), "Skip lines above the header with --skip-lines"),
     (",".join(f"channel {k:04d} {'x' * 500}" for k in range(500)).encode(), "and 460 more"),
 ]
 

@@ -52,6 +52,7 @@ def test_a_zoo_model_gives_what_run_gives(here):
     assert list(out)[1:4] == [f"filtered_{label}" for label in scenario.labels]
     assert (summary.samples, summary.before, summary.inserted, summary.held) == (70, 0, 0, 0)
     assert summary.improved == sum(qpmhe.Status.IMPROVED in s for s in run.statuses)
+    assert estimate("battery_cell", out="observer.csv", max_qps=0).improved == 0
 
 
 def by_hand(text):

@@ -162,7 +162,7 @@ def test_a_claim_is_not_judged_by_what_the_solver_left_of_the_problem():
         assert solution.residuals.dual == np.abs(QP.gradient).max()
         assert solution.message.startswith("it wrote into ")
         assert name in solution.message
-        assert "read only" in solution.message
+        assert "read-only" in solution.message
 
 
 def test_who_scribbles_is_named_unless_right():
@@ -329,7 +329,7 @@ def test_success_that_is_none():
         np.zeros(20), np.zeros(22), 0.0, np.full(21, np.nan), np.full(21, np.inf), "none",
         ["a"] * 21, [[0.0], [0.0, 1.0]], {}, object(), [1j] * 21,
     ],
-    ids=str,
+    ids=lambda one: type(one).__name__,
 )
 @pytest.mark.parametrize("which", ["bound_duals", "row_duals"])
 def test_unusable_multipliers_are_dropped(which, duals):

@@ -140,7 +140,7 @@ def test_damage_is_reported_or_does_not_matter(stored):
     whole, rng, reported = path.read_bytes(), np.random.default_rng(0), 0
     for length in np.linspace(0, len(whole) - 1, 30).astype(int):
         path.write_bytes(whole[:length])
-        with pytest.raises(InvalidInputError, match=r"one.npz is (damaged|no QP file)"):
+        with pytest.raises(InvalidInputError, match=r"one.npz is (damaged|not a QP file)"):
             load(path)
     for place in rng.integers(0, len(whole), 150):
         spoilt = bytearray(whole)
@@ -174,7 +174,7 @@ class Trap:
         return pytest.fail, ("a pickle was run",)
 
 
-FOREIGN, DAMAGED = "no QP file.*qpmhe.solvers.dump", "damaged"
+FOREIGN, DAMAGED = "not a QP file.*qpmhe.solvers.dump", "damaged"
 
 
 def test_files_of_another_kind_are_refused(tmp_path):

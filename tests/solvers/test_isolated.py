@@ -210,7 +210,7 @@ def test_what_cannot_be_made_or_sent_is_refused_at_construction():
         isolated(Unmakeable)
     lock = threading.Lock()
     stuck = Backend("stuck", lambda options, lock=lock: Hostile(options), "theatre")
-    with registered(stuck), pytest.raises(BackendError, match=r"cannot be sent .*a module"):
+    with registered(stuck), pytest.raises(BackendError, match=r"sent .*importable module"):
         create("stuck", isolated=True)
     with pytest.raises(OptionError, match="isolated is 1; expected True or False"):
         create("banded", isolated=1)

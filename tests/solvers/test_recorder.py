@@ -231,7 +231,7 @@ def test_outside_of_the_block_nothing_is_left_of_it(tmp_path):
         _ = recording.backend
     with recording:
         solver = create(recording.backend)
-        with pytest.raises(InvalidInputError, match="begun already"):
+        with pytest.raises(InvalidInputError, match="already started"):
             recording.__enter__()
     assert backends() == before
     with pytest.raises(InvalidInputError, match="within"):

@@ -45,7 +45,7 @@ def test_compare_runs_the_study_of_its_options(tmp_path, shown):
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        ("--qps", "0,two", "--qps has 'two'; expected integers >= 0 between commas, or 'none'"),
+        ("--qps", "0,two", "has 'two'; expected integers >= 0 separated by commas, or 'none'"),
         ("--solver-iterations", "", "--solver-iterations has ''"),
         ("--horizons", "0", "--horizons has '0'; expected integers >= 1"),
         ("--noise-levels", "1,x", "--noise-levels is '1,x'; expected numbers"),

@@ -238,3 +238,19 @@ def test_figures_keep_their_size_after_they_were_saved_for_a_paper(tmp_path):
     assert max(widths) <= 3.0
     after = [len(column.get_children()) for column in legend._legend_handle_box.get_children()]
     assert (figure.get_figwidth(), before, panel.xaxis.label.get_fontsize()) == (8.0, after, 10.0)
+
+
+def test_the_command_counts_kept_qps_and_a_record_model_alone_names_the_remedy(here):
+    text = command("compare", "--model", "mine.py:make", "--record", "log.csv", *GRID,
+                   "--store", "kept.sqlite", "--out", "out", "--keep-failing", "failing")
+    assert "failing has no QPs" in text
+    page = (Path("out") / "index.html").read_text(encoding="utf-8")
+    assert "configurations, up to 40 steps each" in page  # no seeds
+    (Path("failing") / "cell").mkdir()
+    (Path("failing") / "cell" / "one.npz").touch()
+    text = command("compare", "--model", "mine.py:make", "--record", "log.csv", *GRID,
+                   "--store", "kept.sqlite", "--out", "out", "--keep-failing", "failing")
+    assert "failing has 1 QP " in text
+    assert "qpmhe solve-qp failing" in text
+    with pytest.raises(qpmhe.errors.ModelError, match="is enough for a record"):
+        Study(models=["mine.py:make"])

@@ -100,7 +100,7 @@ def test_what_cannot_be_exported_is_reported(folder, tmp_path):
     for files, out, error, words in (
         ([], new, InvalidInputError, "no QP to export: no file was given"),
         ([one], new, InvalidInputError, "no QP to export: its data are not finite"),
-        ([folder, tmp_path / "text.npz"], new, InvalidInputError, r"text.npz is no QP file"),
+        ([folder, tmp_path / "text.npz"], new, InvalidInputError, r"text.npz is not a QP file"),
         (folder, tmp_path / "text.npz", InvalidInputError, "cannot write the test set to .*text"),
         (folder, tmp_path / "full", InvalidInputError, "holds problems already"),
     ):

@@ -19,7 +19,7 @@ from qpmhe.plots.style import _resized
 from qpmhe.studies.report import cases, write_report
 from qpmhe.studies.report.answers import failures, limitations
 from qpmhe.studies.report.drawing import styles
-from qpmhe.studies.report.figures import profiles, spreads
+from qpmhe.studies.report.figures import anytime, profiles, spreads
 from qpmhe.studies.report.page import Part, choose_runs, files
 from qpmhe.studies.report.words import configuration_words, number, percent, seconds
 from qpmhe.studies.summary import summarise
@@ -63,7 +63,7 @@ def test_fastest_near_the_best_the_observer_and_failures():
     assert found["Failures"] == "Never: daqp and proxqp. Failed: osqp: 2 of 6 runs failed."
     rows = frame()
     rows["reasons"] = [{"SOLVER_FAILED": 4} if one == "osqp" else {} for one in rows.backend]
-    words = "osqp, 2 QPs per sample, cap 2: no run, but 10 % of the steps"
+    words = "osqp, 2 QPs per sample, cap 2: 10 % of the steps, but no run"
     assert words in texts(rows)[0]["Failures"]
 
 
@@ -85,8 +85,18 @@ def test_what_is_worse_than_no_qp_is_named():
         f"(RMSE {number(mean)}, 4.00 times); daqp, 2 QPs per sample "
         f"(RMSE after settling {number(settled)}, 1.50 times)."
     )
+    early = rows.assign(rmse=frame().rmse)
+    assert texts(early)[0]["Worse than no QP"].startswith(
+        "1 of 6 configurations has a larger error after settling than the observer alone")
     rows.loc[worse, "rmse"] = np.inf
     assert "osqp, 2 QPs per sample, cap 2 (RMSE ∞); daqp" in texts(rows)[0]["Worse than no QP"]
+
+
+def test_one_backend_at_one_cap_is_not_drawn():
+    rows = summarise(frame())
+    assert anytime(rows[rows["solver_iterations"].isna()]) is not None
+    assert anytime(rows[rows["solver_iterations"].isna() & (rows["backend"] != "osqp")
+                        & (rows["backend"] != "proxqp")]) is None
 
 
 def test_most_of_what_is_worse_is_counted():
@@ -394,7 +404,7 @@ def test_the_terminals_room_is_used(width):
     assert {"RMSE", "conv.", "median", "impr."} <= headings
     assert ("99 %" in headings) == (width >= 120)
     assert ({"95 %", "kept", "back", "hits", "max"} <= headings) == (width == 200)
-    assert ("No room here, but in the report" in " ".join(text.split())) == (width < 200)
+    assert ("Only in the report, for want of room" in " ".join(text.split())) == (width < 200)
     assert not {"late", "NEES"} & headings
     # What was asked for is shown at any width: generic backends, two starts, failed runs.
     rows = frame().query("horizon == 10")

@@ -248,7 +248,7 @@ def test_bad_input():
         qpmhe.diagnose(run, labels=3)
     with pytest.raises(OptionError, match=r"time_unit is 3; expected a string"):
         qpmhe.diagnose(run, time_unit=3)
-    with pytest.raises(InvalidInputError, match="does not know its measurements"):
+    with pytest.raises(InvalidInputError, match="the run has no measurements"):
         qpmhe.diagnose(qpmhe.Run.of(run.states[0], []))
     with pytest.raises(InvalidInputError, match="a folder"):
         qpmhe.diagnose(run).report(Path("/tmp"))

@@ -94,7 +94,7 @@ def test_a_file_without_weights_is_refused(tmp_path, text):
     ("horizon = 0", "horizon is 0; expected an integer"),
     ("horizon = 2.5", r"horizon is 2\.5; expected an integer"),
     ("discount = 3", "discount is 3; expected a number"),
-    ("horison = 3", r"it has 'horison', which is no field of them\)"),
+    ("horison = 3", r"it has 'horison', which weights do not have\)"),
     ("threshold = -1", "threshold"),
 ])  # fmt: skip
 def test_a_field_that_is_wrong_is_named_with_the_file(tmp_path, line, text):
@@ -163,7 +163,8 @@ def test_truth_and_several_records(folder):
 @pytest.mark.parametrize(("arguments", "error", "text"), [
     (["--truth", "position"], OptionError, "--truth has 'position'.* a name of x1, x2"),
     (["--truth", "x3=position"], OptionError, "--truth has 'x3=position'.* a name of x1, x2"),
-    (["--truth", "x1=WRONG"], RecordError, r"name it by --truth x1=COLUMN, or leave it out: then"),
+    (["--truth", "x1=WRONG"], RecordError,
+     r"name it with --truth x1=COLUMN, or leave it out: then"),
     (["--truth", "x1="], OptionError, "--truth leaves all true states out"),
     (["--held-out", "0.9"], OptionError, r"--held-out is 0\.9"),
     (["--parameter", "k=0"], InvalidInputError, "--parameter k starts at 0"),

@@ -2,13 +2,13 @@
  *
  *     x(t+1) = f(x(t), u(t)) + w(t),   y(t) = h(x(t), u(t)) + v(t)
  *
- * Plain C99 without libraries but libm, no memory allocation, bounded loops. Compile
+ * Plain C99 that needs only libm, no memory allocation, bounded loops. Compile
  * $name.c with any C99 compiler (cc -O2) and link with -lm. Never use -ffast-math, -Ofast or
  * -ffinite-math-only: NaN and infinity have a meaning here. GCC without the fix of its bug 114375,
  * such as 12.2, compiles masked loads wrongly, with AVX even at -O2. $name.c switches these off by
  * a pragma; a build that drops it must pass -fno-tree-loop-if-convert.
  *
- *     static mhe_estimator estimator;      all that is remembered
+ *     static mhe_estimator estimator;      all that it remembers
  *     static mhe_workspace workspace;      scratch, may be shared by estimators of one thread
  *     static mhe_estimate estimate;
  *     mhe_reset(&estimator, &mhe_default_settings, x0);      keeps a pointer to the settings
@@ -19,8 +19,8 @@
  * if there is one, after each step. After each update
  * estimate.cost <= estimate.candidate_cost: both are the true cost of the nonlinear problem.
  *
- * A sample with something of its own, such as a weight, is taken by mhe_update_special. Other
- * settings for all samples: copy the settings, change the copy, and call mhe_set.$clock_text
+ * For a sample with other conditions, such as another weight, call mhe_update_special. For other
+ * settings at all samples, copy the settings, change the copy, and call mhe_set.$clock_text
  */
 #ifndef MHE_H
 #define MHE_H
@@ -90,7 +90,7 @@ $status
 /* Rows of a window: those of stage i on w(i), v(i) and x(i); a last stage has x only. */
 #define MHE_ROWS ((MHE_HORIZON + MHE_X_SET) * MHE_SIZE(MHE_STAGE_ROWS))
 
-/* What to do where no trajectory in the sets costs at most what the candidate does. */
+/* What to do if no trajectory in the sets costs at most as much as the candidate. */
 enum { MHE_DROP_ROWS = 0, MHE_KEEP_CANDIDATE = 1 };
 
 /* Sides of an inequality, as bits. */
@@ -303,7 +303,7 @@ typedef struct {
     mhe_real candidate[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real disturbances[MHE_HORIZON * MHE_NX];
     mhe_real noises[MHE_HORIZON * MHE_NY];
-    mhe_real observer_state[MHE_NX]; /* from which the observer goes on, at t+1 */
+    mhe_real observer_state[MHE_NX]; /* from which the observer continues, at t+1 */
     mhe_real filtered[MHE_NX];     /* estimate of x(t) that has used y(t) */
     int64_t time;                  /* of the newest sample */
     int32_t length, status, qps, iterations, corrections, nearest_points;
@@ -373,8 +373,8 @@ typedef struct {
 #endif
 } mhe_workspace;
 
-/* A sample, and what holds for it alone: 0 and null pointers stand for what usually does. Fill it
- * by zeros first: `mhe_sample sample = {0};`. */
+/* A sample, and the conditions for it alone: 0 and null pointers stand for the usual ones. Fill it
+ * with zeros first: `mhe_sample sample = {0};`. */
 typedef struct {
     const mhe_real *y, *u;         /* y(t); u(t), not read where there are no inputs */
     const mhe_real *noise_weight, *disturbance_weight;
@@ -388,7 +388,7 @@ typedef struct {
     mhe_real step;                 /* length of the step from t to t+1 */
 } mhe_sample;
 
-/* Where mhe_run writes; a null pointer leaves out. One entry for each sample. */
+/* Where mhe_run writes, one entry for each sample; a null pointer omits an output. */
 typedef struct {
     mhe_real *states, *filtered, *delayed;   /* MHE_NX each */
     mhe_real *costs, *candidate_costs;
@@ -403,7 +403,7 @@ typedef struct {
  * they must stay where they are as long as the estimator is in use. */
 void mhe_reset(mhe_estimator *estimator, const mhe_settings *settings, const mhe_real *x0);
 
-/* Take a sample in that has something of its own; all of it is copied. */
+/* Take in a sample with other conditions; all of it is copied. */
 void mhe_update_special(mhe_estimator *estimator, mhe_workspace *workspace,
                         const mhe_sample *sample, mhe_estimate *estimate);
 
@@ -418,15 +418,15 @@ void mhe_update_undoable(mhe_estimator *estimator, mhe_estimator *before,
 
 void mhe_undo(mhe_estimator *estimator, const mhe_estimator *before);
 
-/* Put a late measurement into a sample that is still in the window; 0, or -1 if it is not. */
+/* Insert a late measurement into a sample in the window; returns 0, or -1 if it is not there. */
 int mhe_amend(mhe_estimator *estimator, mhe_workspace *workspace, int64_t time,
               const mhe_real *y, mhe_estimate *estimate);
 
-/* One sample of each of many estimators, each with an estimate of its own. */
+/* One sample of each of many estimators, each with its own estimate. */
 void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspace *workspace,
                         const mhe_real *y, const mhe_real *u, mhe_estimate *estimates);
 
-/* Take whole records in: `members` estimators one after the other, `samples` each. */
+/* Process whole records: `members` estimators one after the other, `samples` each. */
 void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspace,
              int64_t samples, const mhe_real *y, const mhe_real *u, const mhe_log *log);
 
@@ -436,13 +436,13 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspac
 void mhe_recompute(mhe_estimator *estimator, mhe_real *reached, mhe_real *covariances);
 
 #if MHE_LAPACK
-/* Before all else: dpotrf, dtrsm, dsyrk and dgemm, by Fortran's convention with 32-bit integers. */
+/* Call this first: dpotrf, dtrsm, dsyrk and dgemm, by Fortran's convention with 32-bit integers. */
 void mhe_set_lapack(void *const *functions);
 #endif
 
-/* Let other settings hold for all samples of the window and from now on, run the observer again
- * from the start of the window, and estimate the same state again. What the samples had of their
- * own in place of what changes is forgotten; `changes` are its bits. Deviations and scales of
+/* Apply other settings to all samples of the window and from now on, run the observer again from
+ * the start of the window, and estimate the same state again. Where the settings change, conditions
+ * of single samples are forgotten; `changes` are its bits. Deviations and scales of
  * sets and the observer's covariances, which are in the settings, too, go with the weights.
  * parameters: a null pointer, or values of the last `count` inputs of all samples. Before the
  * first sample, there is no estimate to write. */

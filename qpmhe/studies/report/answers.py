@@ -123,7 +123,7 @@ class Case:
         observer = rows.iloc[0]
         ratio = observer[self.by] / other[self.by] if other[self.by] > 0.0 else np.inf
         words = configuration_words(other)
-        text = f"{self._value(observer)}, {number(ratio)} times that of {words}"
+        text = f"{self._value(observer)}, {number(ratio)} times the value of {words}"
         if np.isfinite(observer["time_median"]):
             share = observer["time_median"] / other["time_median"]
             text += (
@@ -148,18 +148,19 @@ class Case:
                     ratio = error / float(alone[name]) if alone[name] > 0 else np.inf
                     times = f", {number(ratio)} times" if np.isfinite(ratio) else ""
                     text = f"{configuration_words(row)} ({words} {number(error)}{times})"
-                    found.append((np.nan_to_num(ratio, nan=np.inf), text))
+                    found.append((np.nan_to_num(ratio, nan=np.inf), text, name == "rmse"))
                     break
         if not found:
             return Answer(question, "No configuration.")
         found.sort(key=lambda one: -one[0])
-        named = [text for _, text in found[:_MOST_NAMED]]
+        named = [text for _, text, _ in found[:_MOST_NAMED]]
         more = f"; and {len(found) - len(named)} more" if len(found) > len(named) else ""
-        are = "configuration has" if len(found) == 1 else "configurations have"
+        are = f"configuration{'s' * (len(rows) != 1)} {'has' if len(found) == 1 else 'have'}"
+        over = "" if any(early for _, _, early in found) else "after settling "
         return Answer(
             question,
-            f"{len(found)} of {len(rows)} {are} a larger error than the observer alone, although J "
-            f"is never above the candidate's: {'; '.join(named)}{more}.",
+            f"{len(found)} of {len(rows)} {are} a larger error {over}than the observer alone, "
+            f"although J is never above the candidate's: {'; '.join(named)}{more}.",
         )
 
     def _failed(self) -> Answer:
@@ -172,7 +173,7 @@ class Case:
                 failures.append(f"{backend}: {failed} of {cells} runs failed")
             elif share > 0:
                 worst = configuration_words(mine.loc[mine["failed_steps"].idxmax()])
-                failures.append(f"{worst}: no run, but {percent(share)} of the steps")
+                failures.append(f"{worst}: {percent(share)} of the steps, but no run")
             else:
                 never.append(str(backend))
         if not failures:
@@ -214,10 +215,10 @@ def file_name(title: str) -> str:
 
 
 def chosen(summary: DataFrame) -> tuple[Any | None, Any] | None:
-    """The fastest configuration near the best, and the most accurate, of equals the fastest.
+    """The fastest configuration near the best, and the most accurate, among equals the fastest.
 
-    The first is None where there are no times; all is None where no configuration finished all
-    its runs.
+    The first is None if there are no times; the result is None if no configuration finished all its
+    runs.
     """
     rows, by = _whole(summary), measure(summary)
     if rows.empty:
@@ -257,7 +258,7 @@ def limitations(frame: DataFrame, summary: DataFrame) -> list[str]:
     seeds = int(summary["seeds"].max())
     notes = [
         "A time covers a whole update: the observer's step, building the QPs, the solver, and the "
-        "verdict on its iterate.",
+        "check of its iterate.",
         _RMSE if measure(summary) == "rmse" else _NO_TRUTH,
         f"Values within {percent(TOLERANCE)} count as equal on the Pareto front.",
     ]

@@ -100,9 +100,9 @@ class Mark:
 
     Kinds: "points", "line" (with markers), "level" (a horizontal line), "steps", "curve" (a plain
     line), "box" (one box of quartiles; x has the quantiles 0.01, 0.25, 0.5, 0.75, 0.99, 1) and
-    "front" (ringed points joined by steps). ``hover``, ``sizes`` (radius in points), ``hollow``
-    and ``pale`` are of each point, ``bars`` the lengths of error bars below and above. The page's
-    menus and the columns of a file choose by ``meta``; ``label`` is for a legend.
+    "front" (ringed points joined by steps). ``hover``, ``sizes`` (radius in points), ``hollow`` and
+    ``pale`` have an entry per point; ``bars`` are the lengths of error bars below and above. The
+    page's menus and the columns of a file choose by ``meta``; ``label`` is for a legend.
     """
 
     kind: str

@@ -34,7 +34,7 @@ _SIZES, _LARGEST = {"0": 9.5, "1": 5.1, "2": 6.5}, 8.1
 
 
 def with_states(summary: DataFrame, count: int) -> DataFrame:
-    """A summary with a column for the RMSE of each of so many states, and for its limits."""
+    """A summary with columns for the RMSE of each state, and for its limits."""
     columns = {}
     for suffix in ("", "_low", "_high"):
         lists = summary[f"rmse_states{suffix}"]
@@ -46,7 +46,7 @@ def with_states(summary: DataFrame, count: int) -> DataFrame:
 
 
 def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing | None:
-    """Accuracy against time, a point a configuration; ``front`` marks the rows on the front."""
+    """Accuracy against time, one point per configuration; ``front`` marks the rows on the front."""
     usable = summary["time_median"].notna() & np.isfinite(summary[metric].astype(float))
     rows, best = summary[usable], summary[usable & np.asarray(front, dtype=bool)]
     if rows.empty:
@@ -73,10 +73,10 @@ def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing
 def anytime(summary: DataFrame) -> Drawing | None:
     """RMSE and cost ratio against the cap, a line for each backend and number of QPs per sample.
 
-    Without the cost ratio where the study has none.
+    Without the cost ratio where the study has none, and nothing of one backend at one cap.
     """
     rest = summary[(summary["backend"] != "observer") & (summary["failures"] == 0)]
-    if rest.empty:
+    if len(rest[["backend", "solver_iterations"]].drop_duplicates()) < 2:
         return None
     observer = summary[summary["backend"] == "observer"]
     caps = sorted({int(cap) for cap in rest["solver_iterations"] if not missing(cap)})
@@ -117,9 +117,9 @@ AXES = {
 def sweeps(summary: DataFrame) -> dict[str, tuple[Drawing, dict[str, Style]]]:
     """Errors against N, noise level and i where they vary: the drawing, and how lines look.
 
-    Uncapped, of the usual start and of one backend, which is in the name: of those within 1 % of
-    the best, the first in the alphabet. Bars are confidence limits over the seeds. The lines are
-    those of i, else of N.
+    The runs are uncapped, with the usual start and one backend, which the name states: the first in
+    the alphabet of those within 1 % of the best. Bars are confidence limits over the seeds. There
+    is a line for each i, else for each N.
     """
     drawn = {}
     for (model, steps), rows in summary.groupby(["model", "steps"], sort=False):
@@ -277,7 +277,7 @@ class Profile:
 
     :math:`\rho_s(\tau) = |\{p : t_{p,s} \le \tau \min_{s'} t_{p,s'}\}| / |P|`
     (Dolan and More, Mathematical Programming 91, 2002, doi 10.1007/s101070100263).
-    ``ratios`` are sorted, of the problems that it solves; ``problems`` is |P|.
+    ``ratios``, sorted, are those of the problems that it solves; ``problems`` is |P|.
     """
 
     backend: str
@@ -297,8 +297,8 @@ def profiles(frame: DataFrame) -> list[Profile]:
 
     A backend is represented by its configuration that solves most problems, of several such by
     the one with the lowest geometric mean time (median per step). Solved means: the run finished
-    and its J is on average within `SOLVED` of the converged one. There are none without times,
-    with fewer than two problems, or where no problem counts as solved.
+    and its J is on average within `SOLVED` of the converged one. There are no profiles without
+    times, with fewer than two problems, or if no problem counts as solved.
     """
     problems = [*PROBLEM, "seed"]
     cells = frame[frame["backend"] != "observer"]

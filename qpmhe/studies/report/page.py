@@ -130,11 +130,11 @@ def write_report(
     Parameters
     ----------
     source : Store, path or (frame, meta)
-        A store or its file; or its frame and meta alone, then without trajectories.
+        A store or its file; or only its frame and meta, then without trajectories.
     out : path
         The folder; it is made.
     width : {"single", "double"} or float, optional
-        For a paper: the figures are PDF files, too, of this width; see `qpmhe.plots.save`.
+        For a paper: also write the figures as PDF of this width; see `qpmhe.plots.save`.
 
     Returns
     -------
@@ -144,8 +144,8 @@ def write_report(
     Raises
     ------
     StoreError, InvalidInputError, OptionError
-        If the store cannot be read or has no finished cell, the folder cannot be made, a library
-        is missing, or the width is neither.
+        If the store cannot be read or has no finished cell, the folder cannot be made, a library is
+        missing, or the width is invalid.
     """
     check_libraries()
     inches = inches_of(width)
@@ -155,7 +155,7 @@ def write_report(
     frame, meta = held if isinstance(held, tuple) else (held.frame(), held.meta())
     if not len(frame):
         raise InvalidInputError(
-            "the study has no finished cell, so that there is nothing to report; run it first."
+            "the study has no finished cell to report; run it first."
         )
     folder = make_folder(out)
     summary = summarise(frame)
@@ -397,11 +397,15 @@ def _page(
     }
     done, seeds = int((frame["outcome"] == "done").sum()), frame["seed"].nunique()
     models = listed([str(model) for model in dict.fromkeys(frame["model"])])
+    study = dict(meta.get("study") or {})
+    if study.get("records"):  # they have neither
+        study = {key: one for key, one in study.items() if key not in ("seeds", "noise_levels")}
+    several = "" if study.get("records") else f"{seeds} seed{'s' * (seeds != 1)}, "
     return jinja.get_template("page.html.j2").render(
         title=f"Backends compared: {models}",
         subtitle=f"{len(frame)} runs ({done} finished, {len(frame) - done} failed) of "
         f"{sum(len(case.summary) for case in found)} configurations, "
-        f"{seeds} seed{'s' * (seeds != 1)}, up to {int(frame['steps'].max())} steps each.",
+        f"{several}up to {int(frame['steps'].max())} steps each.",
         css=(here / "page.css").read_text(encoding="utf-8"),
         script=(here / "page.js").read_text(encoding="utf-8"),
         plotly=get_plotlyjs(),
@@ -420,7 +424,7 @@ def _page(
         left_out=sum(part.runs.left_out for part in parts),
         limitations=limitations(frame, summary),
         failures=failures(frame),
-        settings=_flat(meta.get("study") or {}),
+        settings=_flat(study),
         environments=[_flat(one) for one in meta.get("environments") or []],
         machines=_machines(meta, summary),
         sweeps=listed([
@@ -431,7 +435,7 @@ def _page(
 
 
 def embedded(value: Any) -> str:
-    """JSON for a script element, which no text in it can end or lengthen."""
+    """JSON for a script element that no text in it can end or extend."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 

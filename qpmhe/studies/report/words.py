@@ -1,4 +1,4 @@
-"""How configurations and numbers are written for reading."""
+"""Configurations and numbers in readable form."""
 
 from __future__ import annotations
 
