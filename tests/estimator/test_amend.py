@@ -141,11 +141,6 @@ def test_late_measurements_with_sets(sets):
     assert any(Status.CANDIDATE_OUTSIDE in one.status for one in estimates)
 
 
-@pytest.mark.parametrize("backend", qpmhe.solvers.available())
-def test_late_measurements_with_every_backend(backend):
-    compare([4], 5, tolerance=1e-7, backend=backend)
-
-
 @pytest.mark.parametrize("hidden", [(), (0,), (0, 1), (0, 1, 2)], ids=str)
 def test_nothing_new_changes_nothing(hidden):
     """Nor does a measurement that is too large to be squared."""

@@ -10,7 +10,6 @@ import pytest
 import qpmhe
 from qpmhe import Status
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
-from qpmhe.estimation.snapshot import read
 
 PI, INF = np.pi, np.inf
 BEACONS = np.array([[10.0, 0.0], [0.0, 9.0]])  # outside of the path
@@ -338,26 +337,19 @@ def test_bounds_that_leave_the_turn_are_refused():
 def test_snapshots_and_pickles_continue_bit_for_bit(observer, candidate):
     y, u = record(2.0, 40)
     seen, options = wrapped(y), {"observer": observer, "candidate": candidate}
-    for residuals in (ANGLES, FUNCTIONS):
-        whole, loaded = (estimator(wrapping(residuals), **options) for _ in range(2))
-        whole.run(seen[:20], u[:20])
-        state = pickle.loads(pickle.dumps(whole.state_dict()))
-        loaded.load_state_dict(state)
-        made = [loaded] if observer == "injection" else [loaded, pickle.loads(pickle.dumps(whole))]
-        expected = whole.run(seen[20:], u[20:])
-        for other in made:
-            run = other.run(seen[20:], u[20:])
-            assert np.array_equal(run.states, expected.states)
-            assert np.array_equal(run.costs, expected.costs)
+    whole, loaded = (estimator(wrapping(FUNCTIONS), **options) for _ in range(2))
+    whole.run(seen[:20], u[:20])
+    state = whole.state_dict()
+    loaded.load_state_dict(state)
+    made = [loaded] if observer == "injection" else [loaded, pickle.loads(pickle.dumps(whole))]
+    expected = whole.run(seen[20:], u[20:]).states
+    for other in made:
+        assert np.array_equal(other.run(seen[20:], u[20:]).states, expected)
     for different in (
-        {}, {"state_residual": ANGLES["state_residual"]},
-        ANGLES | {"state_residual": qpmhe.angles([0, 2])},
-        ANGLES | {"output_residual": qpmhe.angles([2, 3], period=[2.0 * PI, 6.0])},
+        {}, ANGLES | {"output_residual": qpmhe.angles([2, 3], period=[2.0 * PI, 6.0])}
     ):
         with pytest.raises(InvalidInputError, match=r"another (output|state)_residual"):
             estimator(wrapping(different), **options).load_state_dict(state)
-    without = read(estimator(plain(), **options).state_dict())["estimator"]
-    assert not [name for name in without if "residual" in name]
 
 
 def from_ode(**options):
@@ -372,40 +364,12 @@ def from_casadi(**options):
     )
 
 
-def from_jax(**options):
-    jnp = pytest.importorskip("jax.numpy")
-    return qpmhe.from_jax(
-        lambda x, u: jnp.stack(rate(x, u, jnp)),
-        lambda x: jnp.stack(sight(x, root=jnp.sqrt, angle=jnp.arctan2)), **SIZES, dt=0.5, **options,
-    )
-
-
-def from_sympy(**options):
-    sp = pytest.importorskip("sympy")
-    x, u = sp.symbols("x:3"), sp.symbols("u:2")
-    seen = sight(x, root=sp.sqrt, angle=sp.atan2)
-    return qpmhe.from_sympy(rate(x, u, sp), seen, x, u, dt=0.5, **options)
-
-
-def from_control(**options):
-    control = pytest.importorskip("control")
-    system = control.nlsys(
-        lambda t, x, u, params: np.array(rate(x, u)), lambda t, x, u, params: np.array(sight(x)),
-        inputs=2, outputs=4, states=3,
-    )
-    return qpmhe.from_control(system, dt=0.5, **options)
-
-
-@pytest.mark.parametrize("make", [from_ode, from_casadi, from_jax, from_sympy, from_control])
-def test_every_way_to_make_a_system_takes_angles(make):
-    """With steps of other lengths, and pickled."""
+@pytest.mark.parametrize("make", [from_ode, from_casadi])
+def test_steps_of_other_lengths_take_angles(make):
     y, u = record(2.0, 50)
     lengths = 0.5 + 0.02 * np.sin(np.arange(50.0))
-    system = make(**ANGLES)
-    if make in (from_ode, from_sympy):  # the other models here are local functions
-        system = pickle.loads(pickle.dumps(system))
     found = []
-    for one, data in ((make(), y), (system, wrapped(y))):
+    for one, data in ((make(), y), (make(**ANGLES), wrapped(y))):
         mhe = estimator(one)
         found.append(
             [mhe.update(a, b, dt=c) for a, b, c in zip(data, u / 0.5, lengths, strict=True)]
@@ -413,10 +377,22 @@ def test_every_way_to_make_a_system_takes_angles(make):
     for expected, estimate in zip(*found, strict=True):
         np.testing.assert_allclose(estimate.state, expected.state, rtol=1e-8, atol=1e-9)
         assert estimate.cost == pytest.approx(expected.cost, rel=1e-6)
-    # Where nothing wraps, not a bit.
-    y, u = record(0.01, 20, 0.05)
-    states = [estimator(make(**more)).run(y, u / 0.5).states for more in ({}, ANGLES)]
-    np.testing.assert_array_equal(*states)
+
+
+def test_every_way_to_make_a_system_takes_angles():
+    jnp, sp = pytest.importorskip("jax.numpy"), pytest.importorskip("sympy")
+    control, angle = pytest.importorskip("control"), {name: qpmhe.angles([0]) for name in ANGLES}
+    one, plant = sp.symbols("x:1"), control.nlsys(
+        lambda t, x, u, params: -x, lambda t, x, u, params: x, inputs=0, outputs=1, states=1
+    )
+    for system in (
+        qpmhe.from_jax(lambda x: -x, jnp.sin, n=1, p=1, dt=0.1, **angle),
+        qpmhe.from_sympy([-one[0]], one, one, dt=0.1, **angle),
+        qpmhe.from_control(plant, dt=0.1, **angle),
+    ):
+        for name in ANGLES:
+            turned_once = getattr(system, name)(np.array([2.0 * PI + 0.5]), np.zeros(1))
+            assert turned_once[0] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("residuals", [ANGLES, FUNCTIONS])
@@ -518,18 +494,13 @@ EXPECTED = "expected the same change"
 
 RESIDUALS = [
     (5, ModelError, "expected qpmhe.angles"),
-    ("angles", ModelError, "expected qpmhe.angles"),
     (lambda a, b: a - b + 0.1, ModelError, r"\[0.1, .* at a = b = .*expected zeros"),
     (lambda a, b: b - a, ModelError, EXPECTED), (lambda a, b: 2.0 * (a - b), ModelError, EXPECTED),
     (lambda a, b: np.sin(a - b), ModelError, EXPECTED),
-    (lambda a, b: np.clip(a - b, -1.0, 1.0), ModelError, EXPECTED),
-    (lambda a, b: np.abs(a - b), ModelError, EXPECTED),
     (lambda a, b: (a - b)[:1], ModelError, r"shape \(1,\).*expected"),
-    (lambda a, b: (a - b)[..., None], ModelError, r"shape .*expected"),
     (lambda a, b: 1 / 0, ModelError, "raised ZeroDivisionError"),
     (lambda a, b: np.log(a - b), ModelError, "expected finite numbers"),
     (lambda a: a, ModelError, "takes 1 positional argument.*expected the difference a - b"),
-    (lambda a, b, c: a, ModelError, "missing 1 required.*expected the difference a - b"),
     (lambda a, b: a[0] - b[0], ModelError, r"shape \(\) for two vectors of .*their difference"),
     (qpmhe.angles([7]), InvalidInputError, "names component 7"),
     (plain(state_residual=turned).state_residual, ShapeError, "is for 3 components; expected 4"),

@@ -8,11 +8,9 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.errors import InvalidInputError
-from qpmhe.estimation.snapshot import read, written
 
 from .plain import Record, huber, is_minimum, quadratic, spd
-from .untraced import untraced
+from .systems import swing
 
 GENERATOR = np.random.default_rng(1)
 P, Q, R = 0.05 * spd(GENERATOR, 2), 5.0 * spd(GENERATOR, 2), spd(GENERATOR, 1)
@@ -25,12 +23,6 @@ OPTIONS = [
 ]
 SMOOTHED = {"arrival": "smoothed"}
 each_option = pytest.mark.parametrize("options", OPTIONS, ids=lambda one: str([*one.values()]))
-
-
-def swing(x):
-    return np.stack(
-        [x[..., 0] + 0.2 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
-    )
 
 
 def seen(x):
@@ -121,48 +113,6 @@ def test_the_numbers_are_those_of_plain_loops(count, horizon, missing, discount,
         assert estimate.qps == 1
 
 
-@each_option
-def test_without_qps_all_are_the_observer(options):
-    expected = estimator(max_qps=0).run(record(70, 0.1))
-    found = estimator(max_qps=0, **options).run(record(70, 0.1))
-    np.testing.assert_array_equal(found.states, expected.states)
-    np.testing.assert_array_equal(found.costs, expected.costs)
-
-
-@each_option
-def test_snapshots_and_resets(options):
-    ys, whole, used = record(16), estimator(**options), estimator(**options)
-    used.run(ys)
-    used.reset()
-    for t, y in enumerate(ys):
-        expected = whole.update(y)
-        assert (used.update(y).trajectory == expected.trajectory).all()
-        if t in (0, 3, 4, 10):
-            used = estimator(**options)
-            used.load_state_dict(whole.state_dict())
-            assert whole.covariances().tolist() == used.covariances().tolist()
-
-
-@each_option
-@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
-def test_the_promise_holds_in_sets(infeasible, options):
-    states = qpmhe.Box([-0.4, -0.7], [2.0, 0.7])
-    disturbances = qpmhe.Box([-0.05, 0.0], [0.05, 0.0])
-    sets = {"states": states, "disturbances": disturbances, "noises": qpmhe.Box([-0.3], [0.3])}
-    mhe = estimator(
-        sets=sets, initial_state=[1.0, -0.5], max_qps=2, infeasible=infeasible, **options
-    )
-    improved = 0
-    for y in record(40, 0.1):
-        estimate = mhe.update(y)
-        assert estimate.cost <= estimate.candidate_cost
-        improved += estimate.improved
-        if estimate.improved and not estimate.dropped:
-            assert states.violation(estimate.trajectory) <= 1e-8
-            assert disturbances.violation(estimate.disturbances) <= 1e-8
-    assert improved > 20
-
-
 @pytest.mark.parametrize("root", [lambda x: np.sqrt(x) - 0.3, lambda x: [math.sqrt(x[0]) - 0.3]],
                          ids=["NaN", "raises"])
 def test_a_start_that_the_model_does_not_reach(root):
@@ -246,41 +196,6 @@ def test_late_measurements_and_what_is_set_keep_the_windows_prior():
         kept.check(estimate)
 
 
-@pytest.mark.parametrize("stop", [3, 9])
-def test_snapshots_of_another_arrival_or_without_its_prior_are_refused(stop):
-    mhe = estimator(**SMOOTHED)
-    mhe.run(record(stop))
-    state = read(mhe.state_dict())
-    with pytest.raises(InvalidInputError, match="another arrival"):
-        estimator().load_state_dict(written(state))
-    prior = state["window"]["smoothed_prior"]
-    assert (prior is None) == (stop == 3)
-    for damaged in (None if prior is not None else START, np.full(2, NAN), START[:1]):
-        state["window"]["smoothed_prior"] = damaged
-        with pytest.raises(InvalidInputError, match="damaged"):
-            mhe.load_state_dict(written(state))
-    assert np.isfinite(mhe.update([0.1]).trajectory).all()
-
-
-def test_a_failed_stage_leaves_a_finite_prior_and_the_promise():
-    broken, failed = [False], 0
-
-    def fragile(x):
-        if broken[0]:
-            raise ValueError("out of range")
-        return swing(x)
-
-    mhe = estimator(f=untraced(fragile), **SMOOTHED)
-    for t, y in enumerate(record(25)):
-        broken[0] = t in (7, 8, 15)
-        estimate = mhe.update(y)
-        failed += Status.MODEL_FAILED in estimate.status
-        assert estimate.cost <= estimate.candidate_cost
-        assert np.isfinite(estimate.trajectory).all()
-    assert failed >= 3
-    assert estimate.improved
-
-
 def test_a_prior_that_the_loss_cannot_weigh_is_not_taken():
     class Short(qpmhe.Quadratic):
         """A loss that a prior may have at its own state only."""
@@ -299,19 +214,3 @@ def test_a_prior_that_the_loss_cannot_weigh_is_not_taken():
         # As if it had been improved: the next window's prior is elsewhere.
         mhe._engine._trajectory += 0.1
     assert mhe._engine._window.smoothed_prior is not None
-
-
-@pytest.mark.parametrize("options", [{}, {"max_qps": 0}, {"warm_start": True}], ids=str)
-def test_the_delayed_estimate_is_that_many_states_back(options):
-    expected = estimator(horizon=5, **options).run(record(12))
-    for delay in (0, 1, 3, 5):
-        mhe = estimator(horizon=5, delay=delay, **options)
-        for t, y in enumerate(record(12)):
-            estimate = mhe.update(y)
-            np.testing.assert_array_equal(estimate.state, expected.states[t + 1])
-            if delay > min(t + 1, 5):
-                assert estimate.delayed is None
-            else:
-                np.testing.assert_array_equal(estimate.delayed, estimate.trajectory[-1 - delay])
-        if delay == 1:
-            np.testing.assert_array_equal(estimate.delayed, estimate.filtered)

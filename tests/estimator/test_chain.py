@@ -74,27 +74,6 @@ def test_casadi_gives_the_same(masses, dimension):
             np.testing.assert_allclose(found, expected, rtol=0.0, atol=tolerance)
 
 
-@each_size
-def test_sizes_and_the_rest_where_the_estimation_starts(masses, dimension):
-    system, _, cost, scenario = chain_of_masses(masses, dimension)
-    n, p, rest = system.n, system.p, scenario.initial_estimate
-    assert (n, p, system.m) == (2 * masses * dimension, masses * dimension, 0)
-    np.testing.assert_allclose(cost.noise @ scenario.noise_covariance, np.eye(p), atol=1e-12)
-    np.testing.assert_allclose(
-        cost.disturbance @ scenario.disturbance_covariance, np.eye(n), atol=1e-12
-    )
-    assert len(set(scenario.labels)) == len(scenario.labels) == n
-    assert scenario.labels[p - 1 : p + 1] == (f"{'xyz'[dimension - 1]}{masses} (m)", "vx1 (m/s)")
-    assert not rest[p:].any()
-    np.testing.assert_allclose(system.f(rest, NONE), rest, rtol=0.0, atol=1e-12)
-    positions = rest[:p].reshape(masses, dimension)
-    np.testing.assert_allclose(positions[:, 0] + positions[::-1, 0], SPACING * (masses + 1))
-    if dimension == 1:
-        np.testing.assert_allclose(np.diff(positions[:, 0]), SPACING)
-    else:
-        assert positions[:, -1].max() < -0.1
-
-
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 @pytest.mark.parametrize(("masses", "dimension"), [(1, 1), (9, 1), (3, 2), (2, 3), (5, 3)])
 def test_the_observer_converges(masses, dimension, method):
@@ -108,11 +87,6 @@ def test_the_observer_converges(masses, dimension, method):
     for _ in range(300):
         x, z = system.f(x, NONE), system.f(z, NONE) + observer.gain @ (x - z)[: system.p]
     assert np.linalg.norm(x - z) < 1e-6 * first
-    kalman = qpmhe.SteadyStateKalman(
-        system, scenario.initial_estimate,
-        disturbance=scenario.disturbance_covariance, noise=scenario.noise_covariance,
-    )
-    np.testing.assert_allclose(observer.gain, kalman.gain, rtol=1e-9, atol=1e-12)
 
 
 def test_sizes_that_are_none():

@@ -13,7 +13,6 @@ from qpmhe.errors import EngineWarning, OptionError
 
 from .test_compiled import system_of
 
-casadi = pytest.importorskip("casadi")
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 ONES = {"prior": 1.0, "disturbance": 1.0, "noise": 1.0}
 
@@ -66,11 +65,6 @@ class OwnGain(qpmhe.Luenberger):
         return 2.0 * super().correct(z, v, sample)[0], None
 
 
-class OwnInjection(qpmhe.OutputInjection):
-    def correct(self, z, v, sample):
-        return 2.0 * super().correct(z, v, sample)[0], None
-
-
 class OwnFilter(qpmhe.ExtendedKalman):
     def filter(self, z, v, sample):
         return z + v, np.eye(z.size)
@@ -82,10 +76,6 @@ class OwnSteady(qpmhe.SteadyStateKalman):
 
 
 class OwnCost(qpmhe.QuadraticCost):
-    pass
-
-
-class OwnRobustCost(qpmhe.RobustCost):
     pass
 
 
@@ -118,12 +108,10 @@ WITHOUT_FORM = [
     ("OwnGain has no C form; take an observer of qpmhe", {"observer": lambda: OwnGain([0.3])}),
     (r"the correction of OutputInjection has no C form \(.*asks for .*\); change that",
      {"observer": lambda: qpmhe.OutputInjection(lambda z, v: 0.3 * v if v[0] > 0 else v)}),
-    ("OwnInjection has no C form", {"observer": lambda: OwnInjection(lambda z, v: 0.3 * v)}),
     *((rf"{kind.__name__}, the loss of noise, has no C form \(.*{why}.*\); take Quadratic, "
        "Huber, Power or Barron",
        {"cost": lambda kind=kind: qpmhe.RobustCost(**(ONES | {"noise": kind(1.0)}))})
       for kind, why in LOSSES.items()),
-    ("OwnRobustCost has no C form", {"cost": lambda: OwnRobustCost(**ONES)}),
     ("OwnCost has no C form; take a QuadraticCost", {"cost": lambda: OwnCost(**ONES)}),
     ("OwnFilter has no C form", {"observer": lambda: OwnFilter(**ONES)}),
     ("covariance of OwnSteady has no C form, and is the metric",

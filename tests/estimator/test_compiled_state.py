@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import threading
 
 import numpy as np
 import pytest
@@ -14,52 +13,12 @@ from qpmhe.errors import InvalidInputError
 from qpmhe.estimation.snapshot import read
 from tests.codegen.cases import case
 
-from .test_compiled import NAN, both_engines, equal, estimator_in, loaded, made, spoilt, system_of
+from .test_compiled import NAN, both_engines, equal, loaded, made, spoilt, system_of
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
     pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
 ]
-
-
-def test_two_estimators_in_two_threads():
-    one = case("reactor")
-    Y, found = np.resize([sample["y"] for sample in one.samples], (2000, 1)), [None, None]
-    expected = [one.estimator("compiled", max_qps=k).run(Y).states for k in (2, 0)]
-
-    def follow(k):
-        mhe = one.estimator("compiled", max_qps=2 * (1 - k))
-        run = mhe.run(Y[:1000]).states
-        found[k] = np.vstack((run, [mhe.update(y).state for y in Y[1000:]]))
-
-    threads = [threading.Thread(target=follow, args=(k,)) for k in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    np.testing.assert_array_equal(found, expected)
-
-
-@both_engines
-def test_estimates_do_not_change_and_can_be_copied_and_a_reset_starts_anew(engine):
-    one = case("inputs")
-    mhe, kept = one.estimator(engine, delay=1, warm_start=True), []
-    for sample in one.samples:
-        estimate = mhe.update(**sample)
-        kept.append((estimate, copy.deepcopy(estimate)))
-        for again in (copy.copy(estimate), pickle.loads(pickle.dumps(estimate))):
-            equal(again, estimate)
-            assert again.step_time == estimate.step_time
-    mhe.amend(mhe.time - 1, one.samples[0]["y"])
-    mhe.reset()
-    assert mhe.time == 0
-    with pytest.raises(InvalidInputError, match="no estimate yet"):
-        mhe.covariances()
-    for sample, (estimate, before) in zip(one.samples, kept, strict=True):
-        equal(mhe.update(**sample), before)
-        equal(estimate, before)
-    mhe.reset(one.start + 0.1)
-    np.testing.assert_array_equal(mhe.state, one.start + 0.1)
 
 
 @both_engines
@@ -98,13 +57,10 @@ def test_damaged_snapshots_are_refused_whole():
     kept = mhe.state_dict()
     good = read(kept)
     memory = good["memory"]
-    damaged = [{}, *({**good, "problem": one} for one in (None, (2, 1, 0, 99), [np.zeros(2)] * 4))]
+    damaged = [{}, *({**good, "problem": one} for one in (None, (2, 1, 0, 99)))]
     damaged += [{**good, "engine": "python"}, *({**good, "memory": one} for one in (
-        None, "abc", memory[:-1], np.concatenate((memory, memory)), memory[:0], memory[None],
-        np.full_like(memory, 255), np.full(memory.shape, 1e300), np.full(memory.shape, NAN),
-        [300] * memory.size,
+        None, "abc", memory[:-1], memory[None], np.full_like(memory, 255), [300] * memory.size,
     ))]
-    damaged += [{key: value for key, value in good.items() if key != left} for left in good]
     for name, value in (
         ("history", NAN), ("z_end", NAN), ("last_good", np.inf), ("trajectory", NAN),
         ("is_observed", 2), ("is_complete", 0), ("step", -1.0), ("first", 9), ("far", -1),
@@ -116,13 +72,8 @@ def test_damaged_snapshots_are_refused_whole():
     for state in damaged:
         with pytest.raises(InvalidInputError):
             mhe._engine.load_state_dict(state)
-    for state in (
-        None, 5, "state", [], {}, {**kept, "structure": "{"}, {**kept, "structure": 3},
-        {**kept, "memory": "abc"}, one.estimator("python").state_dict(),
-        *({key: value for key, value in kept.items() if key != left} for left in kept),
-    ):
-        with pytest.raises(InvalidInputError, match="the state "):
-            mhe.load_state_dict(state)
+    with pytest.raises(InvalidInputError, match="the state "):
+        mhe.load_state_dict(one.estimator("python").state_dict())
     for sample in one.samples[2:6]:
         equal(mhe.update(**sample), twin.update(**sample))
 
@@ -181,14 +132,3 @@ def test_a_record_is_its_samples(name):
         assert whole.time == single.time
     runs = [mhe.run(*rows, covariances=True).covariances for mhe in (single, whole)]
     np.testing.assert_array_equal(*runs)
-
-
-def test_a_record_leaves_the_snapshot_that_its_samples_leave():
-    dropped = set()
-    for count in range(1, 30, 4):
-        (one, whole), (_, single) = (estimator_in("pendulum", "tight") for _ in range(2))
-        whole.run(one.record(1, count))
-        for y in one.record(1, count):
-            dropped.add(single.update(y).dropped)
-        assert pickle.dumps(whole.state_dict()) == pickle.dumps(single.state_dict())
-    assert len(dropped) > 1

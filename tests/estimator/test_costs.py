@@ -101,12 +101,6 @@ def test_few_patterns_of_missing_components_are_kept():
     assert 100 < alive <= kept / cost.stage_weight.nbytes
     assert all(one() is not None for one in matrices[-100:])  # the last ones
     assert len(pickle.dumps(cost)) < 1.5 * kept
-    # Some even of large weights.
-    cost = random_cost(1, 800)
-    first = cost.partial_weight(np.arange(800) != 0)
-    for k in range(1, 4):
-        cost.partial_weight(np.arange(800) != k)
-    assert cost.partial_weight(np.arange(800) != 0) is first
 
 
 def test_threads_may_share_a_cost_whose_patterns_are_dropped():

@@ -9,7 +9,7 @@ import pytest
 import qpmhe
 from qpmhe import Status
 from qpmhe.estimation.subproblem import Subproblem
-from qpmhe.solvers import Backend, RawSolution, Solution, Solver, SolveStatus, create
+from qpmhe.solvers import Backend, RawSolution, Solver, create
 
 SYSTEM, OBSERVER, COST, SCENARIO = qpmhe.models.batch_reactor()
 MEASUREMENTS = SCENARIO.simulate(seed=0, steps=12).measurements
@@ -76,20 +76,6 @@ def test_each_qp_gets_what_remains(clock):
     assert clock.limits == [1.0, 0.625, 0.25]
     estimator(backend="ticking", max_qps=3).update(MEASUREMENTS[0])
     assert clock.limits[3:] == [None, None, None]
-
-
-def test_time_that_the_model_takes_is_not_left_to_the_solver(clock):
-    def f(x):
-        clock.now += 0.25 * began[0]
-        return SYSTEM.f.direct(x)
-
-    began = [False]
-    system = qpmhe.System(f, SYSTEM.h.direct, n=2, p=1)
-    mhe, start = estimator(system, backend="ticking", max_qps=1, time_budget=1e9), clock.now
-    began[0] = True
-    mhe.update(MEASUREMENTS[0])
-    (limit,) = clock.limits
-    assert 1e9 - (clock.now - start) <= limit < 1e9 - 0.2
 
 
 @pytest.mark.parametrize("seconds", [1.0, 2.0])
@@ -167,69 +153,3 @@ def test_programs_of_jax_and_casadi_are_made_with_the_estimator():
         new = set(made) - before
         # Those of a window that grows may come later.
         assert not new if system is by_jax else {count for count, _ in new} <= {2, 3}
-
-
-class Panic(BaseException):
-    """As compiled code raises it."""
-
-
-def answering(make):
-    return lambda qp: Solution(make(qp), SolveStatus.SOLVED)
-
-
-def raising(error):
-    def answer(qp):
-        raise error
-
-    return answer
-
-
-ANSWERS = [
-    lambda qp: "no Solution", lambda qp: None, answering(lambda qp: np.zeros(3)),
-    answering(lambda qp: np.full((qp.stages, qp.n), np.nan)),
-    lambda qp: Solution(np.zeros((qp.stages, qp.n)), "solved"),
-    raising(KeyError("P")), raising(SystemExit(1)), raising(Panic()),
-]
-
-
-@pytest.mark.parametrize("options", [{}, {"time_budget": 60.0}], ids=["free", "bounded"])
-def test_a_hostile_backend_gets_out_of_no_method(register, options):
-    class Hostile(Solver):
-        def _solve(self, qp, start):
-            raise NotImplementedError
-
-        def solve(self, qp, start=None):
-            return Hostile.answer(qp)
-
-        def shift(self):
-            self.solve(None)
-
-        forget = shift
-
-        def prepare(self, size):
-            self.solve(None)
-
-    system = qpmhe.System(
-        SYSTEM.f.direct, SYSTEM.h.direct, n=2, p=1, **({} if not options else {
-            "states": qpmhe.Box([0.0, 0.0], [9.0, 9.0]),
-            "disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1]),
-        }),
-    )
-    register("hostile", Hostile)
-    for answer in ANSWERS:
-        Hostile.answer = answer
-        mhe = estimator(system, backend="hostile", **options)
-        plain = estimator(system, backend="auto", max_qps=0)
-        for k, y in enumerate(MEASUREMENTS):
-            estimate = mhe.update(y)
-            assert Status.SOLVER_FAILED | Status.CANDIDATE in estimate.status
-            assert estimate.message
-            plain.update(y)
-            np.testing.assert_array_equal(mhe.state, plain.state)
-            if k == 6:
-                assert mhe.amend(5, MEASUREMENTS[5]).message == estimate.message
-                state = mhe.state_dict()
-        mhe.load_state_dict(state)
-        assert mhe.time == 7
-        mhe.reset()
-        assert mhe.time == 0

@@ -7,11 +7,11 @@ import qpmhe
 
 from . import plain
 from .plain import Record, assembled, spd
-from .test_candidates import swing
+from .systems import GAIN, seen, swing
 
 GENERATOR = np.random.default_rng(1)
 P, Q, R = spd(GENERATOR, 2), spd(GENERATOR, 2), spd(GENERATOR, 2)
-GAIN, START, NONE = np.array([[0.3, 0.05], [0.1, 0.2]]), np.array([0.5, 0.0]), np.zeros(0)
+START, NONE = np.array([0.5, 0.0]), np.zeros(0)
 
 # As they are given, and their definitions.
 LOSSES = {
@@ -23,10 +23,6 @@ LOSSES = {
         (qpmhe.Power(P, 1.5), qpmhe.Power(Q, 1.5), qpmhe.Power(R, 1.5)), (plain.power(1.5),) * 3
     ),
 }
-
-
-def seen(x):
-    return np.stack([x[..., 0] + 0.1 * x[..., 1] ** 2, x[..., 1]], axis=-1)
 
 
 SYSTEM = qpmhe.System(swing, seen, n=2, p=2)
@@ -72,17 +68,6 @@ def test_costs_gradients_and_hessians(losses, discount, missing, horizon):
                 hessian = kept.hessian(at)
                 scale = np.abs(hessian).max()
                 np.testing.assert_allclose(qp.dense(), hessian, rtol=1e-9, atol=1e-11 * scale)
-
-
-def test_the_prior_weight_of_an_observer_is_discounted():
-    observer = qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=0.1 * np.eye(2), noise=np.eye(2))
-    cost = qpmhe.QuadraticCost(prior=qpmhe.ObserverPrior(), disturbance=Q, noise=R, discount=0.7)
-    window, formulation, _ = assembled(SYSTEM, observer, cost, 3, START)
-    for t, y in enumerate(np.random.default_rng(4).standard_normal((6, 2))):
-        window.push(y, NONE)
-        weight = 0.7 ** min(t + 1, 3) * np.linalg.inv(window.prior_covariance)
-        found = formulation.problem(window).prior_weight_at(np.ones(2))
-        np.testing.assert_allclose(found, weight, rtol=1e-9)
 
 
 @pytest.mark.parametrize("batch", [False, True])

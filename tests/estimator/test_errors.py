@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import re
-import warnings
 from operator import and_
 
 import numpy as np
@@ -13,7 +11,6 @@ import qpmhe
 from qpmhe.errors import (
     InvalidInputError,
     ModelError,
-    ObserverWarning,
     OptionError,
     SetError,
     ShapeError,
@@ -93,27 +90,6 @@ def test_initial_states():
         np.testing.assert_array_equal(mhe.state, before)
 
 
-def test_an_initial_state_outside_of_the_state_set_is_projected():
-    box, rows, given = qpmhe.Box([-5.0, -1.0], [9.0, 5.0]), qpmhe.Polytope([[1, 1]], [5]), [2, 7]
-    for states, nearest, project in (
-        (box, [2.0, 5.0], True), (rows, [0.0, 5.0], False), (box & rows, [0.0, 5.0], True)
-    ):
-        words = f"is [2.0, 7.0], outside of the state set {states!r}; the estimator starts at"
-        with pytest.warns(ObserverWarning, match=re.escape(words)):
-            mhe = estimator(
-                system_of(states=states), initial_state=given, project_observer=project
-            )
-        np.testing.assert_allclose(mhe.state, nearest, rtol=1e-12, atol=1e-12)
-        mhe.update([1.0])
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            with pytest.raises(ObserverWarning):
-                mhe.reset(given)
-        assert mhe.time == 1  # as it was
-    mhe.reset([3.0, 2.0])  # on the boundary
-    np.testing.assert_array_equal(mhe.state, [3.0, 2.0])
-
-
 BAD_MATRICES = [
     (np.diag([1.0, -2.0]), WeightError, ["eigenvalue -2", "positive definite"]),
     (np.ones((2, 2)), WeightError, ["eigenvalue ", "positive definite"]),
@@ -138,18 +114,6 @@ def test_weights_and_covariances():
                     build(**covariances)
                     continue
             check(kind, [f"{name} covariance ", *words], build, **covariances)
-
-
-@pytest.mark.parametrize("build", [qpmhe.QuadraticCost, qpmhe.QuadraticCost.from_covariances])
-def test_weights_of_other_sizes(build):
-    matrices = {"prior": np.eye(1), "disturbance": np.eye(2), "noise": np.eye(1)}
-    check(ShapeError, ["prior has shape (1, 1)", "expected (2, 2)"], build, **matrices)
-    system = qpmhe.System(lambda x: x, lambda x: x[..., 0], n=3, p=1)
-    check(
-        ShapeError, ["for 2 disturbances; expected 3", "disturbance_matrix"],
-        estimator, system, qpmhe.Luenberger(np.zeros((3, 1))),
-        build(**matrices | {"prior": np.eye(3)}), initial_state=np.zeros(3),
-    )
 
 
 def test_sets():

@@ -118,13 +118,15 @@ def test_what_no_second_call_raises():
     assert estimate.message.startswith("the model or the cost raised OSError: the table is away")
 
 
-def test_what_a_jacobian_raises_on_the_way():
-    def h_jacobian(x):
-        if x[0] < 0.9:
-            raise ValueError("no slope")
-        return np.eye(1)
+def test_where_a_jacobian_fails_on_the_way():
+    for fails, text in (
+        (raising(ValueError("no slope"), -np.inf), "the Jacobian of h raised ValueError: no slope"),
+        (lambda x: x * np.nan, "the Jacobian of f or h is not finite along the trajectory"),
+    ):
+        def h_jacobian(x, fails=fails):
+            return fails(x).reshape(1, 1) if x[0] < 0.9 else np.eye(1)
 
-    estimate = staying(untraced(lambda x: x), h_jacobian, max_qps=3).update(0.0)
-    assert Status.IMPROVED | Status.MODEL_FAILED in estimate.status
-    assert estimate.qps == 1
-    assert estimate.message.startswith("the Jacobian of h raised ValueError: no slope at x = [0.")
+        estimate = staying(untraced(lambda x: x), h_jacobian, max_qps=3).update(0.0)
+        assert Status.IMPROVED | Status.MODEL_FAILED in estimate.status
+        assert estimate.qps == 1
+        assert estimate.message.startswith(text)

@@ -7,12 +7,11 @@ import pytest
 
 import qpmhe
 
-from . import plain
-from .plain import Record, is_minimum, spd
+from .plain import spd
+from .systems import GAIN, seen
 
 GENERATOR = np.random.default_rng(1)
 P, Q, R = spd(GENERATOR, 2), spd(GENERATOR, 2), spd(GENERATOR, 2)
-GAIN = np.array([[0.3, 0.05], [0.1, 0.2]])
 DT, START = 0.1, [0.5, 0.0]
 
 
@@ -35,10 +34,6 @@ def slope(x, u=None):
     value[..., 1, 0] = -2.0 * x[..., 0] * x[..., 1] - 1.0 - (0.0 if u is None else u[..., 1])
     value[..., 1, 1] = 1.0 - x[..., 0] ** 2
     return value
-
-
-def seen(x):
-    return np.stack([x[..., 0] + 0.1 * x[..., 1] ** 2, x[..., 1]], axis=-1)
 
 
 RATES = {
@@ -77,16 +72,10 @@ def test_what_the_timed_system_keeps():
     assert system.dt == DT
     assert system.timed is system.timed
     assert system.timed.states is system.timed.disturbances is system.timed.noises is box
-    x = np.array([0.5, -0.3])
-    for h in (  # outputs do not see the step
-        lambda x, u: seen(x) * u[..., :1], lambda x, u: [u[0] * s for s in seen(x)],
-        lambda x, u: [float(u[0]) * (x[0] + 0.1 * math.pow(x[1], 2)), u[0] * x[1]],
-    ):
-        timed, u = system_of("driven", h).timed, np.array([2.0, 7.0, 0.35])
-        np.testing.assert_allclose(timed.h(x, u), 2.0 * seen(x), rtol=1e-13)
-        found = timed.h.batch(np.tile(x, (3, 1)), np.tile(u, (3, 1)))
-        np.testing.assert_allclose(found, [2.0 * seen(x)] * 3, rtol=1e-13)
-        np.testing.assert_allclose(timed.h_jacobian(x, u), [[2.0, -0.12], [0.0, 2.0]], rtol=1e-6)
+    # Outputs do not see the step.
+    timed, x = system_of("driven", lambda x, u: seen(x) * u[..., :1]).timed, np.array([0.5, -0.3])
+    found = timed.h.batch(np.tile(x, (3, 1)), np.tile([2.0, 7.0, 0.35], (3, 1)))
+    np.testing.assert_allclose(found, [2.0 * seen(x)] * 3, rtol=1e-13)
 
 
 def estimator(way="free", discount=1.0, **options):
@@ -94,30 +83,6 @@ def estimator(way="free", discount=1.0, **options):
     return qpmhe.MovingHorizonEstimator(
         system_of(way), qpmhe.Luenberger(GAIN), cost, initial_state=START, **options
     )
-
-
-@pytest.mark.parametrize("way", ["free", "driven", "driven, looped"])
-@pytest.mark.parametrize(("horizon", "discount"), [(1, 0.8), (4, 1.0), (70, 0.9)])
-def test_lengths_and_weights_of_single_samples(horizon, discount, way):
-    # Across the place where the window's arrays move back to their front, too.
-    mhe = estimator(way, discount, horizon=horizon, max_qps=None)
-    kept = Record(seen, GAIN, START, (P, Q, R), horizon, discount=discount)
-    rng, m = np.random.default_rng(8), RATES[way][1]
-    for t in range(145 if way == "free" else 12):
-        y, u = 0.7 * rng.standard_normal(2), 0.3 * rng.standard_normal(m)
-        y[rng.random(2) < 0.2] = np.nan
-        dt = rng.uniform(0.01, 0.3) if t % 5 in (1, 2) else None
-        weight = 5.0 * spd(rng, 2) if t % 7 in (0, 3) else None
-        estimate = mhe.update(y, u if m else None, dt=dt, noise_weight=weight)
-        step = plain.rk4(driven if m else (lambda x, u: free(x)))
-        kept.push(lambda x, u=u, dt=dt or DT, step=step: step(x, u, dt), y, weight)
-        if t < 12 or t % 35 == 0 or 63 <= t <= 72:
-            np.testing.assert_allclose(estimate.candidate, kept.candidate, rtol=1e-10, atol=1e-11)
-            expected = kept.cost(kept.candidate), kept.cost(estimate.trajectory)
-            assert (estimate.candidate_cost, estimate.cost) == pytest.approx(expected, rel=1e-9)
-            assert estimate.cost <= estimate.candidate_cost
-    if horizon < 70:
-        assert is_minimum(kept, estimate.trajectory, 1e-4)
 
 
 def test_a_step_of_the_usual_length_may_be_named():

@@ -13,7 +13,6 @@ from qpmhe import Status
 from qpmhe.errors import InvalidInputError
 
 from .spoil import check, cost_of, estimator, system_of, unharmed
-from .untraced import untraced
 
 NAT = np.datetime64("NaT")
 NOTHING = [
@@ -52,12 +51,6 @@ def test_every_way_of_saying_that_something_is_missing(ways, plainly):
         found.reset()
 
 
-def test_the_only_output_is_missing():
-    mhe = estimator()
-    for way in (None, pd.NA, pd.NaT, NAT, [pd.NaT], np.array([NAT])):
-        assert np.isnan(mhe.update(way).noises).all()
-
-
 def test_records_with_gaps():
     frame = pd.DataFrame({"a": pd.array([1, pd.NA, 3]), "b": pd.array([pd.NA, 0.5, None])})
     found, expected = two().run(frame), two().run([[1, np.nan], [np.nan, 0.5], [3, np.nan]])
@@ -84,24 +77,6 @@ def test_a_missing_component_is_not_judged_against_its_set():
     estimate = mhe.update([None, mhe.state[1] + 30.0])
     assert Status.CANDIDATE_OUTSIDE in estimate.status
     assert estimate.dropped == (("noises", 1, "upper", 6),)
-
-
-def test_the_model_is_called_once_at_the_candidate_all_the_same():
-    calls = []
-
-    def counting(x):
-        calls.append(x.ndim)
-        return 0.9 * x
-
-    mhe = two(qpmhe.System(
-        untraced(counting), lambda x: x, n=2, p=2,
-        f_jacobian=lambda x: np.broadcast_to(0.9 * np.eye(2), (*x.shape, 2)),
-    ))
-    mhe.update([1.0, 2.0])
-    for y in (None, [np.inf, 0.7]):
-        calls.clear()
-        mhe.update(y)
-        assert calls.count(1) == 1
 
 
 DATE, DURATION = np.datetime64("2026-01-01T00:00:05"), np.timedelta64(5, "s")

@@ -134,26 +134,6 @@ def test_a_plant_of_which_only_one_function_takes_inputs():
         np.testing.assert_array_equal(system.h(z, u), output)
 
 
-def test_finite_differences_have_the_scales_of_the_augmented_state():
-    """A model that refuses complex numbers, in tiny units."""
-    def rigid(x, u):
-        return np.array([0.9 * float(x[0]) + 1e-3 * float(u[0])])
-
-    found, y = [], np.sin(np.arange(10.0))
-    for f, unit, u in ((rigid, 1e-9, 1e-6), (lambda x, u: 0.9 * x + u, 1.0, 1.0)):
-        system = qpmhe.noisy_inputs(qpmhe.System(f, lambda x: x[:1], n=1, p=1, m=1))
-        prior, disturbance = np.diag([unit**2, u**2]), np.diag([1e-2 * unit**2, u**2])
-        cost = qpmhe.QuadraticCost.from_covariances(
-            prior=prior, disturbance=disturbance, noise=1e-1 * unit**2
-        )
-        mhe = qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([0.2, 0.0]), cost, horizon=5, initial_state=[unit, 0.0]
-        )
-        found.append(mhe.run(unit * y, np.full((10, 1), u)).states[:, 0] / unit)
-        assert (system.f_jacobian.method == "finite differences") == (f is rigid)
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-7)
-
-
 def spring(x, u):
     return np.stack([x[..., 1], u[..., 0] - u[..., 1] * x[..., 0]], axis=-1)
 
@@ -179,8 +159,3 @@ def test_a_system_with_noisy_inputs_is_augmented_with_its_sampling_time(second):
             found = one.timed.f(z, np.append(known, step))
             np.testing.assert_allclose(found, np.append(expected, kept), rtol=1e-14)
         np.testing.assert_allclose(one.f(z, np.array(known)), one.timed.f(z, np.append(known, 0.1)))
-    system = qpmhe.augment_parameters(noisy, nominal=[0.5, 3.0])  # all inputs are parameters
-    z, expected = np.array([0.3, -0.2, 0.1, 0.5, 3.0]), plant.f(z[:2], np.array([0.6, 3.0]))
-    found = system.f(z, np.zeros(0))
-    np.testing.assert_allclose(found, np.append(expected, [0.0, 0.5, 3.0]), rtol=1e-14)
-    assert system.dt == 0.1

@@ -18,8 +18,6 @@ from qpmhe import (
 )
 from qpmhe_solvers import backend
 
-from .plain import rk4
-
 DT = 0.1
 TRUE = np.array([3.0, 0.8])  # stiffness and damping
 NOMINAL = [2.0, 0.8]
@@ -41,10 +39,6 @@ def spring(x, theta):
 
 def position(x, theta):
     return x[..., 0]
-
-
-def driven_rate(x, u, theta):
-    return np.array([x[1], u[0] - theta[0] * x[0] - theta[1] * x[1]])
 
 
 def record(steps=40, disturbance=0.0):
@@ -178,36 +172,6 @@ def test_joint_functions_put_parameters_where_they_belong(estimated, order):
         np.testing.assert_allclose(jacobian[:, 0, 2 + order.index(0)], z[:, 0], rtol=1e-12)
 
 
-def by_column(x, u, theta):
-    return np.array([x[0] * theta[0] + u[0], x[1] - theta[1] * x[0]])
-
-
-def by_state(x, u, theta):
-    first, second = float(np.real(theta[0])), float(np.real(theta[1]))
-    return [x[0] * first + u[0], x[1] - second * x[0]]
-
-
-def by_row(x, u, theta):
-    return np.stack(
-        [x[..., 0] * theta[..., 0] + u[..., 0], x[..., 1] - theta[..., 1] * x[..., 0]], axis=-1
-    )
-
-
-def test_every_way_of_writing_gives_the_same_values():
-    for written in (by_column, by_state, by_row):
-        system = augment_parameters(
-            written, lambda x, u, theta: x[0], n=2, p=1, m=1, nominal=[0.9, 0.1]
-        )
-        # Counts that equal n, m + k and n + k: shapes that do not tell rows from columns.
-        for count in (1, 2, 3, 4, 5):
-            generator = np.random.default_rng(count)
-            z, u = generator.normal(size=(count, 4)), generator.normal(size=(count, 1))
-            expected = [[*by_row(zi[:2], ui, zi[2:]), *zi[2:]]
-                        for zi, ui in zip(z, u, strict=True)]
-            np.testing.assert_allclose(system.f.batch(z, u), expected, rtol=1e-14)
-            np.testing.assert_allclose(system.f(z[0], u[0]), expected[0], rtol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("states", "bounds"),
     [
@@ -232,53 +196,6 @@ def test_sets_are_products(states, bounds):
         assert system.disturbances.violation(z) == pytest.approx(max(known, abs(z[2])))
     assert 2 in system.disturbances.fixed_components
     assert system.noises.upper == 1.0
-
-
-@pytest.mark.parametrize("method", [None, "euler"])
-def test_a_rate_is_discretised(method):
-    options = {"n": 2, "p": 1, "dt": DT, "method": method}
-    system = augment_parameters(spring_rate, position, nominal=NOMINAL, estimated=[0], **options)
-
-    def joint(z):
-        theta = np.stack((z[..., 2], 0.8 + 0.0 * z[..., 2]), axis=-1)
-        return np.concatenate((spring_rate(z, theta), 0.0 * z[..., 2:]), axis=-1)
-
-    options = {k: v for k, v in (options | {"n": 3}).items() if v is not None}
-    expected, nothing = qpmhe.System.from_ode(joint, lambda z: z[..., 0], **options), np.zeros(0)
-    assert (system.dt, system.f_jacobian.method) == (DT, "complex step")
-    for z in np.random.default_rng(4).normal(size=(6, 3)):
-        np.testing.assert_allclose(system.f(z, nothing), expected.f(z, nothing), rtol=1e-14)
-        for dt in (np.array([0.25]), np.array([0.1])):
-            np.testing.assert_allclose(system.timed.f(z, dt), expected.timed.f(z, dt), rtol=1e-14)
-        np.testing.assert_allclose(
-            system.f_jacobian(z, nothing), expected.f_jacobian(z, nothing), rtol=1e-12, atol=1e-15
-        )
-
-
-def test_parameters_that_drift_are_followed():
-    theta, x, found = 2.0, START, []
-    system = augment_parameters(
-        driven_rate, lambda x, u, theta: x[:1], n=2, p=1, m=1, nominal=NOMINAL, estimated=[0],
-        dt=DT, drifting=True, disturbances=POSITION_EXACT,
-    )
-    assert system.disturbances.upper.tolist() == [0.0, np.inf, np.inf]
-    cost = QuadraticCost.from_covariances(
-        prior=np.diag([0.1, 0.1, 0.2]), disturbance=np.diag([1e-6, 1e-6, 1e-2]), noise=1e-6
-    )
-    mhe = MovingHorizonEstimator(
-        system, Luenberger([0.0, -0.05, 0.0]), cost, horizon=15, initial_state=[*START, theta],
-        max_qps=None, candidate="reinitialized",
-    )
-    for t in range(80):
-        u, dt = np.array([2.0 * np.sin(0.3 * t)]), DT if t % 5 else 0.15
-        estimate = mhe.update(x[0], u, dt=None if t % 5 else dt)
-        x = rk4(lambda x, known: driven_rate(x, known[:1], known[1:]))(
-            x, np.array([*u, theta, TRUE[1]]), dt
-        )
-        theta += 0.02
-        found.append(estimate.state[2] - theta)
-    assert np.abs(found[40:]).mean() < 0.2
-    assert np.ptp(estimate.trajectory[:, 2]) > 0.05
 
 
 # Bad input

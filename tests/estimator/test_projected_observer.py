@@ -9,10 +9,11 @@ from scipy.optimize import nnls
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import SetError, ShapeError, WeightError
 from qpmhe.estimation.snapshot import read
 from qpmhe.observers.projection import NearestPoint
+
+from .systems import linear
 
 INF = math.inf
 
@@ -24,10 +25,6 @@ def estimator(system, observer, *, start, max_qps=0, horizon=4, cost=None, **opt
     return qpmhe.MovingHorizonEstimator(
         system, observer, cost, horizon=horizon, initial_state=start, max_qps=max_qps, **options
     )
-
-
-def linear(a, c, states):
-    return qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=len(a), p=len(c), states=states)
 
 
 # The projection
@@ -140,7 +137,7 @@ def worst_excess(rng, steps, observer_of, bound_of):
     lower[0] = 0.0
     corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(n, -1).T
     mhe = estimator(
-        linear(a, c, qpmhe.Box(lower, upper)), observer_of(gain, metric),
+        linear(a, c, states=qpmhe.Box(lower, upper)), observer_of(gain, metric),
         start=corners[rng.integers(len(corners))],
     )
     x, z, worst, projected = corners[rng.integers(len(corners))], mhe.state, -INF, 0
@@ -217,39 +214,13 @@ def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
         assert sum(projected for _, projected in found) > 0.09 * runs * steps
 
 
-def test_the_candidates_disturbance_is_bounded_where_kappa_does_not_bound_it():
-    """|L(t)| <= |e(t+1)| + L_f |e(t)| + |w(t)|; and the plain one's |L|_M where f(z) is in X."""
-    rng, seen = np.random.default_rng(4), {True: 0, False: 0}
-    for _ in range(40):
-        closed, gain, c, metric, _ = certified(rng, 2)
-        a, box = closed + gain @ c, qpmhe.Box([0.0, -1.0], [2.0, 1.0])
-        mhe = estimator(linear(a, c, box), in_own_metric(gain, metric), start=[1.0, 0.0])
-        x, z = np.array([1.0, 0.5]), mhe.state
-        for _ in range(20):
-            v, following = 0.3 * rng.standard_normal(1), rng.uniform(box.lower, box.upper)
-            estimate = mhe.update(c @ x + v)
-            applied, plain = estimate.disturbances[-1], gain @ (c @ (x - z) + v)
-            bound = sum(
-                np.linalg.norm(one) for one in (following - estimate.state, following - a @ x)
-            ) + np.linalg.norm(a, 2) * np.linalg.norm(x - z)
-            assert np.linalg.norm(applied) <= bound * (1 + 1e-9)
-            if Status.OBSERVER_PROJECTED in estimate.status:
-                stays = box.violation(a @ z) == 0.0
-                seen[stays] += 1
-                if stays:
-                    assert applied @ metric @ applied <= plain @ metric @ plain * (1 + 1e-9)
-                assert (Status.PREDICTION_OUTSIDE in estimate.status) is not stays
-            x, z = following, estimate.state
-    assert min(seen.values()) > 10
-
-
 CLOSED = np.array([[1.2, 1.0], [-1.0, -0.5]])
 K, C = np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
 
 
 def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilises():
     def sizes(metric):
-        system = linear(CLOSED + K @ C, C, qpmhe.Box([0.0, 0.0], [INF, INF]))
+        system = linear(CLOSED + K @ C, C, states=qpmhe.Box([0.0, 0.0], [INF, INF]))
         mhe = estimator(system, qpmhe.Luenberger(K, metric=metric), start=[1.0, 0.0])
         return np.linalg.norm(mhe.run(np.zeros((60, 1))).states, axis=1)
 
@@ -260,7 +231,7 @@ def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilise
 
 
 def test_metrics_are_checked():
-    system = linear(CLOSED, C, qpmhe.Box([0.0, 0.0], [INF, INF]))
+    system = linear(CLOSED, C, states=qpmhe.Box([0.0, 0.0], [INF, INF]))
     for kind in (
         lambda metric: qpmhe.Luenberger(K, metric=metric),
         lambda metric: qpmhe.OutputInjection(lambda z, v: K @ v, metric=metric),
@@ -293,25 +264,6 @@ def pressures(steps=30):
     return np.array(found)
 
 
-def test_without_projection_the_observer_is_the_papers():
-    gain, ys = np.array([[0.8], [-0.3]]), pressures(8)
-    expected = [np.array([0.1, 4.5])]
-    for y in ys:
-        expected.append(reaction(expected[-1]) + gain @ (y - expected[-1].sum()))
-    plain = estimator(
-        reactor(), qpmhe.Luenberger(gain), start=[0.1, 4.5], project_observer=False
-    ).run(ys)
-    np.testing.assert_allclose(plain.states, expected, rtol=1e-12)
-    assert (plain.states < 0.0).any()
-    assert plain.share(Status.OBSERVER_PROJECTED) == 0.0
-    # Within the set nothing changes.
-    near = [
-        estimator(reactor(bounded), qpmhe.Luenberger([0.05, 0.05]), start=[3.0, 1.0], max_qps=2)
-        for bounded in (True, False)
-    ]
-    np.testing.assert_array_equal(*(mhe.run(ys).states for mhe in near))
-
-
 # First guesses, noise-free components, degenerate sets
 
 
@@ -331,9 +283,15 @@ def test_a_first_guess_outside_is_projected_with_a_warning():
         # min 2 + 2 s + s^2 over xi = (0, 1 + s) is at s = -1.
         np.testing.assert_allclose(mhe.initial_state, [0.0, 0.0], atol=1e-12)
         np.testing.assert_array_equal(mhe.state, mhe.initial_state)
+    mhe.update([1.0])
+    with pytest.raises(qpmhe.ObserverWarning, match="outside of the state set"):
+        mhe.reset([1.0, -2.0])
+    assert mhe.time == 1  # as it was
     with pytest.warns(qpmhe.ObserverWarning, match="outside of the state set"):
         mhe.reset([1.0, -2.0])
     assert mhe.state.min() >= 0.0
+    mhe.reset([0.0, 1.0])  # on the boundary
+    np.testing.assert_array_equal(mhe.state, [0.0, 1.0])
 
 
 def test_the_roll_out_restores_a_moved_noise_free_component():
@@ -365,24 +323,6 @@ def test_the_roll_out_restores_a_moved_noise_free_component():
 # A prediction that says nothing
 
 
-def test_the_exothermic_reactor_settles_from_far_away_as_from_near():
-    system, observer, cost, scenario = qpmhe.models.cstr()
-    error = scenario.initial_estimate - scenario.initial_state
-    states, measurements, inputs = scenario.simulate(0)
-    settled = []
-    for factor in (1.0, 3.0, 5.0):
-        start = np.clip(
-            scenario.initial_state + factor * error, system.states.lower, system.states.upper
-        )
-        run = estimator(system, observer, start=start, cost=cost, horizon=20).run(
-            measurements, inputs
-        )
-        late = ((run.states - states) / [0.3, 5.0])[100:]
-        settled.append(np.sqrt(np.mean(late**2)))
-    assert settled == pytest.approx([settled[0]] * 3, rel=1e-3)
-    assert settled[0] < 0.12
-
-
 def test_a_prediction_beyond_the_sets_width_does_not_drown_the_correction():
     """f blows up on a part of X; where it does, the output shows the way back."""
     box = qpmhe.Box([0.0], [3.0])
@@ -394,7 +334,7 @@ def test_a_prediction_beyond_the_sets_width_does_not_drown_the_correction():
     assert Status.PREDICTION_OUTSIDE in estimate.status
     np.testing.assert_allclose(estimate.state, [2.0])  # 3, the nearest to 1e30, and K v
     # Outside but near, f(z) = 5, it is projected once: 5 - 3 is inside, and stays.
-    doubling = linear(np.array([[2.0]]), np.eye(1), box)
+    doubling = linear([[2.0]], np.eye(1), states=box)
     near = estimator(doubling, qpmhe.Luenberger([1.5]), start=[2.5])
     np.testing.assert_allclose(near.update([0.5]).state, [2.0])
 
@@ -406,7 +346,7 @@ def test_a_snapshot_is_read_while_states_of_another_metric_are_in_the_window():
         own = 0.9 * x[..., 0] + 0.3
         return np.stack([own, (1.5 - 0.5 * x[..., 0]) * x[..., 1] + 0.3 * x[..., 0]], axis=-1)
 
-    def made(engine):
+    def made():
         system = qpmhe.System(
             f, lambda x: x[..., :1], n=2, p=1, states=qpmhe.Box([0.0, 0.0], [INF, 1.0])
         )
@@ -415,22 +355,17 @@ def test_a_snapshot_is_read_while_states_of_another_metric_are_in_the_window():
         )
         return estimator(
             system, qpmhe.Luenberger([0.2, 0.5]), start=[0.2, 0.9], max_qps=1, horizon=8, cost=cost,
-            engine=engine,
+            engine="python",
         )
 
     rng, x, ys = np.random.default_rng(0), np.array([0.3, 0.9]), []
     for _ in range(12):
         ys.append(x[:1] + 0.3 * rng.standard_normal(1))
         x = f(x)
-    candidates = []
-    for engine in ("python", "compiled") if find_compiler() else ("python",):
-        mhe = made(engine)
-        for y in ys:
-            estimate, again = mhe.update(y), made(engine)
-            again.load_state_dict(mhe.state_dict())
-            np.testing.assert_array_equal(again.state, mhe.state)
-            assert Status.OBSERVER_PROJECTED in estimate.status
-        if engine == "python":
-            assert read(mhe.state_dict())["window"]["metric"][1]
-        candidates.append(estimate.candidate)
-    np.testing.assert_allclose(candidates[-1], candidates[0], atol=1e-9)
+    mhe = made()
+    for y in ys:
+        estimate, again = mhe.update(y), made()
+        again.load_state_dict(mhe.state_dict())
+        np.testing.assert_array_equal(again.state, mhe.state)
+        assert Status.OBSERVER_PROJECTED in estimate.status
+    assert read(mhe.state_dict())["window"]["metric"][1]

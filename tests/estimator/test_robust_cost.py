@@ -11,63 +11,13 @@ from qpmhe.errors import InvalidInputError, OptionError, ShapeError, WeightError
 from . import plain
 from .plain import spd
 from .spoil import check
+from .systems import GAIN, seen, swing
 
 GENERATOR = np.random.default_rng(1)
 P, Q, R = spd(GENERATOR, 2), spd(GENERATOR, 2), spd(GENERATOR, 2)
-GAIN = np.array([[0.3, 0.05], [0.1, 0.2]])
 
 
-def swing(x):
-    return np.stack(
-        [x[..., 0] + 0.2 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
-    )
-
-
-def seen(x):
-    return np.stack([x[..., 0] + 0.1 * x[..., 1] ** 2, x[..., 1]], axis=-1)
-
-
-def record(samples, missing=0.0):
-    """A noisy record with an outlier every now and then."""
-    generator = np.random.default_rng(2)
-    x, ys = np.array([1.0, 0.5]), []
-    for _ in range(samples):
-        y = seen(x) + 0.05 * generator.standard_normal(2)
-        y[generator.random(2) < 0.1] += 3.0
-        y[generator.random(2) < missing] = np.nan
-        ys.append(y)
-        x = swing(x) + 0.02 * generator.standard_normal(2)
-    return np.array(ys)
-
-
-# As they are given, and their definitions.
-COSTS = {
-    "huber": (
-        (qpmhe.Huber(P, 0.1), qpmhe.Huber(Q, 0.2), qpmhe.Huber(R, 0.3)),
-        (plain.huber(0.1), plain.huber(0.2), plain.huber(0.3)),
-    ),
-    "power": (
-        (P, qpmhe.Power(Q, 1.5), qpmhe.Power(R, 3.0)),
-        (plain.quadratic, plain.power(1.5), plain.power(3.0)),
-    ),
-    "redescending": (
-        (P, qpmhe.Cauchy(Q, 0.7, graduation=1.0), qpmhe.GemanMcClure(R, 0.9, graduation=1.0)),
-        (plain.quadratic, plain.barron(0.0, 0.7), plain.geman_mcclure(0.9)),
-    ),
-    "graduated": (
-        (P, qpmhe.Cauchy(Q, 0.7), qpmhe.GemanMcClure(R, 0.9, graduation=5.0)),
-        (plain.quadratic, plain.barron(0.0, 0.7), plain.geman_mcclure(0.9)),
-    ),
-    "mixed": (
-        (qpmhe.Quadratic(P), qpmhe.Power(Q, 1.2), qpmhe.Huber(np.diag([4.0, 9.0]), 0.4, True)),
-        (plain.quadratic, plain.power(1.2), plain.each(plain.huber(0.4))),
-    ),
-}
 TERMS = ("prior", "disturbance", "noise")
-
-
-def cost_of(name, **options):
-    return qpmhe.RobustCost(**dict(zip(TERMS, COSTS[name][0], strict=True)), **options)
 
 
 def estimator(cost, **options):
@@ -75,49 +25,6 @@ def estimator(cost, **options):
         qpmhe.System(swing, seen, n=2, p=2), qpmhe.Luenberger(GAIN), cost,
         **{"horizon": 5, "initial_state": [0.5, 0.0], "max_qps": 2} | options,
     )
-
-
-@pytest.mark.parametrize("prior", [P, qpmhe.ObserverPrior()], ids=["constant", "observer"])
-def test_matrices_stand_for_quadratic_losses(prior):
-    weights = {"prior": prior, "disturbance": Q, "noise": R, "discount": 0.9}
-    losses = weights | {name: qpmhe.Quadratic(weights[name]) for name in TERMS[1:]}
-    covariances = {name: 0.3 * np.eye(2) for name in TERMS}
-    observer = qpmhe.Luenberger(GAIN) if prior is P else qpmhe.ExtendedKalman(**covariances)
-    runs = [
-        qpmhe.MovingHorizonEstimator(
-            qpmhe.System(swing, seen, n=2, p=2), observer, cost, horizon=4, max_qps=2,
-            initial_state=[0.5, 0.0],
-        ).run(record(90, 0.1))
-        for cost in (
-            qpmhe.QuadraticCost(**weights), qpmhe.RobustCost(**weights), qpmhe.RobustCost(**losses)
-        )
-    ]
-    for run in runs[1:]:
-        np.testing.assert_allclose(run.states, runs[0].states, rtol=1e-9, atol=1e-10)
-        np.testing.assert_allclose(run.costs, runs[0].costs, rtol=1e-9)
-
-
-@pytest.mark.parametrize("name", COSTS)
-def test_majorising_weights_have_the_slopes_of_the_losses(name):
-    cost, generator = cost_of(name), np.random.default_rng(4)
-    weights = [getattr(one, "weight", one) for one in COSTS[name][0]]
-    residuals = generator.standard_normal((20, 4)) * 10.0 ** generator.uniform(-1, 1, (20, 1))
-    of_x, of_w, of_v = (
-        lambda s, loss=loss, weight=weight: loss(s, weight)
-        for loss, weight in zip(COSTS[name][1], weights, strict=True)
-    )
-    joint = cost.majorise(residuals, cost.stage_weight)
-    assert not joint[:, :2, 2:].any()
-    assert not joint[:, 2:, :2].any()
-    for residual, weight in zip(residuals, joint, strict=True):
-        slope = plain.differences(lambda r: of_w(r[:2]) + of_v(r[2:]), residual)
-        np.testing.assert_allclose(2.0 * weight @ residual, slope, rtol=1e-9, atol=1e-9)
-        offset = residual[:2]
-        assert cost.prior_cost(offset, P) == pytest.approx(of_x(offset), rel=1e-12)
-        prior_weight = cost.majorise_prior(offset, P)
-        slope = plain.differences(of_x, offset)
-        np.testing.assert_allclose(2.0 * prior_weight @ offset, slope, rtol=1e-9)
-    assert cost.prior_cost(np.zeros(2), P) == 0.0
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 3.0])

@@ -54,19 +54,6 @@ def test_given_jacobians_are_compared_in_any_unit(km):
         qpmhe.System(f, lambda x: x[:1], **options, scales=[km, km])
 
 
-@pytest.mark.parametrize("wide", [1.0, 1e6])
-def test_a_prior_that_knows_nothing_does_no_harm(wide):
-    f, jacobian = uptake(5e-9)
-    given = qpmhe.System(f, lambda x: x[:1], n=2, p=1, f_jacobian=jacobian)
-    by_steps = qpmhe.System(lambda x: [float(s) for s in f(x)], lambda x: x[:1], n=2, p=1)
-    found = [
-        estimator(system, 5e-9 * wide, [0.3, 0.1], [0.0, 5e-9], 1e-18, max_qps=None)
-        .run(np.full(5, 2e-9)).states
-        for system in (given, by_steps)
-    ]
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-5)
-
-
 def test_a_wrong_jacobian_of_the_rate_is_named_by_the_estimator():
     system = qpmhe.System.from_ode(
         lambda x: -x**2, lambda x: x, dt=1e-3, n=1, p=1, rate_jacobian=lambda x: -np.diag(x)
@@ -89,46 +76,7 @@ def test_scales_that_the_user_gave():
             qpmhe.System.from_ode(lambda x: x, lambda x: x, dt=0.1, n=2, p=2, scales=scales)
 
 
-@pytest.mark.parametrize("real", [False, True], ids=["complex step", "differences"])
-def test_powers_of_two_change_not_a_bit_of_a_derivative(real):
-    generator = np.random.default_rng(3)
-    points = generator.uniform(-2.0, 2.0, (20, 2))
-    points[3] = 0.0
-
-    def system_in(units):
-        def f(x):
-            a, b = (float(s) if real else s for s in x / units)
-            if real:
-                return np.array([a * math.exp(-0.3 * b) + 0.1 * b, b / (1.0 + a * a)]) * units
-            return np.array([a * np.exp(-0.3 * b) + 0.1 * b, b / (1.0 + a * a)]) * units
-
-        system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
-        system.use_scales(np.array([0.7, 3.0]) * units)
-        system.check(np.array([0.5, 0.2]) * units, NONE)
-        assert system.f_jacobian.method == ("finite differences" if real else "complex step")
-        return system.f_jacobian.batch(points * units, np.zeros((20, 0)))
-
-    expected = system_in(np.ones(2))
-    for _ in range(10):
-        units = 2.0 ** generator.integers(-30, 31, 2)
-        np.testing.assert_array_equal(system_in(units), expected * units[:, None] / units)
-
-
 # Differences
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
-def test_differences_keep_their_accuracy_where_a_state_passes_zero(unit):
-    system = qpmhe.System(
-        lambda x: [unit * math.sin(x[0] / unit), x[1] + x[0] * x[1] / unit], lambda x: x[:1],
-        n=2, p=1, scales=[unit, unit],
-    )
-    assert system.f_jacobian.method == "finite differences"
-    for a, b in ((0.0, 0.0), (1e-9, 1.0), (0.5, -0.4)):
-        np.testing.assert_allclose(
-            system.f_jacobian(unit * np.array([a, b]), NONE),
-            [[math.cos(a), 0.0], [b, 1.0 + a]], rtol=1e-8, atol=1e-9,
-        )
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0])
@@ -183,31 +131,6 @@ def test_an_estimator_on_a_bound_needs_no_model_beyond_it():
         estimate = estimator(system, 0.1, gain, [0.0], 0.01).update([0.2])
         assert estimate.improved, estimate.message
         assert not estimate.message
-
-
-def test_steps_of_other_lengths_have_the_same_scales():
-    system = qpmhe.System.from_ode(
-        lambda x: [1e-9 * math.sin(x[0] / 1e-9)], lambda x: x, dt=0.1, n=1, p=1
-    )
-    mhe = estimator(system, 1e-9, [0.5], [0.0], 1e-18, max_qps=None)
-    mhe.update([1e-9], dt=0.2)
-    other = mhe._own_system.timed.f_jacobian(np.zeros(1), np.array([0.2]))
-    rk4 = 1.0 + 0.2 + 0.02 + 0.2**3 / 6.0 + 0.2**4 / 24.0
-    np.testing.assert_allclose(other, [[rk4]], rtol=1e-8)
-
-
-def test_a_model_is_called_twice_for_the_derivative_by_each_state():
-    calls = []
-
-    def f(x):
-        calls.append(x)
-        return [math.sin(x[0]), x[1] * x[0]]
-
-    system = qpmhe.System(f, lambda x: x[:1], n=2, p=1, states=qpmhe.Box([-9.0] * 2, [9.0] * 2))
-    system.use_scales([1.0, 1.0])
-    calls.clear()
-    system.f_jacobian.batch(np.ones((10, 2)), np.zeros((10, 0)))
-    assert len(calls) == 40
 
 
 # Observers

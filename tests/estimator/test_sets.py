@@ -75,11 +75,6 @@ def test_the_numbers_of_sets_are_copies():
     np.testing.assert_array_equal(polytope.row_upper, [1.0, 1.0])
 
 
-def test_the_empty_component_is_named():
-    with pytest.raises(SetError, match=r"component 1 has lower 1.5 and upper 1.0.*lower <= upper"):
-        qpmhe.Box([0.0, 1.5, 0.0], [1.0, 1.0, 1.0])
-
-
 def test_sets_that_only_touch_are_not_empty():
     point = qpmhe.Box([0.0], [1.0]) & qpmhe.Box([1.0], [2.0])
     np.testing.assert_array_equal(point.fixed_components, [0])

@@ -10,7 +10,6 @@ import qpmhe
 from qpmhe import Box, Constraint, Status
 from qpmhe.certificates.audit import checked_ingredients
 from qpmhe.errors import InvalidInputError, ModelError, SetError, ShapeError
-from qpmhe.estimation.subproblem import Subproblem
 
 from .same import assert_same
 
@@ -146,23 +145,6 @@ def test_hard_constraints_hold_or_are_named():
     assert str(row) == "upper bound of constraints, row 2, at time 7"
 
 
-def test_nearest_points_are_nearest_in_the_hessian_of_j_alone(monkeypatch):
-    found, plain = [], Subproblem.nearest_point
-
-    def compared(self, problem, trial):
-        band, forces = plain(self, problem, trial).band.copy(), self._forces
-        self.start()
-        qp = plain(self, problem, trial)
-        found.append((forces is not None, np.array_equal(qp.band, band)))
-        self._forces = forces
-        return qp
-
-    monkeypatch.setattr(Subproblem, "nearest_point", compared)
-    estimates(HARD, max_qps=3)
-    assert any(bent for bent, _ in found)
-    assert all(equal for _, equal in found)
-
-
 @pytest.mark.parametrize("penalty", [{}, {"linear": 5.0}])
 @pytest.mark.parametrize("bad", ["raise", "nan", "exit", "shape"])
 def test_a_constraint_that_fails_far_from_the_data_never_escapes(bad, penalty):
@@ -221,15 +203,14 @@ def test_a_snapshot_of_other_penalties_or_another_g_is_refused():
             make(other).load_state_dict(mhe.state_dict())
 
 
-@pytest.mark.parametrize("maker", ["casadi", "jax"])
-def test_models_of_other_tools_inputs_and_steps(maker):
-    pytest.importorskip(maker)
+def test_models_of_casadi_inputs_and_steps():
+    pytest.importorskip("casadi")
     options = {
         "n": 2, "p": 2, "m": 1, "dt": 0.1, "states": SOFT["states"],
         "constraints": [Constraint(lambda x, u: x[0] + u[0] - 0.8, quadratic=50.0)],
     }
 
-    system = getattr(qpmhe, f"from_{maker}")(
+    system = qpmhe.from_casadi(
         lambda x, u: [x[1], (1 - x[0] ** 2) * x[1] - x[0] + u[0]],
         lambda x: [x[0] + 0.1 * x[1] ** 2, x[1]], **options,
     )
@@ -261,40 +242,11 @@ def test_what_does_not_have_them_says_so_by_name(name, words):
     assert words in uncovered(system, observer, COST, Settings(N, "auto", 1))
     with pytest.raises(InvalidInputError, match=words):
         checked_ingredients(system, observer, COST)
-    with pytest.raises(InvalidInputError, match=words):
-        qpmhe.noisy_inputs(qpmhe.System.from_ode(
-            rate, h, dt=0.1, n=2, p=2, m=1, **{name: SOFT[name]}
-        ))
     pytest.importorskip("casadi")
     with pytest.raises(InvalidInputError, match=words):
         IpoptEstimator(
             system, observer, COST, f=f, h=h, horizon=N, initial_state=np.array([1.0, 0.0])
         )
-
-
-@pytest.mark.parametrize("write", [
-    lambda x, w, v: [x[0] * w[1] + v[0], np.sin(x[1]) + v[1]],
-    lambda v, x, w: np.stack((x[..., 0] * w[..., 1], np.sin(x[..., 1])), -1) + v,
-    lambda w, v, x, one=1.0: [float(one * x[0] * w[1] + v[0]), float(np.sin(x[1]) + v[1])],
-])  # fmt: skip
-def test_functions_are_evaluated_however_they_are_written(write):
-    functions = qpmhe.System(f, h, n=2, p=2, constraints=[Constraint(write, 2)]).constraints
-    rng = np.random.default_rng(0)
-    for count in (1, 2, 3, 6):
-        x, r = rng.standard_normal((count + 1, 2)), rng.standard_normal((count, 4))
-        minus, u = rng.standard_normal((count, 4, 2)), np.zeros((count, 0))
-        found = functions.values(x, u, r)
-        own, following = functions.linearised(x, u, r, minus)
-        for i in range(count):
-            expected = [x[i, 0] * r[i, 1] + r[i, 2], np.sin(x[i, 1]) + r[i, 3]]
-            np.testing.assert_allclose(found[i], expected, rtol=1e-14)
-            by_x = np.array([[r[i, 1], 0.0], [0.0, np.cos(x[i, 1])]])
-            by_w = np.array([[0.0, x[i, 0]], [0.0, 0.0]])
-            np.testing.assert_allclose(
-                own[i], by_x + by_w @ minus[i, :2] + minus[i, 2:], rtol=1e-6, atol=1e-8
-            )
-            np.testing.assert_allclose(following[i], by_w, rtol=1e-6, atol=1e-8)
-        assert not found[-1].any()
 
 
 WRONG = [

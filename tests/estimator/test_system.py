@@ -22,25 +22,6 @@ def test_every_way_of_writing_f_gives_equal_values(way):
     check_values(system.f, pendulum, 2)
 
 
-def test_linear_maps():
-    for n in (1, 2, 3, 5):
-        a = np.random.default_rng(n).standard_normal((n, n)) + 2.0 * np.eye(n)
-        for write, mode in (
-            (lambda x, a=a: a @ x, "columns"), (lambda x, a=a: np.dot(a, x), "columns"),
-            (lambda x, a=a: x @ a.T, "batched"), (lambda x, a=a: np.inner(x, a), "batched"),
-            (lambda x, a=a: np.inner(a, x), "looped"),
-            (lambda x, a=a: np.einsum("ij,...j->...i", a, x), "batched"),
-            (lambda x, a=a: np.linalg.solve(np.linalg.inv(a), x), None),
-            # Right on one leading dimension only.
-            (lambda x, a=a: (a @ x.T).T, None), (lambda x, a=a: np.dot(a, x.T).T, None),
-            (lambda x, a=a: np.stack([row @ x.T for row in a], axis=-1), None),
-        ):
-            f = lambda x, write=write: write(x)  # noqa: E731
-            system = qpmhe.System(f, lambda x: x[..., :1], n=n, p=1)
-            assert mode is None or n == 1 or system.f.mode == mode
-            check_values(system.f, lambda x, u, a=a: a @ x, n)
-
-
 BUFFER = np.zeros(2)
 
 
@@ -52,19 +33,16 @@ def buffered(x):
 # f of two states, and the same for one state at a time where f is not that.
 FUNCTIONS = {
     "constant component": (lambda x: np.array([x[1], 1.5]), None),
-    "constant first": (lambda x: [1.5, x[0]], None),
-    "only constants": (lambda x: np.array([1, 2]), None),
     "added vector": (lambda x: np.array([x[1], -x[0]]) + np.array([1.0, 2.0]), None),
-    "scaled by a vector": (lambda x: np.array([1.0, 2.0]) * np.array([x[1], -x[0]]), None),
     "times a multiple of the identity": (lambda x: 0.5 * np.eye(2) @ x, lambda x: 0.5 * x),
     "identity": (lambda x: x, None),
+    # Right on one leading dimension only.
+    "A @ x.T": (lambda x: (A @ x.T).T, None),
+    "rows @ x.T": (lambda x: np.stack([row @ x.T for row in A], axis=-1), None),
     # What mixes many states
     "norm": (lambda x: x / np.linalg.norm(x), None),
-    "mean": (lambda x: x - np.mean(x), None),
     "max": (lambda x: x * np.max(x), None),
     "cumsum": (lambda x: np.cumsum(x), None),
-    "reversed": (lambda x: x[::-1], None),
-    "roll": (lambda x: np.roll(x, 1), None),
     "sort": (lambda x: np.sort(x), None),
     # What one array holds
     "the same array": (buffered, lambda x: [x[1], -x[0]]),
@@ -83,8 +61,7 @@ def test_a_single_output_or_state_may_be_a_scalar():
     for n in (1, 2, 4):
         for h in (
             lambda x: x[0], lambda x: x[..., 0], lambda x: x[:1], lambda x: x[..., :1],
-            lambda x: np.array([x[0]]), lambda x: [x[0]], lambda x: float(x[0]),
-            lambda x: math.sqrt(x[0]) ** 2, lambda x: np.eye(x.shape[0])[0] @ x,
+            lambda x: float(x[0]), lambda x: np.eye(x.shape[0])[0] @ x,
         ):
             check_values(qpmhe.System(lambda x: x, h, n=n, p=1).h, lambda x, u: x[:1], n)
     for h, plain in (
@@ -95,9 +72,7 @@ def test_a_single_output_or_state_may_be_a_scalar():
         system = qpmhe.System(lambda x: x, h, n=2, p=1)
         check_values(system.h, lambda x, u, plain=plain: np.array([plain(x)]), 2)
     for f in (
-        lambda x: np.sin(x), lambda x: np.sin(x[0]), lambda x: math.sin(x[0]),
-        lambda x: math.sin(x.item()), lambda x: [math.sin(x[0])],
-        lambda x: np.array([np.sin(x[0])]) + np.array([0.0]),
+        lambda x: np.sin(x), lambda x: math.sin(x.item()), lambda x: [math.sin(x[0])],
     ):
         system = qpmhe.System(f, lambda x: x, n=1, p=1)
         check_values(system.f, lambda x, u: np.array([math.sin(x[0])]), 1)
@@ -111,7 +86,6 @@ def test_inputs():
         (lambda x, u: x @ A.T + u @ B.T + x * u, "batched"),
         (lambda x, u: A @ x + B @ u + x * u, "columns"),
         (lambda x, u: np.inner(A, x) + np.inner(B, u) + x * u, "looped"),
-        (lambda x, u=None: x @ A.T + u @ B.T + x * u, "batched"),
         (lambda *a: a[0] @ A.T + a[1] @ B.T + a[0] * a[1], "batched"),
         (lambda x, force=None, gain=1.0: A @ x + gain * (B @ force) + x * force, "columns"),
     ):

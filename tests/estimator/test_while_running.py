@@ -10,7 +10,7 @@ from qpmhe import Box, Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError, WeightError
 
-from .same import assert_same, interrupted, leaves
+from .same import assert_same, leaves
 from .spoil import check
 
 WEIGHTS = {"prior": np.diag([2.0, 1.0]), "disturbance": np.diag([9.0, 4.0]),
@@ -425,55 +425,4 @@ def test_what_was_given_is_copied():
     assert leaves(mhe.state_dict()) == leaves(twin.state_dict())
 
 
-@pytest.mark.parametrize("name", [n for n in OPTIONS if n.startswith(("two", "sets, r"))])
-def test_an_interrupted_change_was_not_made(name):
-    mhe, twin = estimator(**OPTIONS[name]), estimator(**OPTIONS[name])
-    rng, changes = np.random.default_rng(12), {"noise_weight": np.eye(3), "parameters": [0.7, 0.3]}
-    if has_sets(name):
-        changes["bounds"] = {"states": Box([-0.4, -1.0], [0.4, np.inf])}
-    for t, one in enumerate(samples(9, 13, has_sets(name))):
-        do = [lambda each, one=one: feed(each, one)]
-        if t in (0, 7):
-            do.append(lambda each: each.set(**changes))
-        for each in do:
-            if t not in (0, 4, 7):
-                each(mhe)
-                each(twin)
-                continue
-            mhe.state_dict()  # in which solvers forget, as they do after an interrupt
-            twin.state_dict()
-            found, expected = interrupted(mhe, each, rng, 150), each(twin)
-            assert (found is None) == (expected is None)
-            if found is not None:
-                assert_same(found, expected)
-    assert leaves(mhe.state_dict()) == leaves(twin.state_dict())
-
-
 # The step's work, and code that is written
-
-
-def test_a_sample_of_one_sensor_computes_nothing_twice(monkeypatch):
-    mhe, reduced, plain = estimator(), [], qpmhe.QuadraticCost._reduced
-    monkeypatch.setattr(
-        qpmhe.QuadraticCost, "_reduced",
-        lambda self, *arguments: reduced.append(1) or plain(self, *arguments),
-    )
-    for t in range(60):
-        mhe.update([0.1], U, sensors=[t % 3])
-    assert len(reduced) == 3
-
-
-@pytest.mark.parametrize("kalman", [None, "ExtendedKalman"])
-def test_the_written_code_has_the_present_weights_and_bounds(kalman, tmp_path):
-    def written(mhe):
-        return [path.read_text() for path in qpmhe.codegen.write(mhe, tmp_path)]
-
-    options = {"sets": {"noises": SETS["noises"]}, "kalman": kalman, "parameters": None}
-    before = written(estimator(**options))
-    for changes in (
-        CHANGES["noise"], CHANGES["disturbance"],
-        {"bounds": {"noises": CHANGES["bounds"]["bounds"]["noises"]}},
-    ):
-        mhe = estimator(**options)
-        mhe.set(**changes)
-        assert written(mhe) == written(made_with(options, changes)) != before
