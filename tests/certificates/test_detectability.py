@@ -100,9 +100,12 @@ def test_what_is_refused_says_why():
     hidden = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
     with pytest.raises(NotCertifiedError, match=r"eigenvalue 1\.1.*not in the out.*measure some"):
         certify_detectability(hidden, unit_box(2))
-    for eta in (0.0, 1.0, -0.5, math.nan, True, "fast"):
+    for eta in (0.0, 1.0, math.nan, True, "fast"):
         with pytest.raises(OptionError, match="eta is"):
             certify_detectability(hidden, unit_box(2), eta=eta)
+    for seconds in (0.0, math.nan, True, "long"):
+        with pytest.raises(OptionError, match="seconds is"):
+            certify_detectability(hidden, unit_box(2), seconds=seconds)
 
 
 def test_what_intervals_cannot_run_is_sampled_with_the_reason():
