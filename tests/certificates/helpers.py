@@ -7,7 +7,6 @@ from qpmhe.certificates import certify, certify_detectability, certify_observer,
 
 REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])
 PENDULUM = qpmhe.Box([-3.0, -10.0], [3.0, 10.0])
-TANKS = qpmhe.Box([0.2, 0.2], [2.0, 2.0])
 
 
 def linear(A, C, **options):

@@ -230,7 +230,7 @@ def test_a_projection_in_the_certified_metric_keeps_all_bounds():
     assert paper.kappa_bar != paper.kappa
     spread = np.sqrt(np.linalg.cond(certificate.observer_bound.metric))
     projected = more = 0
-    for seed in range(15):
+    for seed in range(8):
         states, ys = inside(certificate, seed)
         mhe = estimator(certificate, initial_state=[0.0, 0.5])
         watch = Monitor(certificate, mhe, initial_error=states[0] - mhe.observer_state)
@@ -258,7 +258,7 @@ def test_a_projection_in_the_certified_metric_keeps_all_bounds():
             for i, moved in enumerate(np.linalg.norm(steps, axis=1)):
                 t = estimate.time - len(steps) + 1 + i
                 assert moved <= paper.kappa_bar * paper.L_bar * newest_sum(paper, start, signals, t)
-    assert projected > 30
+    assert projected > 15
     assert more > 0  # kappa does not hold of these corrections, whatever the metric makes of it
 
 
