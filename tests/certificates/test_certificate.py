@@ -86,6 +86,8 @@ def test_assumed_constants_give_the_papers_bound_and_say_so():
     )
     assert certificate.evidence is Evidence.ASSUMED
     assert certificate.of().cost.exponent == 1.5
+    with pytest.raises(OptionError, match="eta is 1"):
+        Detectability.assumed(eta=1.0, c_p=1.0, c_w=1.0, c_v=1.0)
     with pytest.raises(OptionError, match="no bound of the observer: its constants were stated"):
         certificate.bound(None, initial_error=1.0)
 

@@ -9,9 +9,8 @@ import pytest
 import qpmhe
 from qpmhe.certificates import search as search_module
 from qpmhe.certificates.contraction import certify_detectability, certify_observer
-from qpmhe.certificates.evidence import Evidence, NotCertifiedError, weakest
+from qpmhe.certificates.evidence import Evidence, NotCertifiedError
 from qpmhe.certificates.inequalities import Form, Matrices, definite
-from qpmhe.certificates.properties import Detectability
 from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.errors import OptionError
 
@@ -169,13 +168,3 @@ def test_rates_of_linear_systems_are_reproduced(A, C, L):
         assert ask(true * (1.0 + 1e-6)).evidence is Evidence.PROVED
         with pytest.raises(NotCertifiedError):
             ask(true * (1.0 - 1e-12))
-
-
-def test_assumed_constants_are_labelled():
-    assumed = Detectability.assumed(eta=0.9, c_p=2.0, c_w=3.0, c_v=4.0)
-    assert assumed.evidence is Evidence.ASSUMED
-    assert weakest([Evidence.PROVED, assumed.evidence]) is Evidence.ASSUMED
-    bound = assumed.sums.bound(5.0, [1.0], [2.0])
-    np.testing.assert_allclose(bound, [10.0, 0.9 * (10.0 + 3.0 + 8.0)])
-    with pytest.raises(OptionError, match="eta"):
-        Detectability.assumed(eta=1.0, c_p=2.0, c_w=3.0, c_v=4.0)

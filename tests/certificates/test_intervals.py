@@ -53,18 +53,9 @@ def of_sympy():
     return qpmhe.from_sympy(rate, [sympy.Max(a, a / 2)], [a, b], dt=0.1)
 
 
-def of_jax():
-    jnp = pytest.importorskip("jax.numpy")
-    return qpmhe.from_jax(
-        lambda x: jnp.array([x[1], 1.5 * (1.0 - x[0] ** 2) * x[1] - jnp.tanh(x[0])]),
-        lambda x: jnp.maximum(x[0], 0.5 * x[0]), dt=0.1, n=2, p=1,
-    )
-
-
 KINDS = {
     "casadi": lambda: of_casadi("SX"), "casadi of matrices": lambda: of_casadi("MX"),
-    "sympy": of_sympy, "jax": of_jax,
-    "numpy through a copy": lambda: of_numpy().copy(traced=True),
+    "sympy": of_sympy, "numpy through a copy": lambda: of_numpy().copy(traced=True),
 }
 
 
