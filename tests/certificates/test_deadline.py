@@ -56,10 +56,10 @@ def test_proofs_end_with_the_time(ticking):
     assert "time was over" in found.notes[0]
 
 
-@pytest.mark.parametrize("question", QUESTIONS)
-def test_search_without_time_says_so(ticking, question):
-    with pytest.raises(OutOfTimeError, match="more seconds"):
-        QUESTIONS[question](linear(0.5, 1.0), unit_box(1), seconds=0.5)
+def test_search_without_time_says_so(ticking):
+    for question in QUESTIONS.values():
+        with pytest.raises(OutOfTimeError, match="more seconds"):
+            question(linear(0.5, 1.0), unit_box(1), seconds=0.5)
 
 
 def test_loading_the_solvers_is_not_charged_to_the_search(monkeypatch):
