@@ -199,7 +199,7 @@ def test_sizes_that_do_not_fit_are_named(four):
         (lambda: four.entering(box(-1.0, 1.0)), ShapeError, "dimension 1"),
         (lambda: four.entering(0.1, qpmhe.Box([-1.0, -np.inf], [1.0, 1.0])), SetError, "unbounded"),
         (lambda: four.radii(4, 1.0, ones), ShapeError, "3 samples; expected 4"),
-        (lambda: four.limit(ones), OptionError, "of single samples"),
+        (lambda: four.limit(ones), OptionError, "sample by sample"),
         (lambda: four.initial([1.0, 2.0]), ShapeError, "initial_error has shape"),
         (lambda: four.initial(ones), ShapeError, "several samples"),
         (lambda: four.initial(-1.0), OptionError, "initial_error"),
