@@ -3,10 +3,10 @@
 import numpy as np
 
 import qpmhe
+from qpmhe.certificates import certify, certify_detectability, certify_observer, synthesise_gain
 
 REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])
 PENDULUM = qpmhe.Box([-3.0, -10.0], [3.0, 10.0])
-TANKS = qpmhe.Box([0.2, 0.2], [2.0, 2.0])
 
 
 def linear(A, C, **options):
@@ -30,6 +30,18 @@ def unit_box(n):
 
 def unit_cost(n=1, p=1):
     return qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=np.eye(p))
+
+
+# What may be asked of a scalar system on a region.
+GAIN = qpmhe.Luenberger([[0.1]])
+QUESTIONS = {
+    "detectability": certify_detectability,
+    "observer": lambda system, region, **how: certify_observer(system, GAIN, region, **how),
+    "gain": lambda system, region, **how: synthesise_gain(system, region, **how).stability,
+    "certificate": lambda system, region, **how: certify(
+        system, GAIN, unit_cost(), horizon=2, region=region, **how
+    ),
+}
 
 
 def two_tanks():

@@ -9,9 +9,8 @@ import pytest
 import qpmhe
 from qpmhe.certificates import search as search_module
 from qpmhe.certificates.contraction import certify_detectability, certify_observer
-from qpmhe.certificates.evidence import Evidence, NotCertifiedError, weakest
+from qpmhe.certificates.evidence import Evidence, NotCertifiedError
 from qpmhe.certificates.inequalities import Form, Matrices, definite
-from qpmhe.certificates.properties import Detectability
 from qpmhe.certificates.sdp import Answer, Program
 from qpmhe.errors import OptionError
 
@@ -64,7 +63,7 @@ def test_nonlinear_output_takes_output_injection():
     assert any("not affine" in note for note in found.notes)
     sharp = 0.8 / 0.7 / 0.6
     assert sharp < found.c_v < 1.05 * sharp
-    assert attack_detectability(system, found.region, found.sums, trials=500) <= 1.0 + RELATIVE
+    assert attack_detectability(system, found.region, found.sums, trials=200) <= 1.0 + RELATIVE
 
 
 def test_what_holds_at_every_state_need_not_hold_for_averages():
@@ -98,11 +97,14 @@ def test_what_is_refused_says_why():
         certify_detectability(qpmhe.models.batch_reactor()[0], REACTOR, eta=0.5)
     assert 0.6 < caught.value.smallest_rate < 0.75
     hidden = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
-    with pytest.raises(NotCertifiedError, match=r"1\.1.*not appear in the out.*measure an out"):
+    with pytest.raises(NotCertifiedError, match=r"eigenvalue 1\.1.*not appear in.*measure an"):
         certify_detectability(hidden, unit_box(2))
-    for eta in (0.0, 1.0, -0.5, math.nan, True, "fast"):
+    for eta in (0.0, 1.0, math.nan, True, "fast"):
         with pytest.raises(OptionError, match="eta is"):
             certify_detectability(hidden, unit_box(2), eta=eta)
+    for seconds in (0.0, math.nan, True, "long"):
+        with pytest.raises(OptionError, match="seconds is"):
+            certify_detectability(hidden, unit_box(2), seconds=seconds)
 
 
 def test_what_intervals_cannot_run_is_sampled_with_the_reason():
@@ -166,13 +168,3 @@ def test_rates_of_linear_systems_are_reproduced(A, C, L):
         assert ask(true * (1.0 + 1e-6)).evidence is Evidence.PROVED
         with pytest.raises(NotCertifiedError):
             ask(true * (1.0 - 1e-12))
-
-
-def test_assumed_constants_are_labelled():
-    assumed = Detectability.assumed(eta=0.9, c_p=2.0, c_w=3.0, c_v=4.0)
-    assert assumed.evidence is Evidence.ASSUMED
-    assert weakest([Evidence.PROVED, assumed.evidence]) is Evidence.ASSUMED
-    bound = assumed.sums.bound(5.0, [1.0], [2.0])
-    np.testing.assert_allclose(bound, [10.0, 0.9 * (10.0 + 3.0 + 8.0)])
-    with pytest.raises(OptionError, match="eta"):
-        Detectability.assumed(eta=1.0, c_p=2.0, c_w=3.0, c_v=4.0)

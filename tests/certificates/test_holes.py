@@ -14,6 +14,8 @@ import qpmhe
 from qpmhe.certificates.enclosures import SmoothModel
 from qpmhe.certificates.regions import bounded_region
 
+from .helpers import scalar, unit_box
+
 # All these functions are 0.5 x, but for a step of width 2e-4 at 0.3, which no sample meets.
 PLACE, WIDTH = 0.3, 2e-4
 TABLE = {}
@@ -83,15 +85,13 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("way", REFUSED)
 @pytest.mark.parametrize("letter", ["f", "h"])
-def test_what_looks_for_symbols_is_not_proved(way, letter):
-    function, word = REFUSED[way]
-    system = qpmhe.System(**({"f": lambda x: 0.5 * x, "h": lambda x: x} | {letter: function}),
-                          n=1, p=1)
-    model = SmoothModel(system, bounded_region(system, qpmhe.Box([-1.0], [1.0])))
-    assert word in model.reason
-    assert model.reason
+def test_what_looks_for_symbols_is_not_proved(letter):
+    for way, (function, word) in REFUSED.items():
+        system = scalar(**{letter: function})
+        model = SmoothModel(system, bounded_region(system, unit_box(1)))
+        assert word in model.reason, way
+        assert model.reason, way
 
 
 def of_numbers(x):
@@ -111,9 +111,8 @@ def of_numbers(x):
     lambda x: np.interp(x, [-1.0, PLACE - WIDTH, PLACE + WIDTH, 1.0], [0.0, 0.0, 6 * WIDTH, 0.0]),
 ])
 def test_a_step_that_no_sample_meets_is_enclosed(f):
-    system = qpmhe.System(f, lambda x: x, n=1, p=1)
-    region = bounded_region(system, qpmhe.Box([-1.0], [1.0]))
-    model = SmoothModel(system, region)
+    system = scalar(f)
+    model = SmoothModel(system, bounded_region(system, unit_box(1)))
     assert model.reason == ""
     for low, high in ((-1.0, 1.0), (PLACE - 1e-6, PLACE + 1e-6)):
         corners, error = model.enclose(np.array([[low]]), np.array([[high]])).corners()
@@ -121,10 +120,8 @@ def test_a_step_that_no_sample_meets_is_enclosed(f):
 
 
 def test_what_jumps_between_samples_is_known_to():
-    system = qpmhe.System(
-        lambda x: 0.5 * x + np.where(np.isclose(x, PLACE), 1.0, 0.0), lambda x: x, n=1, p=1
-    )
-    region = bounded_region(system, qpmhe.Box([-1.0], [1.0]))
+    system = scalar(lambda x: 0.5 * x + np.where(np.isclose(x, PLACE), 1.0, 0.0))
+    region = bounded_region(system, unit_box(1))
     model = SmoothModel(system, region)
     assert model.reason == ""
     assert "jump" in model.obstacle(region.lower, region.upper)

@@ -101,7 +101,7 @@ def test_no_run_exceeds_a_bound(make, pytestconfig):
 
 def test_the_inequality_holds_between_states():
     system, sizes = qpmhe.models.van_der_pol().system, Sizes(0.01, 0.02)
-    plan = design(system, qpmhe.Box([-2.5, -3.0], [2.5, 3.0]), sizes=sizes)
+    plan = design(system, qpmhe.Box([-1.5, -1.5], [1.5, 1.5]), sizes=sizes, discount=0.9)
     rng, form = np.random.default_rng(0), plan.form
     x = plan.region.sample(4000, rng)[:, :2]
     one, other = x[rng.integers(len(x), size=(2, 20_000))]
@@ -178,7 +178,7 @@ def test_what_was_not_certified_is_no_bound_for_a_window(double):
     )
     plan = design(
         system, qpmhe.Box([-2.0], [2.0]), inputs=qpmhe.Box([-1.0], [1.0]), sizes=Sizes(0.1, 0.1),
-        horizon=4,
+        discount=0.6, horizon=4,
     )
     assert plan.horizon == 4
     mhe = estimator(plan, qpmhe.Luenberger([[0.5]]), horizon=3)

@@ -116,15 +116,6 @@ def test_each_event_ends_the_bound_at_its_sample(certificate, event):
         assert np.isnan(band.error[sample + 1 :]).all()
 
 
-def test_a_candidate_that_starts_again_has_no_such_bound(certificate):
-    mhe = estimator(certificate, candidate="reinitialized")
-    reading = followed(certificate, mhe).check(mhe.update([0.1]))
-    assert "restarts at each sample" in reading.reason
-    run = estimator(certificate, candidate="reinitialized").run(record()[1])
-    band = certificate.observer_bound.along(run, initial_error=START)
-    assert (band.lost, band.reason) == (0, reading.reason)
-
-
 def test_weights_do_not_matter_to_the_observer_and_wrong_sizes_are_found_out(certificate):
     mhe, other = (estimator(certificate) for _ in range(2))
     watch, same = followed(certificate, mhe), followed(certificate, other)
@@ -239,7 +230,7 @@ def test_a_projection_in_the_certified_metric_keeps_all_bounds():
     assert paper.kappa_bar != paper.kappa
     spread = np.sqrt(np.linalg.cond(certificate.observer_bound.metric))
     projected = more = 0
-    for seed in range(15):
+    for seed in range(8):
         states, ys = inside(certificate, seed)
         mhe = estimator(certificate, initial_state=[0.0, 0.5])
         watch = Monitor(certificate, mhe, initial_error=states[0] - mhe.observer_state)
@@ -267,7 +258,7 @@ def test_a_projection_in_the_certified_metric_keeps_all_bounds():
             for i, moved in enumerate(np.linalg.norm(steps, axis=1)):
                 t = estimate.time - len(steps) + 1 + i
                 assert moved <= paper.kappa_bar * paper.L_bar * newest_sum(paper, start, signals, t)
-    assert projected > 30
+    assert projected > 15
     assert more > 0  # kappa does not hold of these corrections, whatever the metric makes of it
 
 
@@ -420,8 +411,14 @@ def test_what_the_theorem_does_not_cover_leaves_the_observers_bound(certificate)
         mhe = estimator(certificate, **options)
         watch = Monitor(certificate, mhe, initial_error=START)
         assert words in watch.barred
-        reading = watch.check(mhe.update(record()[1][0]))
-        assert (reading.lost is None) == ("candidate" not in options)
+        ys, again = record()[1], "candidate" in options
+        reading = watch.check(mhe.update(ys[0]))
+        assert (reading.lost is not None) == again
+        if again:  # a run alone shows it, too
+            assert "restarts at each sample" in reading.reason
+            mhe.reset()
+            band = certificate.observer_bound.along(mhe.run(ys), initial_error=START)
+            assert (band.lost, band.reason) == (0, reading.reason)
     system = scalar(lambda x: 0.8 * x)
     certificate = certify(  # a prior from the observer has its lower bound
         system, qpmhe.SteadyStateKalman(system, [0.0], disturbance=0.5, noise=1.0),

@@ -15,6 +15,7 @@ from qpmhe.certificates.sizes import lengths_of
 from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError
 
 from . import helpers
+from .attacks import RELATIVE
 from .helpers import box, unit_cost
 
 STEPS = 60
@@ -75,10 +76,11 @@ def test_no_adversary_exceeds_the_bound(made, pytestconfig):
     ))
     u, alive = np.zeros((runs, 0)), np.ones(runs, bool)
     b = np.array([bound.initial(e) for e in x - z])
-    quiet, entering = b == 0.0, bound.entering()
+    quiet, entering, sums = b == 0.0, bound.entering(), bound.stability.sums
+    paper, share = sums.initial * np.linalg.norm(x - z, axis=1), 0.0  # (eq:RGES)
     for _ in range(STEPS):
         f, h, ahead = system.f.batch(x, u), system.h.batch(x, u), system.f.batch(z, u)
-        best, chosen = np.full(runs, -1.0), np.array([f, ahead])
+        best, chosen, added = np.full(runs, -1.0), np.array([f, ahead]), np.zeros(runs)
         for w, v in pairs:
             after, following = f + w, ahead + (h + v - system.h.batch(z, u)) @ K.T
             e = after - following
@@ -87,13 +89,17 @@ def test_no_adversary_exceeds_the_bound(made, pytestconfig):
             better = size > best
             chosen[:, better] = after[better], following[better]
             best = np.where(better, size, best)
+            signals = np.linalg.norm(w) * sums.disturbance + np.linalg.norm(v) * sums.noise
+            added = np.where(better, signals, added)
         alive &= (best >= 0.0) & bound.region.contains(z)
         x, z = chosen
         b = np.array([bound.advanced(each, entering) for each in b])
+        paper = sums.rate * (paper + added)
         x[~alive] = z[~alive] = 0.5 * (low + high)  # those that left are counted no more
         e = (x - z)[alive]
         assert np.all(bound.length(e) * (1.0 - 1e-12) <= b[alive])
         assert np.all(np.abs(e) <= bound.components(b[alive]))
+        share = max(share, np.max(np.linalg.norm(e, axis=1) / paper[alive]))
         inside = alive & bound.region.contains(x)
         lower, upper = bound.around(b[inside], z[inside])
         assert np.all((lower <= x[inside]) & (x[inside] <= upper))
@@ -101,6 +107,7 @@ def test_no_adversary_exceeds_the_bound(made, pytestconfig):
         far = bound.farthest(b[inside], other - z[inside], z[inside])
         assert np.all(np.linalg.norm(other - x[inside], axis=1) <= far)
     assert alive.mean() > 0.2
+    assert 0.4 < share <= 1.0 + RELATIVE
     assert bound.limit() / np.sqrt(best[alive & quiet]).max() < 4.0
 
 
@@ -192,7 +199,7 @@ def test_sizes_that_do_not_fit_are_named(four):
         (lambda: four.entering(box(-1.0, 1.0)), ShapeError, "dimension 1"),
         (lambda: four.entering(0.1, qpmhe.Box([-1.0, -np.inf], [1.0, 1.0])), SetError, "unbounded"),
         (lambda: four.radii(4, 1.0, ones), ShapeError, "3 samples; expected 4"),
-        (lambda: four.limit(ones), OptionError, "of single samples"),
+        (lambda: four.limit(ones), OptionError, "sample by sample"),
         (lambda: four.initial([1.0, 2.0]), ShapeError, "initial_error has shape"),
         (lambda: four.initial(ones), ShapeError, "several samples"),
         (lambda: four.initial(-1.0), OptionError, "initial_error"),

@@ -181,6 +181,10 @@ def test_inputs_of_the_wrong_length():
         ({"inputs": lambda t, x: x}, OptionError, "the system has 0 inputs"),
         ({"of": system(1)}, OptionError, "inputs is None, and the system has 1 inputs"),
         ({"resolution": [-0.1]}, OptionError, "resolution is"),
+        (
+            {"region": qpmhe.Box([0.0] * 2, [1.0] * 2)}, OptionError,
+            "region is .* a set of dimension 1",
+        ),
         ({"resolution": [0.1, 0.1]}, ShapeError, "resolution has shape"),
         (
             {"of": system(states=qpmhe.Box([0.0], [0.4]))},
