@@ -53,13 +53,10 @@ def test_a_cell_is_the_run_of_an_estimator_made_by_hand(qps, cap, backend, start
     settled = round(qpmhe.models.batch_reactor().scenario.settling_time / 0.1)
     assert 0 < settled < STEPS
     relative = (errors / np.sqrt(((states - initial) ** 2).mean(axis=0))) ** 2
-    root = {
-        "rmse": np.sqrt(relative.mean()), "rmse_settled": np.sqrt(relative[settled:].mean()),
-        "rmse_states": np.sqrt((errors**2).mean(axis=0)),
-        "rmse_settled_states": np.sqrt((errors[settled:] ** 2).mean(axis=0)),
-    }
-    for name, value in root.items():
-        assert row[name] == pytest.approx(value, rel=1e-12)
+    for suffix, first in (("", 0), ("_settled", settled)):
+        assert row[f"rmse{suffix}"] == pytest.approx(np.sqrt(relative[first:].mean()), rel=1e-12)
+        by_state = np.sqrt((errors[first:] ** 2).mean(axis=0))
+        assert row[f"rmse{suffix}_states"] == pytest.approx(by_state, rel=1e-12)
     status = qpmhe.Status
     failed = np.mean([
         not e.improved and any(f in e.status for f in (status.SOLVER_FAILED, status.NO_DECREASE))

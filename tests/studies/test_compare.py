@@ -59,14 +59,21 @@ def study_file(tmp_path, **options):
     return file
 
 
-def test_a_study_file_names_store_and_report(tmp_path, shown):
-    file, store = study_file(tmp_path), tmp_path / "mine.sqlite"
-    command("study", file, "--jobs", 1)
-    assert len(Store(store).frame()) == 2
+def test_a_study_file_names_store_and_report_and_failed_cells_are_reported(tmp_path, shown):
+    file, store = study_file(tmp_path, models=[f"{ODD}:raises"]), tmp_path / "mine.sqlite"
+    text = command("study", file, "--jobs", 1)
+    assert "1 of 2 cells failed; the report gives the reasons." in text
     assert "2 of 2 cells were there already" in command("study", file, "--out", tmp_path / "there")
-    assert shown == [(store, tmp_path / "mine-report"), (store, tmp_path / "there")]
     command("export", store, tmp_path / "cells.csv")
     assert len(pd.read_csv(tmp_path / "cells.csv")) == 2
+    file = study_file(tmp_path, models=[f"{ODD}:raises"], seeds=[1])
+    words = "no cell of the study finished, 1 failed;.*ZeroDivisionError.*--retry-failed"
+    with pytest.raises(QpmheError, match=words):  # the cell of seed 0 does not count
+        command("study", file, "--store", store, "--jobs", 1)
+    # The report is there all the same.
+    outs = [tmp_path / name for name in ("mine-report", "there")]
+    assert shown[:2] == [(store, out) for out in outs]
+    assert len(shown) == 3
 
 
 def test_what_the_report_needs_is_missed_before_any_cell_runs(tmp_path, monkeypatch):
@@ -78,17 +85,6 @@ def test_what_the_report_needs_is_missed_before_any_cell_runs(tmp_path, monkeypa
         with pytest.raises(InvalidInputError, match=r"the report needs itables.*qpmhe\[studies\]"):
             command(*words, "--out", tmp_path / "out")
     assert [one.name for one in tmp_path.iterdir()] == ["mine.toml"]
-
-
-def test_failed_cells_are_reported_and_are_an_error_where_there_are_no_others(tmp_path, shown):
-    store = tmp_path / "mine.sqlite"
-    text = command("study", study_file(tmp_path, models=[f"{ODD}:raises"]), "--jobs", 1)
-    assert "1 of 2 cells failed; the report gives the reasons." in text
-    file = study_file(tmp_path, models=[f"{ODD}:raises"], seeds=[1])
-    words = "no cell of the study finished, 1 failed;.*ZeroDivisionError.*--retry-failed"
-    with pytest.raises(QpmheError, match=words):  # the cell of seed 0 does not count
-        command("study", file, "--store", store, "--jobs", 1)
-    assert len(shown) == 2  # the report is there all the same
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])

@@ -145,20 +145,16 @@ def test_limitations_and_failures_follow_the_data():
     assert "fewer runs" in after
 
 
-def test_spreads_are_quantiles_of_all_steps():
-    rows = frame().query("horizon == 10")
-    found = {(one.backend, one.cap): one for one in spreads(rows)}
-    mine = rows[(rows.backend == "daqp") & (rows.solver_iterations == 2)]
-    times = np.concatenate(list(mine.times)).astype(float)
-    one = found["daqp", "2"]
-    assert one.steps == 120 == times.size
-    assert one.quantiles == pytest.approx(
-        np.quantile(times, (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)).tolist()
-    )
-
-
-def test_profile_against_its_definition():
+def test_spreads_and_profile_against_their_definitions():
     rows = frame()
+    (one,) = (one for one in spreads(rows.query("horizon == 10"))
+              if (one.backend, one.cap) == ("daqp", "2"))
+    mine = rows.query("horizon == 10 and backend == 'daqp' and solver_iterations == 2")
+    times = np.concatenate(list(mine.times)).astype(float)
+    assert one.steps == 120 == times.size
+    shares = (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
+    assert one.quantiles == pytest.approx(np.quantile(times, shares).tolist())
+
     found = profiles(rows)
     assert [(one.backend, one.problems) for one in found] == [
         ("daqp", 6), ("osqp", 6), ("proxqp", 6)]
@@ -175,6 +171,12 @@ def test_profile_against_its_definition():
             assert (one.ratios <= tau).sum() / one.problems == share
     assert profiles(rows.query("seed == 0 and horizon == 10")) == []  # one problem
     assert profiles(rows.assign(cost_ratio=2.0)) == []  # nothing is solved
+
+
+def test_thirty_backends_look_different():
+    drawn = styles([f"solver {k:02d}" for k in range(30)]).values()
+    assert len({(one.color, one.symbol) for one in drawn}) == 31
+    assert len({(one.color, one.dash) for one in drawn}) == 31
 
 
 def test_numbers_durations_and_shares_in_words():
@@ -206,12 +208,6 @@ def test_a_menu_entry_for_each_state():
         )
     (one, *_) = cases(rows)
     assert Part(one, frame(), None).state_labels() == ["state 1", "state 2"]  # without names
-
-
-def test_thirty_backends_look_different():
-    drawn = styles([f"solver {k:02d}" for k in range(30)])
-    assert len({(one.color, one.symbol) for one in drawn.values()}) == 31
-    assert len({(one.color, one.dash) for one in drawn.values()}) == 31
 
 
 @pytest.mark.parametrize("inches", [None, 3.3])
