@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-import time
 from collections.abc import Callable
 from dataclasses import fields
 
@@ -40,10 +39,6 @@ def crashes() -> Example:
 
 def is_killed() -> Example:
     return _odd(lambda: os.kill(os.getpid(), 9))
-
-
-def is_slow() -> Example:
-    return _odd(lambda: time.sleep(3.1))
 
 
 def hangs() -> Example:

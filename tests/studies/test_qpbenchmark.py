@@ -15,8 +15,6 @@ from qpmhe.studies.qpbenchmark_set import export_qpbenchmark
 from qpmhe_solvers import QP, create
 from qpmhe_solvers.files import dump
 
-ENTRIES = ("P", "q", "G", "h", "A", "b", "lb", "ub")
-
 
 @pytest.fixture
 def folder(tmp_path):
@@ -30,35 +28,32 @@ def folder(tmp_path):
     return inside
 
 
+def missed(problem, x):
+    found = [np.zeros(1)]
+    for matrix, side, size in (
+        (problem.G, problem.h, np.asarray), (problem.A, problem.b, np.abs),
+        (-np.eye(x.size), None if problem.lb is None else -problem.lb, np.asarray),
+        (np.eye(x.size), problem.ub, np.asarray),
+    ):
+        if side is not None:
+            found.append(size(matrix @ x - side))
+    return np.concatenate(found).max()
+
+
 @pytest.mark.parametrize("case", CASES)
-def test_an_exported_problem_has_the_same_optimum(case, tmp_path):
+def test_an_exported_problem_has_the_same_optimum_objective_and_constraints(case, tmp_path):
     qp, dense = make(**CASES[case])
     exported = export_qpbenchmark(dump(qp, tmp_path / "one.npz"), tmp_path / "set")
     problem = qpsolvers.Problem.load(str(exported.problems[0]))
-    for name in ENTRIES:
+    for name in ("P", "q", "G", "h", "A", "b", "lb", "ub"):
         value = getattr(problem, name)
         assert value is None or (value.size > 0 and np.isfinite(value).all()), name
-    solution = qpsolvers.solve_problem(problem, "quadprog")
-    expected = dense.minimiser()
+    solution, expected = qpsolvers.solve_problem(problem, "quadprog"), dense.minimiser()
     np.testing.assert_allclose(solution.x, expected, atol=1e-7 * (1 + np.abs(expected).max()))
-    # And its objective and constraints are the same anywhere.
     for x in np.random.default_rng(0).standard_normal((20, qp.size)):
         value = 0.5 * x @ problem.P @ x + problem.q @ x
         assert value == pytest.approx(dense.objective(x), rel=1e-12)
         assert missed(problem, x) == pytest.approx(dense.violation(x), rel=1e-12, abs=1e-12)
-
-
-def missed(problem, x):
-    parts = [np.zeros(1)]
-    if problem.G is not None:
-        parts.append(problem.G @ x - problem.h)
-    if problem.A is not None:
-        parts.append(np.abs(problem.A @ x - problem.b))
-    if problem.lb is not None:
-        parts.append(problem.lb - x)
-    if problem.ub is not None:
-        parts.append(x - problem.ub)
-    return np.concatenate(parts).max()
 
 
 def test_a_side_of_the_bounds_that_is_finite_is_given_as_such(tmp_path):
@@ -111,12 +106,7 @@ def test_what_cannot_be_exported_is_reported(folder, tmp_path):
         export_qpbenchmark(folder, new, matrices="banded")
 
 
-@pytest.mark.parametrize(("matrices", "sparse_only"), [("sparse", True), ("dense", False)])
-def test_the_script_yields_the_problems_in_order(
-    matrices, sparse_only, folder, tmp_path, monkeypatch
-):
-    exported = export_qpbenchmark(folder, tmp_path / "set", matrices=matrices, title='the "set"')
-
+def test_the_script_yields_the_problems_in_order(folder, tmp_path, monkeypatch):
     class Problem:
         @staticmethod
         def load(path):
@@ -125,11 +115,13 @@ def test_the_script_yields_the_problems_in_order(
 
     stand_in = types.SimpleNamespace(TestSet=object, Problem=Problem)
     monkeypatch.setitem(sys.modules, "qpbenchmark", stand_in)
-    # qpbenchmark looks for the class by the name of the file.
-    test_set = runpy.run_path(str(exported.script))["MheQpbenchmark"]()
-    assert list(test_set) == [(matrices, str(path)) for path in exported.problems]
-    assert (test_set.title, test_set.sparse_only) == ('the "set"', sparse_only)
-    assert test_set.description.startswith(f"{len(CASES)} QPs from")
+    for kind in ("sparse", "dense"):
+        exported = export_qpbenchmark(folder, tmp_path / kind, matrices=kind, title='the "set"')
+        # qpbenchmark looks for the class by the name of the file.
+        test_set = runpy.run_path(str(exported.script))["MheQpbenchmark"]()
+        assert list(test_set) == [(kind, str(path)) for path in exported.problems]
+        assert (test_set.title, test_set.sparse_only) == ('the "set"', kind == "sparse")
+        assert test_set.description.startswith(f"{len(CASES)} QPs from")
 
 
 @pytest.mark.slow

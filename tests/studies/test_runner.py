@@ -23,13 +23,19 @@ from qpmhe.studies.store import Writer
 
 from .commands import command
 
+try:
+    import distributed
+except ImportError:
+    distributed = None
+
 ODD = "tests/studies/odd_models.py"
 SMALL = {"backends": ["banded"], "qps": [0, 1], "seeds": 2, "steps": 12}
-DEATHS = [
-    ("crashes", "the process that ran it died, twice (SIGSEGV", 60.0),
-    ("is_killed", "the process that ran it died, twice", 60.0),
-    ("hangs", "out of time: the process that ran it did not answer", 6.0),
-]
+DEATHS = {
+    "crashes": "the process that ran it died, twice (SIGSEGV",
+    "is_killed": "the process that ran it died, twice",
+    "hangs": "out of time: the process that ran it did not answer",
+    "raises": "ZeroDivisionError: division by zero",
+}
 
 
 @pytest.fixture
@@ -77,71 +83,6 @@ def test_a_study_runs_once_and_more_cells_are_added(path, monkeypatch):
     assert handed == []
 
 
-def test_errors_of_a_heading_that_wraps(path):
-    """Two crossings in the record: whole turns are no errors, nor jumps in the figures."""
-    grid = {"models": ["vehicle"], "backends": ["banded"], "qps": [0, 1], "seeds": 1, "steps": 100}
-    run(Study(**grid, measure="accuracy", covariances=True), path, jobs=1, progress=False)
-    store = Store(path)
-    for row in store.frame().itertuples():
-        assert row.rmse_states[2] < 0.1
-        assert row.nees < 30.0
-        drawn = store.trajectory(row.key)
-        assert np.abs(np.diff(drawn["states"][:, 2])).max() > 6.0
-        assert np.abs(drawn["estimates"] - drawn["states"])[:, 2].max() < 1.0
-
-
-def test_accuracy_and_time_are_measured_apart(path):
-    run(Study(**SMALL, measure="accuracy"), path, progress=False)
-    frame = Store(path).frame()
-    assert frame["times"].isna().all()
-    run(Study(**SMALL, measure="time"), path, progress=False)
-    timed = Store(path).frame()
-    assert list(timed["key"]) == list(frame["key"])
-    assert timed["time_median"].gt(0).all()
-    assert list(timed["cost_ratio"]) == list(frame["cost_ratio"])
-    assert not timed["shared"].any()  # one at a time, as nothing else was asked for
-    assert Store(path).meta()["studies"][1]["jobs"] == 1
-    more = Study(**{**SMALL, "seeds": [7, 8]}, measure="time")
-    shared = run(more, path, jobs=2, progress=False).frame().set_index("seed")["shared"]
-    assert shared[[7, 8]].all()
-
-
-@pytest.mark.parametrize(("model", "words", "timeout"), DEATHS)
-def test_a_cell_that_ends_its_process_is_a_row(path, model, words, timeout):
-    ends_alone(path, model, words, timeout, jobs=2)
-
-
-def ends_alone(path, model, words, timeout, **where):
-    study = Study(
-        models=[f"{ODD}:{model}"], backends=["banded"], qps=[1], seeds=4, steps=12,
-        cell_timeout=timeout,
-    )
-    frame = run(study, path, progress=False, **where).frame().set_index("seed")
-    assert sorted(frame.index) == [0, 1, 2, 3]
-    assert frame["outcome"].to_dict() == {0: "done", 1: "failed", 2: "done", 3: "done"}
-    assert words in frame["reason"][1]
-
-
-def test_cells_that_fail_stop_nothing_and_can_be_tried_again(path, monkeypatch):
-    study = Study(
-        models=[f"{ODD}:is_slow", f"{ODD}:raises"], backends=["banded"], qps=[1], seeds=2,
-        steps=12, cell_timeout=3.0,
-    )
-    out = console()
-    frame = run(study, path, progress=out).frame()
-    reasons = {row.model: row.reason for row in frame.itertuples() if row.outcome == "failed"}
-    assert reasons == {
-        f"{ODD}:is_slow": "out of time: 1 of 12 steps were done.",
-        f"{ODD}:raises": "ZeroDivisionError: division by zero",
-    }
-    assert "2 failed" in out.file.getvalue()
-    handed = counted(monkeypatch)
-    run(study, path, progress=False)
-    assert handed == []
-    run(study, path, progress=False, retry_failed=True)
-    assert [key[-6:] for key in handed] == ["seed=1"] * 2
-
-
 def test_a_backend_that_crashes_is_isolated_and_the_qp_is_kept(path, tmp_path):
     banded = qpmhe_solvers.backend("banded")
     mine = qpmhe_solvers.Backend("mine", lambda options: banded.factory(options), "banded")
@@ -186,48 +127,91 @@ def test_a_full_disk_in_the_middle_is_reported_and_the_same_call_goes_on(path, m
     assert list(after["finished"][: len(before)]) == list(before["finished"])
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"jobs": 0}, OptionError, "jobs is 0"),
-        ({"jobs": 2, "scheduler": "tcp://127.0.0.1:1"}, OptionError, "leave it out"),
-        ({"progress": 3}, OptionError, "progress is 3"),
-        ({"study": "study.toml"}, StudyError, r"expected a qpmhe\.studies\.Study"),
-        ({"missing": "joblib"}, InvalidInputError, r"pip install 'qpmhe\[studies\]'"),
-        ({"missing": "distributed", "scheduler": "tcp://127.0.0.1:1"}, InvalidInputError,
-         r"pip install 'qpmhe\[dask\]'"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(path, monkeypatch, options, error, words):
-    if (module := options.pop("missing", None)) is not None:
-        monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(error, match=words):
-        run(**{"study": Study(**SMALL), "store": path, "progress": False} | options)
+def ends_alone(path, models, **where):
+    """Of two cells of each model, that of seed 1 ends its process; reasons by model."""
+    study = Study(
+        models=[f"{ODD}:{model}" for model in models], backends=["banded"], qps=[1], seeds=2,
+        steps=12, cell_timeout=6.0,
+    )
+    frame = run(study, path, **{"progress": False} | where).frame()
+    assert frame.set_index("seed")["outcome"].groupby("seed").agg(set).to_dict() == {
+        0: {"done"}, 1: {"failed"}}
+    failed = frame[frame["seed"] == 1]
+    for model, reason in zip(failed["model"], failed["reason"], strict=True):
+        assert DEATHS[model.rpartition(":")[2]] in reason
+    return study
 
 
-try:
-    import distributed
-except ImportError:
-    distributed = None
+@pytest.mark.parametrize("model", ["crashes", "is_killed", "hangs"])
+def test_cells_that_fail_or_end_their_process_are_rows_and_can_be_tried_again(
+    path, monkeypatch, model
+):
+    out = console()
+    study = ends_alone(path, (model, "raises"), jobs=2, progress=out)
+    assert "2 failed" in out.file.getvalue()
+    handed = counted(monkeypatch)
+    run(study, path, progress=False)
+    assert handed == []
+    again = Study(**{**SMALL, "models": [f"{ODD}:raises"], "qps": [1]})
+    run(again, path, jobs=1, progress=False, retry_failed=True)
+    assert [key[-6:] for key in handed] == ["seed=1"]
+
+
+def test_accuracy_and_time_are_measured_apart_and_whole_turns_are_no_errors(path):
+    """Two crossings of a heading that wraps are no errors, nor jumps in the figures."""
+    options = {"models": ["vehicle"], "backends": ["banded"], "qps": [0, 1], "steps": 100}
+    run(Study(**options, seeds=1, measure="accuracy", covariances=True), path, progress=False)
+    store = Store(path)
+    frame = store.frame()
+    assert frame["times"].isna().all()
+    for row in frame.itertuples():
+        assert row.rmse_states[2] < 0.1
+        assert row.nees < 30.0
+        drawn = store.trajectory(row.key)
+        assert np.abs(np.diff(drawn["states"][:, 2])).max() > 6.0
+        assert np.abs(drawn["estimates"] - drawn["states"])[:, 2].max() < 1.0
+    run(Study(**options, seeds=1, measure="time"), path, progress=False)
+    timed = store.frame()
+    assert list(timed["key"]) == list(frame["key"])
+    assert timed["time_median"].gt(0).all()
+    assert list(timed["cost_ratio"]) == list(frame["cost_ratio"])
+    assert not timed["shared"].any()  # one at a time, as nothing else was asked for
+    assert store.meta()["studies"][1]["jobs"] == 1
+    run(Study(**{**options, "steps": 12}, seeds=[7, 8], measure="time"), path, jobs=2,
+        progress=False)
+    assert store.frame().set_index("seed")["shared"][[7, 8]].all()
+
+
+def test_what_does_not_fit_is_refused(path, monkeypatch):
+    monkeypatch.setattr(runner, "_CONNECT", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # it accepts, and never answers
+        there = [{"scheduler": one} for one in (
+            "nonsense", "", 8786, f"tcp://127.0.0.1:{silent.getsockname()[1]}")]
+        for options, error, words in (
+            ({"jobs": 0}, OptionError, "jobs is 0"),
+            ({"jobs": 2, "scheduler": "tcp://127.0.0.1:1"}, OptionError, "leave it out"),
+            ({"progress": 3}, OptionError, "progress is 3"),
+            ({"study": "study.toml"}, StudyError, r"expected a qpmhe\.studies\.Study"),
+            *((one, StudyError, f"the scheduler is {one['scheduler']!r}.* gives no Dask workers "
+               ".*such as tcp://10") for one in there if distributed),
+            ({"missing": "joblib"}, InvalidInputError, r"pip install 'qpmhe\[studies\]'"),
+            ({"missing": "distributed", **there[0]}, InvalidInputError,
+             r"pip install 'qpmhe\[dask\]'"),
+        ):
+            if (module := options.pop("missing", None)) is not None:
+                monkeypatch.setitem(sys.modules, module, None)
+            with pytest.raises(error, match=words):
+                run(**{"study": Study(**SMALL), "store": path, "progress": False} | options)
+    assert not path.exists()
+
 
 # What Dask and its own dependencies warn of is theirs.
-on_dask = [
-    pytest.mark.filterwarnings("ignore"),
-    pytest.mark.skipif(distributed is None, reason="Dask is not installed"),
-]
-
-
-def marked(test):
-    """A test of the cluster."""
-    for mark in on_dask:
-        test = mark(test)
-    return test
+on_dask = pytest.mark.filterwarnings("ignore")
 
 
 @pytest.fixture(scope="module")
 def address():
-    import dask
-
+    dask = pytest.importorskip("dask")
     # A busy machine restarts workers slowly, and such a cluster takes that for their end.
     patient = dask.config.set({"distributed.deploy.lost-worker-timeout": "600s"})
     with warnings.catch_warnings(), patient:
@@ -239,7 +223,7 @@ def address():
             yield made.scheduler_address
 
 
-@marked
+@on_dask
 def test_results_of_a_cluster_are_those_of_this_machine(address, path, tmp_path):
     study = Study(**SMALL)
     there = run(study, path, scheduler=address, progress=False).frame()
@@ -252,30 +236,18 @@ def test_results_of_a_cluster_are_those_of_this_machine(address, path, tmp_path)
 
 
 @pytest.mark.slow
-@marked
-@pytest.mark.parametrize(("model", "words", "timeout"), DEATHS[1:])
-def test_a_cell_that_ends_its_worker_is_a_row(address, path, model, words, timeout):
-    ends_alone(path, model, words, timeout, scheduler=address)
-
-
-@marked
-@pytest.mark.parametrize("given", ["nonsense", "", "http://127.0.0.1:80", 8786, "silent"])
-def test_what_is_no_scheduler_is_refused(tmp_path, monkeypatch, given):
-    monkeypatch.setattr(runner, "_CONNECT", 1.0)
-    with socket.create_server(("127.0.0.1", 0)) as silent:  # it accepts, and never answers
-        if given == "silent":
-            given = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(StudyError, match=r"gives no Dask workers .*such as tcp://10") as caught:
-            run(Study(**SMALL), tmp_path / "store.sqlite", scheduler=given, progress=False)
-    assert str(caught.value).startswith(f"the scheduler is {given!r}")
-    assert list(tmp_path.iterdir()) == []
+@on_dask
+def test_a_cell_that_ends_its_worker_is_a_row(address, path):
+    ends_alone(path, ("is_killed", "hangs"), scheduler=address)
 
 
 @pytest.mark.slow
-@marked
+@on_dask
 def test_a_scheduler_that_dies_loses_nothing_and_the_same_call_resumes(
     path, tmp_path, monkeypatch
 ):
+    pytest.importorskip("distributed")
+
     def server(*arguments):
         return subprocess.Popen(
             [sys.executable, "-m", *arguments, "--no-dashboard"],

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qpmhe.errors import BackendError, InvalidInputError, ModelError, OptionError, QpmheError
+from qpmhe.errors import BackendError, InvalidInputError, ModelError, OptionError
 from qpmhe.models.loading import find, fingerprint, load, module_file
 from qpmhe.studies import StoreError, Study, StudyError, run
 from qpmhe.studies.cell import Task, compute
@@ -39,10 +39,6 @@ cell_timeout = 5
 """
 
 
-def keys(**options):
-    return [cell.key for cell in Study(**options).cells()]
-
-
 def test_the_defaults_are_all_native_backends_on_the_reactor():
     study = Study()
     assert study.backends == tuple(name for name in available() if ":" not in name)
@@ -54,17 +50,18 @@ def test_the_defaults_are_all_native_backends_on_the_reactor():
 
 
 def test_cells_that_would_be_the_same_are_one():
+    def keys(**options):
+        return [cell.key for cell in Study(**options).cells()]
+
     assert keys(backends=["banded"], solver_iterations=[1, 5], seeds=1, qps=[1]) == [
         "batch_reactor/banded/i=1/cap=none/N=10/candidate/T=150/seed=0"
     ]
     assert keys(backends=["osqp", "auto"], qps=[0], starts=["candidate", "best"], seeds=1) == [
         "batch_reactor/observer/i=0/cap=none/N=10/candidate/T=150/seed=0"
     ]
-    assert len(keys(backends=["osqp"] * 2, horizons=[None, 10, 10], qps=[1, 1], seeds=[3, 3],
-                    solver_iterations=[2], models=["batch_reactor"] * 2)) == 1
     # Single values stand for lists, and any iterable is one.
-    assert len(keys(models="batch_reactor", backends="osqp", qps=2, horizons=4, starts="best",
-                    solver_iterations=None, seeds=range(1, 3), noise_levels=2)) == 2
+    assert len(keys(models="batch_reactor", backends=["osqp"] * 2, qps=2, horizons=[None, 10],
+                    starts="best", solver_iterations=None, seeds=range(1, 3), noise_levels=2)) == 2
 
 
 def test_a_file_is_the_same_study_as_in_python_and_the_product_of_its_lists(tmp_path):
@@ -87,84 +84,57 @@ def test_a_file_is_the_same_study_as_in_python_and_the_product_of_its_lists(tmp_
     assert Study.from_toml(path) == Study()
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"models": []}, StudyError, "models is empty"),
-        ({"models": [3]}, StudyError, "models has 3; expected the name"),
-        ({"models": ["chain_of_masses(2)"]}, ModelError, "plain values by keyword"),
-        ({"models": ["chain_of_masses(masses=open)"]}, ModelError, "plain values"),
-        ({"models": ["chain_of_masses(masses=0)"]}, ModelError, "masses is 0"),
-        ({"models": ["no.such.module:make"]}, ModelError, "cannot import no.such.module"),
-        ({"models": [f"{ODD}:missing"]}, ModelError, "missing"),
-        ({"models": [f"{ODD}:not_callable"]}, ModelError, "not_callable"),
-        ({"models": [f"{ODD}:cannot_be_made"]}, ModelError, "no such reactor"),
-        ({"models": [f"{ODD}:three_parts"]}, ModelError, "expected (system, observer, cost"),
-        ({"models": [f"{ODD}:wrong_part"]}, ModelError, "for its cost"),
-        ({"backends": []}, StudyError, "backends is empty"),
-        ({"qps": [1.5]}, OptionError, "qps is 1.5"),
-        ({"horizons": [2.0]}, OptionError, "horizons is 2.0"),
-        ({"noise_levels": [0.0]}, OptionError, "noise_levels is 0.0"),
-        ({"noise_levels": []}, StudyError, "noise_levels is empty"),
-        ({"seeds": [-1]}, OptionError, "seeds is -1"),
-        ({"covariances": 1}, OptionError, "covariances is 1"),
-        ({"cell_timeout": float("inf")}, OptionError, "cell_timeout is inf"),
-        ({"folder": 3}, StudyError, "folder is 3"),
-        ({"seed": 1}, OptionError, "Did you mean seeds?"),
-    ],
-)
-def test_what_does_not_fit_is_refused(options, error, words):
-    with pytest.raises(error, match=re.escape(words)) as caught:
-        Study(**options)
-    assert isinstance(caught.value, QpmheError)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("seeds = 3", "sedes = 3", "unknown key 'sedes'; expected some of models, records"),
-        ("# every option", "[study]", "unknown key 'study'"),
-        ('"batch_reactor"', '"batch_reactr"', "expected one of batch_reactor"),
-        ("masses=1", "mases=1", "mases"),
-        ('"osqp"', '"osq"', "backend 'osq' is not known; expected one of auto"),
-        ('"none"', '"converged"', '\'converged\'; expected an integer >= 0. "none"'),
-        ("[5, ", "[5, 0, ", "solver_iterations is 0"),
-        ('"default"', '"converged"', "horizons is 'converged'"),
-        ('"best"', '"bets"', "starts is 'bets'"),
-        ("steps = 20", "steps = 2.5", "steps is 2.5"),
-        ('"time"', '"speed"', "measure is 'speed'"),
-        ("deadline = 0.01", "deadline = -1", "deadline is -1"),
-        ("seeds = 3", "seeds 3", "no valid TOML"),
-    ],
-)
-def test_what_does_not_fit_in_a_file_has_its_line(tmp_path, old, new, words):
-    text, path = GOOD.replace(old, new), tmp_path / "study.toml"
-    path.write_text(text)
-    with pytest.raises(StudyError, match=re.escape(words)) as caught:
-        Study.from_toml(path)
-    assert str(path) in str(caught.value)
-    if "TOML" not in words:  # of a list over several lines, the line of its key
-        lines = text.splitlines()
-        wrong = next(k for k, line in enumerate(GOOD.splitlines()) if old in line)
-        while not re.match(r"\w+ =|\[", lines[wrong]):
-            wrong -= 1
-        assert f", line {wrong + 1}:" in str(caught.value)
-
-
-def test_files_that_hold_no_study_are_refused(tmp_path):
-    path = tmp_path / "study.toml"
-    for content, words in ((None, "cannot read"), (b"\xff\xfe\x00", "no text in UTF-8"),
-                           (b"# seeds = 3\n", "is empty; name at least one of models")):
-        if content is not None:
-            path.write_bytes(content)
-        with pytest.raises(StudyError, match=words):
-            Study.from_toml(path)
-
-
-def test_a_backend_that_is_not_installed_is_refused_by_name(monkeypatch):
+def test_what_does_not_fit_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "osqp", None)
-    with pytest.raises(BackendError, match="'osqp' is not installed; pip install osqp"):
-        Study(backends=["osqp"])
+    for error, name, value, words in (
+        (StudyError, "models", [], "models is empty"),
+        (StudyError, "models", [3], "models has 3; expected the name"),
+        (ModelError, "models", ["chain_of_masses(masses=open)"], "plain values by keyword"),
+        (ModelError, "models", ["chain_of_masses(masses=0)"], "masses is 0"),
+        (ModelError, "models", ["no.such.module:make"], "cannot import no.such.module"),
+        (ModelError, "models", [f"{ODD}:missing"], "missing"),
+        (ModelError, "models", [f"{ODD}:not_callable"], "not_callable"),
+        (ModelError, "models", [f"{ODD}:cannot_be_made"], "no such reactor"),
+        (ModelError, "models", [f"{ODD}:three_parts"], "expected (system, observer, cost"),
+        (ModelError, "models", [f"{ODD}:wrong_part"], "for its cost"),
+        (StudyError, "backends", [], "backends is empty"),
+        (BackendError, "backends", ["osqp"], "'osqp' is not installed; pip install osqp"),
+        (OptionError, "qps", [1.5], "qps is 1.5"),
+        (OptionError, "noise_levels", [0.0], "noise_levels is 0.0"),
+        (OptionError, "seeds", [-1], "seeds is -1"),
+        (OptionError, "covariances", 1, "covariances is 1"),
+        (OptionError, "cell_timeout", float("inf"), "cell_timeout is inf"),
+        (StudyError, "folder", 3, "folder is 3"),
+        (OptionError, "seed", 1, "Did you mean seeds?"),
+    ):
+        with pytest.raises(error, match=re.escape(words)):
+            Study(**{name: value})
+
+
+def test_what_does_not_fit_in_a_file_has_its_line(tmp_path):
+    path = tmp_path / "study.toml"
+    with pytest.raises(StudyError, match="cannot read"):
+        Study.from_toml(path)
+    for old, new, line, words in (
+        ("seeds = 3", "sedes = 3", 13, "unknown key 'sedes'; expected some of models, records"),
+        ("# every option", "[study]", 1, "unknown key 'study'"),
+        ('"batch_reactor"', '"batch_reactr"', 2, "expected one of batch_reactor"),
+        ("masses=1", "mases=1", 2, "mases"),
+        ('"osqp"', '"osq"', 6, "backend 'osq' is not known; expected one of auto"),
+        ('"none"', '"converged"', 7, '\'converged\'; expected an integer >= 0. "none"'),
+        ("[5, ", "[5, 0, ", 9, "solver_iterations is 0"),
+        ('"default"', '"converged"', 10, "horizons is 'converged'"),
+        ('"best"', '"bets"', 12, "starts is 'bets'"),
+        ("steps = 20", "steps = 2.5", 14, "steps is 2.5"),
+        ('"time"', '"speed"', 15, "measure is 'speed'"),
+        ("seeds = 3", "seeds 3", None, "no valid TOML"),
+        (GOOD, "# seeds = 3\n", None, "is empty; name at least one of models"),
+        (GOOD, "\udcff", None, "no text in UTF-8"),
+    ):
+        path.write_text(GOOD.replace(old, new), errors="surrogateescape")
+        with pytest.raises(StudyError, match=re.escape(words)) as caught:
+            Study.from_toml(path)
+        assert str(path) + (f", line {line}:" if line else "") in str(caught.value)
 
 
 @pytest.fixture
@@ -248,43 +218,29 @@ def test_what_a_fingerprint_covers(here):
         assert fingerprint(lone) == hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def test_modules_without_a_file_of_their_own(here):
-    (here / "changing.py").write_text("raise RuntimeError\n")
-    for place in ("sys", "no.such.module", "changing.nothing"):
-        assert module_file(place) is None
-    assert module_file("changing") == (here / "changing.py").resolve()
-    with pytest.raises(ModelError, match=r"cannot import sys\.no"):
-        load(find("sys.no:make"))
-    with pytest.raises(QpmheError, match="changing"):
-        find("changing.py/x.py:make")
-
-
-@pytest.mark.parametrize(
-    ("name", "code", "words"),
-    [
-        ("tanks.py", OWN.format(""), r"names no function; expected tanks\.py:make\."),
-        ("tanks.py", "def _helper(): pass\ndef needy(a): pass\n",
-         "has no function without arguments"),
-        ("tanks.py", "def open(:", r"expected tanks\.py:function\."),
-        ("changing.py:make", 'def make():\n    raise RuntimeError("boom")\n',
-         r"changing\.py, line 2: model '.*' cannot be made: RuntimeError: boom\."),
-        ("changing:make", 'def make():\n    raise RuntimeError("boom")\n',
-         r"changing\.py, line 2: model '.*' cannot be made: RuntimeError: boom\."),
-    ],
-)
-def test_messages_about_a_model_s_file(here, name, code, words):
-    (here / re.sub(r"(\.py)?(:make)?$", ".py", name, count=1)).write_text(code)
-    with pytest.raises(InvalidInputError, match=words):
-        load(find(name))
-
-
-def test_arguments_of_a_model_in_a_file(here):
+def test_arguments_of_a_model_in_a_file_and_messages_about_it(here):
     (here / "mine.py").write_text(
         "from qpmhe.models import batch_reactor\n"
         "def make(method='euler'):\n    return batch_reactor(method)\n"
     )
     name = "mine.py:make(method='rk4')"
     source = replace(Study(models=[name], **SMALL).sources[0].model, name=name)
-    value = load(source).system.f(np.array([3.0, 1.0]), None)
-    zoo = load(find("batch_reactor(method='rk4')")).system.f(np.array([3.0, 1.0]), None)
-    np.testing.assert_array_equal(value, zoo)
+    values = [load(one).system.f(np.array([3.0, 1.0]), None)
+              for one in (source, find("batch_reactor(method='rk4')"))]
+    np.testing.assert_array_equal(*values)
+    boom = 'def make():\n    raise RuntimeError("boom")\n'
+    place = r"changing\.py, line 2: model '.*' cannot be made: RuntimeError: boom\."
+    for name, code, words in (
+        ("tanks.py", OWN.format(""), r"names no function; expected tanks\.py:make\."),
+        ("tanks.py", "def _helper(): pass\ndef needy(a): pass\n", "no function without arguments"),
+        ("tanks.py", "def open(:", r"expected tanks\.py:function\."),
+        ("changing.py:make", boom, place), ("changing:make", boom, place),
+        ("sys.no:make", "", r"cannot import sys\.no"), ("changing.py/x.py:make", boom, "changing"),
+    ):
+        file = re.sub(r"(\.py)?(/x\.py)?(:make)?$", ".py", name, count=1)
+        (here / file).write_text(code)
+        with pytest.raises(InvalidInputError, match=words):
+            load(find(name))
+    for place in ("sys", "no.such.module", "changing.nothing"):
+        assert module_file(place) is None
+    assert module_file("changing") == (here / "changing.py").resolve()
