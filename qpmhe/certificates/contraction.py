@@ -275,7 +275,7 @@ def _unstable(search: Search, text: str) -> NotCertifiedError:
         return NotCertifiedError(
             "no constant gain is shown to contract on the whole region: the semidefinite program "
             "is infeasible for every rate below 1",
-            ("a smaller region", "an observer with a varying gain", "other coordinates"),
+            ("a smaller region", "other coordinates, in which the model is closer to linear"),
         )
     return NotCertifiedError(
         f"{text}: no constant P shows contraction on the whole region, although A - L C is stable "

@@ -108,11 +108,12 @@ class Case:
         apart = int((
             (rest["rmse_excess_low"] > 0) & (rest["rmse_excess"] > TOLERANCE)
         ).sum())
-        reach = "other reaches" if equal == 1 else "others reach"
-        text += f". {equal} {reach} the same {self.ranked_by} within {percent(TOLERANCE)}"
+        reach = {0: "No other reaches", 1: "1 other reaches"}.get(equal, f"{equal} others reach")
+        text += f". {reach} the same {self.ranked_by} within {percent(TOLERANCE)}"
         if rest["rmse_excess_low"].notna().any():
             text += (
-                f"; {apart} of {len(rest)} are worse by more than chance (95 %, paired by seed)"
+                f"; {apart} of {len(rest)} {'is' if apart == 1 else 'are'} worse by more than "
+                "chance (95 %, paired by seed)"
             )
         return text + "."
 
