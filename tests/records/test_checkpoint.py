@@ -83,7 +83,7 @@ def test_results_that_do_not_belong_to_the_checkpoint(cut):
     Path("out.csv").write_bytes(whole[:500])
     refused("shorter")
     Path("out.csv").unlink()
-    with pytest.raises(CheckpointError, match="gone"):
+    with pytest.raises(CheckpointError, match="is missing"):
         estimate(CONTINUOUS, resume=True, **OPTIONS)
     # What stands behind the checkpoint is computed again in any case.
     Path("out.csv").write_bytes(whole[: known + 5] + b"#" + whole[known + 6 :])
