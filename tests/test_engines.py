@@ -173,7 +173,7 @@ def test_doctor_says_what_there_is_and_what_each_model_runs(here):
     code, output = command("doctor", *models)
     assert code == 0
     for text in (
-        f"Python {sys.version.split()[0]}", np.__version__, "right with -O", "1 steps",
+        f"Python {sys.version.split()[0]}", np.__version__, "correct with -O", "1 steps",
         "model.py:make 2 CasADi python its library is not in the cache; qpmhe.compile makes it.",
         "model.py:asks_for_python 2 CasADi python it asks for engine='python'.",
         "model.py:traced 2 traced python its library is not in the cache",
@@ -193,7 +193,7 @@ def test_doctor_of_a_machine_without_anything(here, monkeypatch):
     code, output = command("doctor", "model.py:make")
     assert code == 0
     for text in (
-        "C compiler CC is '/nowhere/cc', which is not there", "cache", "not there yet",
+        "C compiler CC is '/nowhere/cc', which does not exist", "cache", "not there yet",
         "QPMHE_ENGINE", "model.py:make 2 CasADi python the environment variable QPMHE_ENGINE",
     ):
         assert text in output, text

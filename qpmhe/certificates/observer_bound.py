@@ -268,7 +268,8 @@ class ObserverBound:
         With the offset :math:`o = \hat x - z` (..., n), the radius b and the longest half axis a of
         the set for b = 1,
 
-        .. math:: |o - e|^2 \le |o|^2 + 2 b |o|_{P^{-1}} + b^2 a^2 .
+        .. math::
+            |o - e|^2 \le |o|^2 + 2 b |o|_{P^{-1}} + b^2 a^2 .
 
         With the observer's state z (..., n), only what is within the region counts.
         """
