@@ -70,7 +70,7 @@ class Case:
 def test_they_are_the_blocks_of_the_inverse_hessian(options):
     """With noise weights of samples and late measurements; asking for them changes nothing."""
     case, twin = Case(**options), Case(**options)
-    with pytest.raises(InvalidInputError, match="no estimate yet; update first"):
+    with pytest.raises(InvalidInputError, match="no estimate yet; call update"):
         case.mhe.covariances()
     empty = case.mhe.run(np.empty((0, case.p)), covariances=True).covariances
     assert empty.shape == (0, case.n, case.n)
@@ -88,7 +88,7 @@ def test_they_are_the_blocks_of_the_inverse_hessian(options):
     case.kept.amend(when, late)
     case.check(case.kept.hessian(estimate.trajectory))
     case.mhe.reset()
-    with pytest.raises(InvalidInputError, match="no estimate yet; update first"):
+    with pytest.raises(InvalidInputError, match="no estimate yet; call update"):
         case.mhe.covariances()
 
 
