@@ -311,7 +311,7 @@ class CompiledEngine:
         """Covariances along the last estimate."""
         record = self._memory[0]
         if not record["has_trajectory"]:
-            raise InvalidInputError("there is no estimate yet; update first.")
+            raise InvalidInputError("there is no estimate yet; call update first.")
         length = self.length
         stages = record["stages"][(record["first"] + np.arange(length)) % self._sizes[2]]
         system, cost, count = self._system, self.cost, length
@@ -356,7 +356,7 @@ class CompiledEngine:
         """The last step's problem and its estimate, as the Python step has them."""
         record = self._memory[0]
         if not record["has_trajectory"]:
-            raise InvalidInputError("there is no estimate yet; update first.")
+            raise InvalidInputError("there is no estimate yet; call update first.")
         if self._mirror is None:
             parts = self._system.copy(traced=True), self._observer, self._given_cost
             self._mirror = PythonEngine(*parts, self._settings, self.state)
