@@ -15,7 +15,8 @@ from .cases import case
 CC = shutil.which("cc")
 FLAGS = tuple(flag for flag in compiler._FLAGS if flag not in ("-shared", "-fPIC"))
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
-WATCHED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+# With sanitizers GCC 12 warns of indices that loops of one output do not reach; they watch these.
+WATCHED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wno-array-bounds")
 WILD = 40
 SAMPLE, AMEND, SET = range(3)
 

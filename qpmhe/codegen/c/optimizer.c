@@ -394,7 +394,7 @@ static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int b
         if (o->outside) o->spare->cost = INFINITY;
         mhe_take(k, o);
     }
-    mhe_set_widening(k, e->settings, 1 - e->time / (real)MHE_HORIZON);
+    mhe_set_widening(k, e->settings, 1 - (real)e->time / (real)MHE_HORIZON);
     mhe_weigh(e, k, o->best);
     mhe_descend(e, k, o, before, limit);
     mhe_set_widening(k, e->settings, 0);
