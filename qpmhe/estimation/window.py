@@ -437,6 +437,8 @@ class Window(Stages):
             view.z_next[...], output, jacobian = kernel.stage(view.z, u)
             np.subtract(view.y, output, terms.noise)
             np.negative(jacobian, terms.linear[:, 1:])
+            if model.f_jacobian.inner is not None and not np.isfinite(jacobian).all():
+                self._differentiate(terms, (model.f_jacobian, model.h_jacobian), (view.z, u))
         if self._output_residual is not None:
             self._evaluating = "output_residual"
             self._output_residual.wrap(terms.noise, view.y)

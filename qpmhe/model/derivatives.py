@@ -30,6 +30,9 @@ _SLACK = 10.0
 _PARTS = (1.0, 0.62, 0.23)
 # An angle must turn by less than half its period within so many steps.
 _FAR = 8.0
+# How far inside a bound a Jacobian is taken that is not finite at it, as a share of the state's
+# magnitude, and at most of the width.
+_INWARD, _MOST_INWARD = 2.0**-10, 0.25
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
@@ -38,12 +41,16 @@ class Jacobian:
     """The Jacobian with respect to x of a `BatchedFunction` with vector values.
 
     Steps are fractions of the states' magnitudes, which are 1 until `use_scales` sets them; a given
-    Jacobian is compared with differences only from then on.
+    Jacobian is compared with differences only from then on. Where it is not finite, as that of a
+    square root on the bound 0 is not, it is taken a small step inside the bounds of X, as
+    differences are.
 
     Attributes
     ----------
     method : str
         ``given``, ``complex step`` or ``finite differences``.
+    inner : (2, n) array or None
+        Bounds a small step inside those of X; None if X has no bounds.
     remedy : str
         Remedy for a wrong given Jacobian.
     """
@@ -63,6 +70,7 @@ class Jacobian:
         n = probes[0][0].size
         self._eye: Array = np.eye(n)
         self._bounds = None if states is None else (states.lower, states.upper)
+        self.inner: Array | None = None
         self._outputs: Array = np.zeros(function.shape)
         self._scales: Array | None = None
         self._set_scales(np.ones(n))
@@ -72,21 +80,21 @@ class Jacobian:
         if given is not None:
             name = f"{function.name}_jacobian"
             self._given = BatchedFunction(name, given, (*function.shape, n), inputs, probes)
-            self.method, self.batch = "given", self._given.batch
+            self.method, self.batch = "given", self._given_batch()
         else:
             self._choose(probes)
 
     def __call__(self, x: Array, u: Array) -> Array:
         """The Jacobian (d, n) at one state."""
         if self._given is not None:
-            return self._given(x, u)
+            return self._given(x, u) if self.inner is None else self._taken(self._given, x, u)
         value: Array = self.batch(x[None], u[None])[0]
         return value
 
     @property
     def direct(self) -> Callable[..., Any]:
         """A function of one state, and of the input where there are any."""
-        if self._given is not None:
+        if self._given is not None and self.inner is None:
             return self._given.direct
         return self if self._inputs else partial(self, u=np.zeros(0))
 
@@ -111,6 +119,28 @@ class Jacobian:
         self._sizes = np.ldexp(1.0, np.frexp(scales)[1] - 1)
         self._complex_steps = _COMPLEX_STEP * self._sizes
         self._complex_moves = 1j * self._complex_steps * self._eye
+        if self._bounds is not None and np.isfinite(self._bounds).any():
+            lower, upper = self._bounds
+            step = np.minimum(_INWARD * self._sizes, _MOST_INWARD * (upper - lower))
+            self.inner = np.array((lower + step, upper - step))
+
+    def _given_batch(self) -> Callable[[Array, Array], Array]:
+        given = self._given
+        assert given is not None
+        return given.batch if self.inner is None else partial(self._taken, given.batch)
+
+    def _taken(self, given: Callable[[Array, Array], Any], x: Array, u: Array) -> Array:
+        """A given Jacobian, from inside the bounds where it is not finite or raises on them."""
+        assert self.inner is not None
+        try:
+            found: Array = np.asarray(given(x, u), np.float64)
+        except Exception:
+            return np.asarray(given(np.clip(x, *self.inner), u))
+        if np.isfinite(found).all():
+            return found
+        finite = np.isfinite(found).all(axis=(-2, -1), keepdims=True)
+        found = found.copy()  # a function may return one and the same array every time
+        return np.where(finite, found, given(np.clip(x, *self.inner), u))
 
     def _complex(self, x: Array, u: Array) -> Array:
         moved = x[..., None, :] + self._complex_moves
@@ -271,7 +301,7 @@ class Jacobian:
             f"{function.name}_jacobian", slope, (*function.shape, size), self._inputs, []
         )
         other._given.mode = "batched"
-        other.batch = other._given.batch
+        other.batch = other._given_batch()
         return other
 
     def copy(self, function: BatchedFunction) -> Jacobian:
@@ -282,7 +312,7 @@ class Jacobian:
             other.use(self.method)
         else:
             other._given = self._given.copy()
-            other.batch = other._given.batch
+            other.batch = other._given_batch()
         return other
 
     def try_batched(self, x: Array, u: Array) -> None:

@@ -92,8 +92,7 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
         real next[NX], output[NY];
         k->at[i] = around == o->candidate ? &stage->terms : t;
         if (around == o->candidate) continue;
-        mhe_f_jacobian(around->x + i * NX, stage->u, stage->step, next, t->f_jacobian);
-        mhe_h_jacobian(around->x + i * NX, stage->u, output, t->h_jacobian);
+        mhe_linear(e->settings, around->x + i * NX, stage, next, output, t);
         if (!mhe_all_finite(NX * NX, t->f_jacobian) || !mhe_all_finite(NY * NX, t->h_jacobian))
             return 0;
         mhe_set_terms(e->settings, k, stage, around->w + i * NX, around->v + i * NY, t);

@@ -47,6 +47,28 @@ static int mhe_rejection(const mhe_settings *s, const mhe_stage *stage, const in
 }
 #endif
 
+/* f and h at a state, and their Jacobians: where one is not finite on the bounds of X, a small step
+ * inside them. */
+static void mhe_linear(const mhe_settings *s, const real *x, const mhe_stage *stage, real *next,
+                       real *output, mhe_terms *t)
+{
+    mhe_f_jacobian(x, stage->u, stage->step, next, t->f_jacobian);
+    mhe_h_jacobian(x, stage->u, output, t->h_jacobian);
+#if MHE_X_SET
+    const int f = mhe_all_finite(NX * NX, t->f_jacobian);
+    const int h = mhe_all_finite(NY * NX, t->h_jacobian);
+    if (f && h) return;
+    real at[NX], unused[NX + NY];
+    for (int j = 0; j < NX; j++) {
+        const real above = mhe_max(s->inner_lower[j], x[j]);
+        at[j] = above < s->inner_upper[j] ? above : s->inner_upper[j];
+    }
+    if (!f) mhe_f_jacobian(at, stage->u, stage->step, unused, t->f_jacobian);
+    if (!h) mhe_h_jacobian(at, stage->u, unused, t->h_jacobian);
+#endif
+    (void)s;
+}
+
 /* Evaluate the stage at its z and step the observer to `next`, its covariance to `following` and its
  * sensors' counts to `rejections`, in X or, if there is one, `onto`; the cost, or infinity. `events`
  * gets bits of the status. */
@@ -59,8 +81,7 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     if (s->project && !e->metric_settled) linear = 1;
 #endif
     if (linear) {
-        mhe_f_jacobian(stage->z, stage->u, stage->step, predicted, stage->terms.f_jacobian);
-        mhe_h_jacobian(stage->z, stage->u, output, stage->terms.h_jacobian);
+        mhe_linear(s, stage->z, stage, predicted, output, &stage->terms);
     } else {
         mhe_f(stage->z, stage->u, stage->step, predicted);
         mhe_h(stage->z, stage->u, output);
