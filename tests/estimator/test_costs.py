@@ -138,20 +138,6 @@ def test_the_observer_prior_clips_eigenvalues_to_its_constants():
         check(OptionError, text, ObserverPrior, *bounds)
 
 
-@pytest.mark.parametrize("unit", [1e-9, 1e9])
-def test_weights_of_rows_in_any_unit_are_weights(unit):
-    matrix = spd(np.random.default_rng(12), 3)
-    scale = np.outer([1.0, unit, unit**2], [1.0, unit, unit**2])
-    others = {"disturbance": matrix * scale, "noise": 1.0}
-    prior = QuadraticCost.from_covariances(prior=matrix * scale, **others).prior
-    np.testing.assert_allclose(prior * scale, np.linalg.inv(matrix), rtol=1e-9)
-    skew, negative = matrix * scale, matrix.copy()
-    skew[0, 1] *= 1.001
-    negative[0] = negative[:, 0] = 3.0 * negative[:, 1]
-    for wrong, text in ((skew, "not symmetric"), (negative * scale, "positive definite")):
-        check(WeightError, [text], QuadraticCost.from_covariances, prior=wrong, **others)
-
-
 def test_wrong_costs_are_named():
     given = weights(2, 2)
     for changes, error, words in (

@@ -234,28 +234,6 @@ def test_huber_finds_back_from_a_covariance_that_is_too_small(make):
         assert (np.abs(run.observer_states[-30:]).max() < 1.0) == settled
 
 
-@each_filter
-@pytest.mark.parametrize("rule", [
-    qpmhe.Gate(reopen=2, groups=[[0, 2]]), qpmhe.HuberInnovation(reopen=2),
-], ids=["gate", "huber"])
-def test_no_unit_matters(make, rule):
-    a, c = np.array([[1.0, 0.1], [-0.1, 0.95]]), np.array([[1.0, 0.0], [0.3, 1.0], [1.0, -1.0]])
-    Y = np.random.default_rng(11).standard_normal((60, 3)) * 0.1
-    Y[20:35, 0] += 5.0
-    found = []
-    for one in (1.0, 1e9):
-        T, D = np.array([one, 1.0 / one]), np.array([1.0, one, 1.0])
-        system = qpmhe.System(
-            lambda x, T=T: T * (a @ (x / T)), lambda x, T=T, D=D: D * (c @ (x / T)), n=2, p=3
-        )
-        covariances = {"prior": np.diag(0.01 * T**2), "disturbance": np.diag(1e-4 * T**2)}
-        observer = watching(rule, make, **covariances, noise=np.diag(0.01 * D**2))
-        run = estimator(observer, T * [2.0, -2.0], system).run(Y * D)
-        found.append((run.observer_states / T, run.rejected_sensors))
-    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(found[1][1], found[0][1])
-
-
 def test_what_fits_nothing_is_refused():
     Gate, Huber = qpmhe.Gate, qpmhe.HuberInnovation
     for make, options, text in (
@@ -281,9 +259,3 @@ def test_what_fits_nothing_is_refused():
     for other in (None, Gate(reopen=9), Huber()):
         another = estimator(watching(other), FAR)
         check(InvalidInputError, ["observer"], another.load_state_dict, mhe.state_dict())
-
-
-def test_sensors_are_in_the_order_of_their_first_outputs():
-    assert qpmhe.Gate(groups=[[4, 2], [3, 0]]).sensors(6) == ((3, 0), (1,), (4, 2), (5,))
-    limits = qpmhe.Gate(groups=[[0, 1, 2]]).limits(4)
-    np.testing.assert_allclose(limits, list(CHI2.values()), rtol=1e-6)

