@@ -39,35 +39,6 @@ def huber(threshold):
     return loss
 
 
-def power(exponent):
-    return lambda s, weight: (s @ weight @ s) ** (exponent / 2.0)
-
-
-def barron(shape, threshold):
-    def loss(s, weight):
-        q, square = s @ weight @ s, threshold**2
-        if shape == 0.0:
-            return 2.0 * square * np.log1p(q / (2.0 * square))
-        if shape == -np.inf:
-            return -2.0 * square * np.expm1(-q / (2.0 * square))
-        width = 2.0 - shape
-        power = np.expm1(np.log1p(q / (square * width)) * shape / 2.0)
-        return 2.0 * square * width / shape * power
-
-    return loss
-
-
-def geman_mcclure(threshold):
-    return lambda s, weight: s @ weight @ s / (1.0 + s @ weight @ s / (4.0 * threshold**2))
-
-
-def each(loss):
-    """The loss of every component by itself, added."""
-    return lambda s, weight: sum(
-        loss(s[j : j + 1], weight[j : j + 1, j : j + 1]) for j in range(len(s))
-    )
-
-
 def euler(rate):
     return lambda x, u, dt: x + dt * rate(x, u)
 

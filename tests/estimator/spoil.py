@@ -34,11 +34,6 @@ def with_input():
     return estimator(system_of(lambda x, u: x @ A.T + u, m=2))
 
 
-def cases(*rows):
-    """Parametrisation that names each case by its first value."""
-    return [pytest.param(*row, id=repr(row[0])) for row in rows]
-
-
 def check(kind, fragments, build, /, *arguments, **options):
     """That build raises our own error of this kind, with the fragments in its message."""
     with pytest.raises(kind) as caught:

@@ -4,62 +4,39 @@ import math
 
 import numpy as np
 import pytest
-from oracles.systems import SYSTEMS
 
 import qpmhe
 from qpmhe import BatchEstimator, Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import OptionError, QpmheError, ShapeError, UnknownOptionError
-from qpmhe.models.batch_reactor import casadi_output, casadi_rate
 
-from .plain import spd
 from .untraced import untraced
 
 NAN = np.nan
 A = np.array([[1.0, 0.1], [-0.1, 0.95]])
-SETS = {"states": qpmhe.Box([-9.0, -9.0], [9.0, 9.0])}
 ENGINES = ("python", "compiled") if find_compiler() is not None else ("python",)
-compiled = pytest.mark.skipif(len(ENGINES) < 2, reason="there is no C compiler")
+COVARIANCES = {"prior": np.eye(2), "disturbance": 0.1 * np.eye(2), "noise": 0.1 * np.eye(2)}
+KALMAN = qpmhe.ExtendedKalman(**COVARIANCES, innovation=qpmhe.Gate(reopen=2))
 
 
 def turn(x):
     return x @ A.T
 
 
-def first(x):
-    return x[..., :1]
-
-
-def parts(f=turn, h=first, p=1, **system):
-    cost = qpmhe.QuadraticCost(
-        prior=10.0 * np.eye(2), disturbance=100.0 * np.eye(2), noise=25.0 * np.eye(p)
-    )
-    gain = [[0.3], [0.2]] if p == 1 else 0.1 * np.eye(2)
-    return qpmhe.System(f, h, n=2, p=p, **system), qpmhe.Luenberger(gain), cost
-
-
 def driven(x, u):
     return np.sin(x @ A.T) + u @ np.array([[0.3, 0.1], [0.0, 0.2], [0.1, -0.1]])
 
 
-def reactor(**sets):
-    pytest.importorskip("casadi")
-    model = qpmhe.models.batch_reactor()
-    system = qpmhe.from_casadi(casadi_rate, casadi_output, dt=0.1, method="euler", n=2, **sets)
-    return system, model.observer, model.cost
-
-
-def reactor_records(members, steps=30):
-    scenario = qpmhe.models.batch_reactor().scenario
-    Y = np.array([scenario.simulate(seed, steps).measurements for seed in range(members)])
-    Y[-1, 5:9], Y[0, 12] = NAN, np.inf
-    return Y
+def parts(f=turn, h=lambda x: x[..., :1], p=1, observer=None, **system):
+    cost = qpmhe.QuadraticCost(
+        prior=10.0 * np.eye(2), disturbance=100.0 * np.eye(2), noise=25.0 * np.eye(p), discount=0.8
+    )
+    gain = [[0.3], [0.2]] if p == 1 else 0.1 * np.eye(2)
+    return qpmhe.System(f, h, n=2, p=p, **system), observer or qpmhe.Luenberger(gain), cost
 
 
 def batch_of(one, members=3, starts=(0.5, 0.0), **options):
-    return BatchEstimator(
-        *one, members=members, initial_states=starts, **{"horizon": 3} | options
-    )
+    return BatchEstimator(*one, members=members, initial_states=starts, **{"horizon": 3} | options)
 
 
 FIELDS = {
@@ -68,9 +45,10 @@ FIELDS = {
     "candidate_costs": "candidate_cost", "statuses": "status", "qps": "qps",
     "improved": "improved",
 }
-
-
-RUNS = ("states", "filtered", "observer_states", "costs", "candidate_costs", "qps", "delayed")
+RUNS = (
+    "states", "filtered", "observer_states", "costs", "candidate_costs", "qps", "delayed",
+    "rejected_sensors",
+)
 
 
 def compare(one, Y, U=None, *, starts=(0.5, 0.0), horizon=5, threads=None, **options):
@@ -92,10 +70,8 @@ def compare(one, Y, U=None, *, starts=(0.5, 0.0), horizon=5, threads=None, **opt
             values = [getattr(each, single) for each in expected]
             np.testing.assert_array_equal(getattr(found, several), values, several)
         assert (len(found), found.time) == (members, t)
-        if expected[0].delayed is None:
-            assert found.delayed is None
-        else:
-            np.testing.assert_array_equal(found.delayed, [each.delayed for each in expected])
+        for rejected, each in zip(found.rejected_sensors, expected, strict=True):
+            assert tuple(np.flatnonzero(rejected)) == each.rejected_sensors
     run = batch.run(Y[:, half:], None if U is None else U[..., half:, :])
     runs = [
         mhe.run(Y[k, half:], None if U is None else own[k, half:]) for k, mhe in enumerate(singles)
@@ -111,45 +87,34 @@ def compare(one, Y, U=None, *, starts=(0.5, 0.0), horizon=5, threads=None, **opt
     return seen
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_systems_and_measurements_that_are_missing(name):
-    case, generator = SYSTEMS[name](), np.random.default_rng(5)
-    cost = qpmhe.QuadraticCost(
-        prior=spd(generator, case.n), disturbance=spd(generator, case.n),
-        noise=spd(generator, case.p), discount=0.8,
-    )
-    one = qpmhe.System(case.f, case.h, n=case.n, p=case.p), qpmhe.Luenberger(case.gain), cost
-    Y = np.array([case.record(seed, 25) for seed in range(4)])
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(("given", "members", "options"), [
+    ({}, 3, {"max_qps": 0, "threads": 1, "horizon": 1}),
+    # Fewer members would share a thread.
+    ({}, 40, {"max_qps": None, "warm_start": True, "delay": 3, "threads": 2}),
+    ({"disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}, 3, {"max_qps": 2}),
+    ({"h": lambda x: x, "p": 2, "observer": KALMAN}, 5, {"candidate": "reinitialized"}),
+], ids=["observers", "threads", "sets", "gates"])
+def test_members_with_gaps_are_single_estimators(given, members, options, engine):
+    starts, generator = 0.1 * np.arange(2 * members).reshape(-1, 2), np.random.default_rng(5)
+    one = parts(**given)
+    Y = 3.0 * generator.standard_normal((members, 20, one[0].p))
     Y[generator.random(Y.shape) < 0.15] = NAN
-    Y[0, 2:6], Y[1], Y[-1, 7, 0] = np.inf, NAN, -1e200
-    for options in ({"max_qps": 0, "delay": 1}, {"max_qps": None}, {"warm_start": True}):
-        assert Status.MISSING in compare(one, Y, starts=case.start, **options)
+    Y[0, 2:6], Y[1], Y[-1, 7, 0], Y[2, 12] = np.inf, NAN, -1e200, 90.0
+    seen = compare(one, Y, starts=starts, engine=engine, **options)
+    assert Status.MISSING in seen
+    assert "observer" not in given or Status.SENSORS_REJECTED in seen
 
 
-def test_engines_and_threads():
-    for sets, options in (
-        ({}, {"max_qps": 0, "threads": 1, "horizon": 1}),
-        ({}, {"max_qps": None, "warm_start": True, "delay": 3, "threads": 2}),
-        ({"disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}, {"max_qps": 2}),
-        ({}, {"candidate": "reinitialized"}),
-    ):
-        for engine in ENGINES:
-            # Fewer would share a thread.
-            members = 40 if engine == "compiled" and options.get("threads") == 2 else 5
-            starts = np.array([3.0, 0.1]) + 0.1 * np.arange(members)[:, None] / members
-            Y = reactor_records(members, 20)
-            compare(reactor(**sets), Y, starts=starts, engine=engine, **options)
-
-
-def test_inputs_of_each_member_and_shared_ones():
+@pytest.mark.parametrize("engine", ENGINES)
+def test_inputs_of_each_member_and_shared_ones(engine):
     one = parts(driven, lambda x, u: x[..., :1] * (1.0 + 0.1 * u[..., :1]), m=3)
     generator = np.random.default_rng(3)
     Y, U = generator.standard_normal((3, 20, 1)), generator.standard_normal((3, 20, 3))
     U[1, 15] = NAN
-    for engine in ENGINES:
-        for inputs in (U, U[0]):
-            seen = compare(one, Y, inputs, starts=np.eye(3, 2), max_qps=2, engine=engine)
-            assert (Status.MODEL_FAILED in seen) == (inputs is U)
+    for inputs in (U, U[0]):
+        seen = compare(one, Y, inputs, starts=np.eye(3, 2), max_qps=2, engine=engine)
+        assert (Status.MODEL_FAILED in seen) == (inputs is U)
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
@@ -160,13 +125,9 @@ def test_a_large_measurement_is_missing_only_where_its_cost_overflows():
     statuses = [batch.update(Y[:, t]).statuses for t in range(12)]
     missing = [[Status.MISSING in one for one in step] for step in statuses]
     assert np.argwhere(missing).tolist() == [[5, 1]]
-    # Where another component's does, those with a finite square stay.
-    Y = np.zeros((2, 12, 2))
-    Y[0, 4], Y[1, 5] = [1e149, 1e170], [1e151, 1e170]
-    compare(parts(h=lambda x: x, p=2), Y)
 
 
-def test_every_way_of_saying_that_nothing_was_measured():
+def test_short_ways_of_saying_it():
     for expected, other in (
         ([[1.0, 2.0], [NAN, NAN]], [[1.0, 2.0], None]), ([[NAN, NAN]] * 2, None),
         ([[1.0, NAN], [NAN, 3.0]], [[1.0, None], [None, 3.0]]),
@@ -174,92 +135,68 @@ def test_every_way_of_saying_that_nothing_was_measured():
         one = parts(h=lambda x: x, p=2)
         found = [batch_of(one, 2).update(value).trajectories for value in (expected, other)]
         np.testing.assert_array_equal(*found)
-    batch = batch_of(parts(), 2)
-    assert batch.update([1.0, None]).statuses[1] & Status.MISSING
-    assert batch.update([[None], None]).statuses[0] & Status.MISSING
-
-
-def test_one_state_one_output_one_input_without_brackets():
     one = (
         qpmhe.System(lambda x, u: 0.9 * x + u, lambda x: x, n=1, p=1, m=1),
         qpmhe.Luenberger([0.3]), qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0),
     )
     batch, full = batch_of(one, 2, 0.5), batch_of(one, 2, [[0.5], [0.5]])
-    found, expected = batch.update([1.0, 2.0], 0.1), full.update([[1.0], [2.0]], [[0.1], [0.1]])
+    found, expected = batch.update([1.0, None], 0.1), full.update([[1.0], [None]], [[0.1], [0.1]])
     np.testing.assert_array_equal(found.trajectories, expected.trajectories)
     run = batch.run([[1.0, 2.0], [0.5, 0.7]], [0.1, 0.2])
     other = full.run([[[1.0], [2.0]], [[0.5], [0.7]]], [[[0.1], [0.2]]] * 2)
     np.testing.assert_array_equal(run.states, other.states)
-    assert "members=2" in repr(batch)
-    assert batch.horizon == 3
-    assert "improved=2" in repr(found)
+    assert (batch.horizon, "members=2" in repr(batch)) == (3, True)
 
 
 NOT_MADE = [
     (OptionError, ["members is 0", ">= 1"], {"members": 0}),
-    (OptionError, ["members is 2.5", "integer"], {"members": 2.5}),
     (OptionError, ["members is True", "integer"], {"members": True}),
-    (OptionError, ["horizon is 0"], {"horizon": 0}),
-    (OptionError, ["max_qps is -1"], {"max_qps": -1}),
     (OptionError, ["engine is 'fast'"], {"engine": "fast"}),
     (OptionError, ["threads is 0"], {"threads": 0, "engine": "compiled"}),
     (OptionError, ["from_casadi"], {"f": untraced(turn), "engine": "compiled"}),
     (UnknownOptionError, ["max_qp", "Did you mean max_qps?"], {"max_qp": 1}),
-    (UnknownOptionError, ["initial_states"], {"initial_state": [0.5, 0.0]}),
     (UnknownOptionError, ["parameters", "inputs"], {"parameters": [0.5]}),
     (ShapeError, ["(3,)", "(3, 2)", "(2,) for all"], {"starts": [1.0, 2.0, 3.0]}),
-    (ShapeError, ["(2, 2)", "(3, 2)"], {"starts": np.ones((2, 2))}),
     (ShapeError, ["1 to 2 states", "same"], {"starts": [[1.0, 2.0], [1.0], [1, 2]]}),
     (QpmheError, ["initial_states", "finite"], {"starts": [1.0, NAN]}),
     (QpmheError, ["initial_states", "real numbers"], {"starts": "here"}),
     # What a single estimator would not take.
-    (QpmheError, ["initial_states[2]", "nan"],
-     {"f": np.sqrt, "starts": [[0.5, 0.0], [0.5, 0.1], [-1.0, 0.0]]}),
     (QpmheError, ["initial_states[1]", "raised"],
      {"f": lambda x: [math.sqrt(x[0]), x[1]], "starts": [[0.5, 0.0], [-0.5, 0.1], [1.0, 0.0]]}),
-    (QpmheError, ["initial_states[1]", "f_jacobian[0, 0]"],
-     {"f_jacobian": lambda x: A * (1.0 + (np.abs(x[..., :1, None]) > 50.0)),
-      "starts": [[0.5, 0.0], [60.0, 0.1], [1.0, 0.0]]}),
 ]
 
 
-def test_what_cannot_be_made():
-    for error, fragments, given in NOT_MADE:
-        functions = {key: given[key] for key in ("f", "f_jacobian") if key in given}
-        options = {key: value for key, value in given.items() if key not in functions}
+def test_what_cannot_be_made(monkeypatch):
+    def raises(error, fragments, call, *arguments, **options):
         with pytest.raises(error) as caught:
-            batch_of(parts(**functions), **options)
-        for fragment in fragments:
-            assert fragment in str(caught.value)
+            call(*arguments, **options)
+        assert all(fragment in str(caught.value) for fragment in fragments)
+
+    for error, fragments, given in NOT_MADE:
+        options = {key: value for key, value in given.items() if key != "f"}
+        one = parts(given.get("f", turn))
+        raises(error, fragments, batch_of, one, **options)
         if "starts" in options:
-            good = batch_of(parts(**functions), starts=[0.5, 0.1])
+            good = batch_of(one, starts=[0.5, 0.1])
             states = good.update([0.5, 0.4, 0.6]).states
-            with pytest.raises(error):
-                good.reset(options["starts"])
-            assert good.time == 1
+            raises(error, fragments, good.reset, options["starts"])
             np.testing.assert_array_equal(good.states, states)
-
-
-def test_parts_that_are_none_and_more_memory_than_there_is(monkeypatch):
-    one = parts()
     for k, word in enumerate(("system", "observer", "cost")):
-        with pytest.raises(QpmheError, match=f"{word} is None"):
-            batch_of([None if j == k else part for j, part in enumerate(one)])
-    with pytest.raises(ShapeError, match="gain has shape"):
-        batch_of((one[0], qpmhe.Luenberger(np.ones((3, 1))), one[2]))
+        without = [None if j == k else part for j, part in enumerate(one)]
+        raises(QpmheError, [f"{word} is None"], batch_of, without)
 
     def refuse(*_):
         raise MemoryError("Unable to allocate 1.49 TiB")
 
     monkeypatch.setattr("qpmhe.batch._Looped", refuse)
-    with pytest.raises(OptionError, match=r"1000 members with a horizon of 9 .*1.49 TiB.*fewer"):
-        batch_of(one, 1000, horizon=9)
+    text = ["1000 members with a horizon of 9", "1.49 TiB", "fewer"]
+    raises(OptionError, text, batch_of, parts(), 1000, horizon=9)
 
 
 def test_initial_states_outside_of_the_set_are_projected_with_a_warning():
-    starts = [[0.5, 0.0], [9.5, 0.0], [0.0, 0.0]]
+    starts, states = [[0.5, 0.0], [9.5, 0.0], [0.0, 0.0]], qpmhe.Box([-9.0, -9.0], [9.0, 9.0])
     with pytest.warns(qpmhe.ObserverWarning, match=r"initial_states\[1\] is \[9.5, 0.0\]"):
-        batch = batch_of(parts(**SETS), starts=starts)
+        batch = batch_of(parts(states=states), starts=starts)
     np.testing.assert_array_equal(batch.states, np.clip(starts, -9.0, 9.0))
     with pytest.warns(qpmhe.ObserverWarning, match=r"initial_states\[2\]"):
         batch.reset([*starts[:1], *starts[:1], [0.0, -20.0]])
@@ -269,24 +206,19 @@ def test_initial_states_outside_of_the_set_are_projected_with_a_warning():
 ONES = np.ones((3, 5, 1))
 REFUSED = [
     (ShapeError, ["Y has shape (2, 1)", "(3, 1)", "member"], "update", [[1.0], [2.0]]),
-    (ShapeError, ["Y has shape (3, 2)", "(3, 1)"], "update", np.ones((3, 2))),
     (ShapeError, ["Y has shape ()", "(3, 1)"], "update", 1.0),
     (ShapeError, ["1 to 2 components", "NaN"], "update", [[1.0], [1.0, 2.0], [1.0]]),
     (QpmheError, ["Y is", "real numbers"], "update", ["a", "b", "c"]),
     (QpmheError, ["U was given", "leave it out"], "update", [1.0] * 3, [1.0]),
     (ShapeError, ["4 to 6 samples", "NaN"], "run", [np.ones(5), np.ones(4), np.ones(6)]),
-    (ShapeError, ["4 to 6 samples"], "run", [[[1.0]] * 6, [[1.0]] * 6, [[1.0]] * 4]),
     (ShapeError, ["(2, 5, 1)", "(3, T, 1)"], "run", np.ones((2, 5, 1))),
-    (ShapeError, ["(5,)", "(3, T, 1)"], "run", np.ones(5)),
     (QpmheError, ["U was given"], "run", ONES, np.ones((5, 1))),
 ]
 REFUSED_WITH_INPUTS = [
     (QpmheError, ["U is missing", "3 inputs", "update(Y, U)"], "update", ONES[:, 0]),
     (QpmheError, ["U is missing", "run(Y, U)"], "run", ONES),
     (ShapeError, ["U has shape (2,)", "(3,) for all"], "update", ONES[:, 0], [1, 2]),
-    (ShapeError, ["U has shape (2, 3)"], "update", ONES[:, 0], np.ones((2, 3))),
     (ShapeError, ["(4, 3)", "(3, 5, 3)"], "run", ONES, np.ones((4, 3))),
-    (ShapeError, ["(3, 4, 3)", "(3, 5, 3)"], "run", ONES, np.ones((3, 4, 3))),
     (ShapeError, ["1 to 2 components"], "update", ONES[:, 0], [[1, 2], [1], [1, 2]]),
 ]
 
@@ -301,8 +233,7 @@ def test_bad_samples_and_records_are_refused_before_any_is_taken():
             for error, fragments, call, *arguments in refused:
                 with pytest.raises(error) as caught:
                     getattr(spoilt, call)(*arguments)
-                for fragment in fragments:
-                    assert fragment in str(caught.value)
+                assert all(fragment in str(caught.value) for fragment in fragments)
             found, expected = spoilt.update(*sample), twin.update(*sample)
             assert spoilt.time == twin.time
             np.testing.assert_array_equal(found.trajectories, expected.trajectories)

@@ -12,6 +12,7 @@ import qpmhe
 from qpmhe import Status
 from qpmhe.errors import InvalidInputError
 
+from .same import assert_same
 from .spoil import check, cost_of, estimator, system_of, unharmed
 
 NAT = np.datetime64("NaT")
@@ -29,10 +30,10 @@ PARTLY = [
 ]
 
 
-def two(system=None, cost=None, **options):
+def two(cost=None, initial_state=(1.0, 2.0), **sets):
     return estimator(
-        system or system_of(h=lambda x: x, p=2), qpmhe.Luenberger(0.1 * np.eye(2)),
-        cost or cost_of(2, 2), **options,
+        system_of(h=lambda x: x, p=2, **sets), qpmhe.Luenberger(0.1 * np.eye(2)),
+        cost or cost_of(2, 2), initial_state=initial_state, max_qps=3,
     )
 
 
@@ -40,37 +41,23 @@ def two(system=None, cost=None, **options):
 def test_every_way_of_saying_that_something_is_missing(ways, plainly):
     expected, found = two(), two()
     for way in ways:
-        for t in range(5):
+        for t in range(4):
             one = found.update(way if t == 2 else [1.0, t])
-            other = expected.update(plainly if t == 2 else [1.0, t])
-            np.testing.assert_array_equal(one.trajectory, other.trajectory)
-            np.testing.assert_array_equal(one.noises, other.noises)
-            assert one.status == other.status
+            assert_same(one, expected.update(plainly if t == 2 else [1.0, t]))
             assert (Status.MISSING in one.status) is (t == 2)
         expected.reset()
         found.reset()
-
-
-def test_records_with_gaps():
     frame = pd.DataFrame({"a": pd.array([1, pd.NA, 3]), "b": pd.array([pd.NA, 0.5, None])})
-    found, expected = two().run(frame), two().run([[1, np.nan], [np.nan, 0.5], [3, np.nan]])
-    assert found.states.tolist() == expected.states.tolist()
-    batch = qpmhe.BatchEstimator(
-        system_of(), qpmhe.Luenberger([[0.3], [0.1]]), cost_of(), members=2, horizon=3,
-        initial_states=[1.0, 2.0],
-    )
-    run = batch.run([[1.0, pd.NA, 2.0], [1.0, np.nan, 2.0]])
-    assert run.states[0].tolist() == run.states[1].tolist()
+    other = expected.run([[1, np.nan], [np.nan, 0.5], [3, np.nan]])
+    assert found.run(frame).states.tolist() == other.states.tolist()
 
 
 def test_a_missing_component_is_not_judged_against_its_set():
-    # The noise that the state would have is far outside of V where y is not there.
-    system = system_of(h=lambda x: x, p=2, noises=qpmhe.Box([-1.0, -1.0], [1.0, 1.0]))
-    cost = cost_of(2, 2, disturbance=100.0 * np.eye(2))
-    mhe = two(system, cost, initial_state=[40.0, 0.0], max_qps=3)
+    """The noise that the state would have is far outside of V where y is not there."""
+    noises = qpmhe.Box([-1.0, -1.0], [1.0, 1.0])
+    mhe = two(cost_of(2, 2, disturbance=100.0 * np.eye(2)), [40.0, 0.0], noises=noises)
     for t in range(6):
         estimate = mhe.update([None, mhe.state[1] + 0.2] if t % 2 else None)
-        assert estimate.dropped == ()
         assert not estimate.status & (Status.CANDIDATE_OUTSIDE | Status.ROWS_DROPPED)
     # The component that is there is judged.
     assert estimate.improved
@@ -81,7 +68,7 @@ def test_a_missing_component_is_not_judged_against_its_set():
 
 DATE, DURATION = np.datetime64("2026-01-01T00:00:05"), np.timedelta64(5, "s")
 TIMES = [
-    np.array([DATE]), DATE, DURATION, [DURATION], [datetime(2026, 1, 1)], [timedelta(seconds=5)],
+    np.array([DATE]), DURATION, [datetime(2026, 1, 1)], [timedelta(seconds=5)],
     [pd.Timestamp(DATE)], [pd.Timedelta(DURATION)], pd.Series([DATE]), pd.DatetimeIndex([DATE]),
     np.array([DURATION], object), np.ma.array([DURATION], mask=[False]),
 ]
@@ -98,8 +85,7 @@ def test_times_are_no_measurements():
     unharmed(estimator, calls, ([1.5],))
     text = ["dates or durations", "(t - t[0]) / numpy.timedelta64(1, 's')"]
     check(InvalidInputError, text, estimator().update, TIMES[0])
-    text = ["gain is [nan, 1.0]", "finite"]
-    check(InvalidInputError, text, qpmhe.Luenberger, [pd.NA, 1.0])
+    check(InvalidInputError, ["gain is [nan, 1.0]", "finite"], qpmhe.Luenberger, [pd.NA, 1.0])
 
 
 def test_neither_scipy_nor_pandas_is_imported():

@@ -1,15 +1,15 @@
-"""Differential equations: the methods, the ways of writing a rate, its Jacobian."""
+"""Differential equations: the methods, the ways of writing a rate, steps of any length."""
 
 import itertools
 import math
 
 import numpy as np
+import pytest
 
 import qpmhe
 
 from . import plain
-
-NONE = np.zeros(0)
+from .ways import NONE
 
 
 def check(system, step, slope=None):
@@ -27,13 +27,16 @@ def check(system, step, slope=None):
 
 def test_linear_rates_give_the_truncated_exponential():
     rate = np.array([[-0.5, 2.0], [-1.0, -0.2]])
-    for (method, degree), dt in itertools.product({"euler": 1, "rk4": 4}.items(), (0.01, 0.3)):
+    for (method, degree), dt in itertools.product(
+        ((None, 4), ("euler", 1), ("rk4", 4)), (0.01, 0.3)
+    ):
         step, term = np.eye(2), np.eye(2)
         for k in range(1, degree + 1):
             term = term @ (dt * rate) / k
             step = step + term
         system = qpmhe.System.from_ode(
-            lambda x: x @ rate.T, lambda x: x[..., :1], dt=dt, n=2, p=1, method=method
+            lambda x: x @ rate.T, lambda x: x[..., :1], dt=dt, n=2, p=1,
+            **({"method": method} if method else {}),
         )
         check(system, lambda x, step=step: step @ x, lambda x, step=step: step)
 
@@ -44,41 +47,58 @@ def in_place(x):
     return value
 
 
-def test_every_way_of_writing_the_rate():
-    for method, rate in itertools.product((plain.euler, plain.rk4), (
-        in_place, lambda x: np.array([x[1], -np.sin(x[0])]), lambda x: [x[1], -np.sin(x[0])],
-        lambda x: (x[1], -np.sin(x[0])), lambda x: np.array([x[1], -math.sin(x[0])]),
-        lambda x: [x[1], -math.sin(x[0])],
-    )):
-        def step(x, method=method):
-            return method(lambda x, u: in_place(x))(x, None, 0.1)
+@pytest.mark.parametrize("method", [plain.euler, plain.rk4])
+def test_every_way_of_writing_the_rate(method):
+    for rate in (
+        in_place, lambda x: np.array([x[1], -np.sin(x[0])]), lambda x: (x[1], -np.sin(x[0])),
+        lambda x: np.array([x[1], -math.sin(x[0])]), lambda x: [x[1], -math.sin(x[0])],
+    ):
+        def step(x, dt=0.1):
+            return method(lambda x, u: in_place(x))(x, None, dt)
 
         options = {"dt": 0.1, "n": 2, "p": 1, "method": method.__name__}
-        check(qpmhe.System.from_ode(rate, lambda x: x[..., :1], **options), step)
+        system = qpmhe.System.from_ode(rate, lambda x: x[..., :1], **options)
         given = qpmhe.System.from_ode(
             rate, lambda x: x[..., :1], **options, h_jacobian=lambda x: np.eye(1, 2),
             rate_jacobian=lambda x: np.array([[0.0, 1.0], [-np.cos(x[0]), 0.0]]),
         )
         assert (given.f_jacobian.method, given.h_jacobian.method) == ("given", "given")
+        check(system, step)
         check(given, step, lambda x, step=step: plain.differences(step, x))
-
-
-def test_the_default_method_is_rk4():
-    default, named, euler = (
-        qpmhe.System.from_ode(lambda x: -(x**3), lambda x: x, dt=0.2, n=1, p=1, **method)
-        for method in ({}, {"method": "rk4"}, {"method": "euler"})
-    )
-    x = np.array([1.3])
-    assert default.f(x, NONE) == named.f(x, NONE) != euler.f(x, NONE)
+        for one, dt in itertools.product((system, given), (0.02, 1.0)):  # of any length
+            found = one.timed.f(np.array([0.4, -0.7]), np.array([dt]))
+            np.testing.assert_allclose(found, step(np.array([0.4, -0.7]), dt), rtol=1e-12)
 
 
 def test_rates_of_one_state_with_jacobians():
-    for rate in (lambda x: -(x**3), lambda x: -(x[0] ** 3), lambda x: -math.pow(x[0], 3)):
-        for jacobian in (
-            lambda x: np.array([[-3.0 * x[0] ** 2]]), lambda x: [[-3.0 * x[0] ** 2]],
-            lambda x: -3.0 * x[..., None] ** 2,
-        ):
+    for rate in (lambda x: -(x**3), lambda x: -math.pow(x[0], 3)):
+        for jacobian in (lambda x: [[-3.0 * x[0] ** 2]], lambda x: -3.0 * x[..., None] ** 2):
             system = qpmhe.System.from_ode(
                 rate, lambda x: x[0], dt=0.1, n=1, p=1, method="euler", rate_jacobian=jacobian
             )
             check(system, lambda x: x - 0.1 * x**3, lambda x: 1.0 - 0.3 * x[:, None] ** 2)
+
+
+def test_what_the_timed_system_keeps_and_a_step_of_the_usual_length():
+    box = qpmhe.Box([-9.0, -9.0], [9.0, 9.0])
+    system = qpmhe.System.from_ode(
+        lambda x, u: in_place(x), lambda x, u: x[..., :1] * u[..., :1], dt=0.1, n=2, p=1, m=1,
+        states=box, disturbances=box,
+    )
+    timed = system.timed
+    assert (timed.m, timed) == (2, system.timed)
+    assert timed.states is timed.disturbances is box
+    # Outputs do not see the step.
+    np.testing.assert_allclose(timed.h(np.array([0.5, 1.0]), np.array([3.0, 0.7])), [1.5])
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
+    one, other = (
+        qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([0.3, 0.1]), cost, horizon=4, initial_state=[0.5, 0.0]
+        )
+        for _ in range(2)
+    )
+    for t, y in enumerate(np.random.default_rng(4).standard_normal(12)):
+        # A weight of one output may be a scalar.
+        plainly = one.update(y, 1.0, noise_weight=[[2.0]])
+        named = other.update(y, 1.0, dt=0.1 if t % 3 else None, noise_weight=2.0)
+        np.testing.assert_allclose(named.trajectory, plainly.trajectory, rtol=1e-9, atol=1e-10)

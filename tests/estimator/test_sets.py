@@ -27,16 +27,13 @@ def test_a_point_is_in_an_intersection_as_far_as_in_each_part(kinds):
         for kind in kinds:
             lower = np.where(generator.random(d) < 0.3, -np.inf, -generator.exponential(size=d))
             upper = np.where(generator.random(d) < 0.3, np.inf, generator.exponential(size=d))
-            rows = generator.standard_normal((2, d))
-            parts.append(
-                qpmhe.Box(lower, upper) if kind == "b"
-                else qpmhe.Polytope(rows, generator.exponential(size=2))
-            )
-        whole, before = parts[0], repr(parts)
+            rows, side = generator.standard_normal((2, d)), generator.exponential(size=2)
+            parts.append(qpmhe.Box(lower, upper) if kind == "b" else qpmhe.Polytope(rows, side))
+            for given in (lower, upper, rows, side):
+                given[...] = 9.0  # copies are kept
+        whole = parts[0]
         for part in parts[1:]:
             whole = whole & part
-        assert (whole.dimension, repr(parts)) == (d, before)
-        assert whole.matrix.shape == (2 * kinds.count("p"), d)
         points = 0.6 * generator.standard_normal((*lead, d))
         expected = max(
             plain_violation(part, point) for part in parts for point in points.reshape(-1, d)
@@ -49,41 +46,19 @@ def test_a_point_is_in_an_intersection_as_far_as_in_each_part(kinds):
     assert seen == {True, False}
 
 
-def test_boxes_of_points_and_of_one_component():
-    box = qpmhe.Box([-1.0, 1.0], [1.0, np.inf])
-    assert [box.violation(np.array(x)) for x in ([-1.0, 1.0], [1.0, 1e300], [1.25, -3.0])] == [
-        0.0, 0.0, 4.0
-    ]
-    point = qpmhe.Box([0.0, 2.0], [0.0, 2.0])
-    assert [point.violation(np.array([0.0, x])) for x in (2.0, 2.5)] == [0.0, 0.5]
-    assert qpmhe.Box(-1, 2).violation(np.array([[3.5]])) == 1.5
-    assert qpmhe.Polytope([1.0, 2.0], 3.0).violation(np.array([2.0, 1.0])) == 1.0
+def test_components_that_are_bounded_and_fixed():
     wide = qpmhe.Box([-np.inf, 0.0, -1.0, -np.inf], [np.inf, 0.0, np.inf, 2.0])
     np.testing.assert_array_equal(wide.bounded_components, [1, 2, 3])
     np.testing.assert_array_equal(wide.fixed_components, [1])
-    assert repr(qpmhe.Box([0, -np.inf], [1, 2])) == "Box(lower=[0.0, -inf], upper=[1.0, 2.0])"
-    assert "3 rows" in repr(qpmhe.Polytope(np.ones((3, 2)), np.ones(3)))
-
-
-def test_the_numbers_of_sets_are_copies():
-    lower, upper, matrix = np.zeros(2), np.ones(2), np.eye(2)
-    box, polytope = qpmhe.Box(lower, upper), qpmhe.Polytope(matrix, upper)
-    for array in (lower, upper, matrix):
-        array[...] = 9.0
-    np.testing.assert_array_equal([box.lower, box.upper], [[0.0, 0.0], [1.0, 1.0]])
-    np.testing.assert_array_equal(polytope.matrix, np.eye(2))
-    np.testing.assert_array_equal(polytope.row_upper, [1.0, 1.0])
-
-
-def test_sets_that_only_touch_are_not_empty():
-    point = qpmhe.Box([0.0], [1.0]) & qpmhe.Box([1.0], [2.0])
+    # Sets that only touch are not empty.
+    point = qpmhe.Box(0, 1) & qpmhe.Box([1.0], [2.0])
     np.testing.assert_array_equal(point.fixed_components, [0])
-    corner = qpmhe.Box([0.0, 0.0], [1.0, 1.0]) & qpmhe.Polytope([[-1.0, -1.0]], [-2.0])
+    corner = qpmhe.Box([0.0, 0.0], [1.0, 1.0]) & qpmhe.Polytope([-1.0, -1.0], -2.0)
     assert corner.violation(np.array([1.0, 1.0])) == 0.0
 
 
-@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-9, 1e9), (1e9, 1e6), (1e-12, 1e-9)])
-@pytest.mark.parametrize("row", [1e-9, 1.0, 1e12])
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e-9, 1e9), (1e-12, 1e-9)])
+@pytest.mark.parametrize("row", [1e-9, 1e12])
 def test_whether_a_set_is_empty_depends_on_no_unit(units, row):
     units = np.array(units)
     matrix = row * np.array([[1.0, 1.0], [-1.0, -0.5], [0.0, -1.0]]) / units
@@ -102,8 +77,8 @@ def test_inequalities_on_unknown_components_do_not_count():
     # Component 0 is out by 6, 1 by 2, 2 by 4; the rows by 8.5, 5 and 1.
     point = np.array([7.0, 4.0, -7.0])
     for known, expected in (
-        ([1, 1, 1], 8.5), ([1, 1, 0], 8.5), ([1, 0, 1], 6.0), ([0, 1, 1], 5.0), ([0, 0, 1], 5.0),
-        ([0, 1, 0], 2.0), ([1, 0, 0], 6.0), ([0, 0, 0], 0.0),
+        ([1, 1, 1], 8.5), ([1, 1, 0], 8.5), ([1, 0, 1], 6.0), ([0, 0, 1], 5.0), ([0, 1, 0], 2.0),
+        ([0, 0, 0], 0.0),
     ):
         assert one.violation(point, np.array(known, bool)) == expected
     rows = one.touched(np.array([[True, False, False], [False, False, True], [False] * 3]))
