@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,7 +214,8 @@ class Search:
         while high - low > _TOLERANCE * (1.0 - low):
             try:
                 margin = _MARGINS[0] * min(1.0, middle * middle)
-                feasible = self._solved(middle, margin, deadline).form is not None
+                form = self._solved(middle, margin, deadline).form
+                feasible = form is not None and self._fits(form)
             except OutOfTimeError:
                 if math.isinf(high):
                     raise
@@ -224,6 +225,12 @@ class Search:
             low, high = (low, middle) if feasible else (middle, high)
             middle = 0.5 * (low + high)
         return high
+
+    def _fits(self, form: Form) -> bool:
+        """Whether an inequality holds at the chosen states: what is infeasible may seem solved."""
+        wider = replace(form, rate=form.rate + _TOLERANCE * (1.0 - form.rate))
+        chosen = Matrices.exact(self.jacobians[self._chosen])
+        return wider.holds_always() and bool(definite(wider.matrices(chosen)).all())
 
     def _solved(self, rate: float, margin: float, deadline: Deadline) -> Answer:
         """What the program returns; an error if there is no time for it, or not enough."""
