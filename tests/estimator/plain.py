@@ -159,7 +159,7 @@ class Record:
         return total
 
     def improved(self, trajectory):
-        """The trajectory after one full Gauss-Newton step, which must lower J to be of use."""
+        """The trajectory after one full Gauss-Newton step."""
         step = np.linalg.solve(self.hessian(trajectory), -0.5 * self.gradient(trajectory).ravel())
         better = trajectory + step.reshape(trajectory.shape)
         assert self.cost(better) < self.cost(trajectory)
