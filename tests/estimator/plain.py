@@ -147,19 +147,24 @@ class Record:
     def gradient(self, trajectory):
         return differences(self.cost, trajectory).reshape(trajectory.shape)
 
-    def hessian(self, trajectory):
-        """Of J/2 for quadratic losses: the residuals' Jacobians between their weights."""
-        n, count = len(self.Q), self.count
+    def hessian(self, trajectory, cost=None):
+        """Of J/2: the residuals' Jacobians between the weights, or those that majorise a cost."""
+        n, count, first = len(self.Q), self.count, self.first
         total = np.zeros((trajectory.size, trajectory.size))
-        total[:n, :n] = self.discount**count * self.P
+        offset = trajectory[0] - self.z[first]
+        total[:n, :n] = self.P if cost is None else cost.majorise_prior(offset, self.P)
+        total *= self.discount**count
+        residuals = self.residuals(trajectory)
         for i, slope in enumerate(differences(self.residuals, trajectory)):
             joint = np.zeros((len(slope), len(slope)))
-            joint[:n, :n], joint[n:, n:] = self.Q, self.weight(self.first + i)
+            joint[:n, :n], joint[n:, n:] = self.Q, self.weight(first + i)
+            if cost is not None:
+                joint = cost.majorise(residuals[i : i + 1], joint[None])[0]
             total += self.discount ** (count - 1 - i) * slope.T @ joint @ slope
         return total
 
     def improved(self, trajectory):
-        """The trajectory after one full Gauss-Newton step, which must lower J to be of use."""
+        """The trajectory after one full Gauss-Newton step."""
         step = np.linalg.solve(self.hessian(trajectory), -0.5 * self.gradient(trajectory).ravel())
         better = trajectory + step.reshape(trajectory.shape)
         assert self.cost(better) < self.cost(trajectory)

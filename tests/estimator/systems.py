@@ -4,18 +4,11 @@ import numpy as np
 
 import qpmhe
 
-GAIN = np.array([[0.3, 0.05], [0.1, 0.2]])
-
 
 def swing(x):
     return np.stack(
         [x[..., 0] + 0.2 * x[..., 1], 0.9 * x[..., 1] - 0.2 * np.sin(x[..., 0])], axis=-1
     )
-
-
-def seen(x):
-    """Two outputs, of which the first is nonlinear."""
-    return np.stack([x[..., 0] + 0.1 * x[..., 1] ** 2, x[..., 1]], axis=-1)
 
 
 def linear(A, C, **options):

@@ -1,7 +1,5 @@
 """Outputs and states that wrap: as accurate as with angles that go on beyond half a turn."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -9,11 +7,9 @@ import qpmhe
 from qpmhe import Box, Polytope, Status
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 
-from .untraced import untraced
-
+pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 PI, INF = np.pi, np.inf
 NAMES = ("state_residual", "output_residual")
-ONES = {"prior": 1.0, "disturbance": 1.0, "noise": 1.0}
 # A compass needle in degrees, seen directly, with a rate; its bounds lie across the seam.
 NEEDLE = {"prior": np.diag([25.0, 1.0]), "disturbance": np.diag([1.0, 0.1]), "noise": [[4.0]]}
 HALF = Box([170.0, -INF], [190.0, INF])
@@ -81,7 +77,6 @@ def follow(mhe, y, moves=False, wraps=False):
     ("unscented", 0.0, {"disturbances": Polytope([[1.0, 1.0], [-1.0, 1.0]], [0.7, 0.7]),
                         "states": ACROSS}, {"horizon": 2}),
 ])
-@pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 def test_nothing_is_lost_across_the_seam(observer, turn, sets, options):
     noise, t = np.random.default_rng(1).normal(0.0, 2.0, 50), np.arange(50)
     y, moves = (180.0 + turn * t + 12.0 * np.sin(0.2 * t) + noise)[:, None], "states" in sets
@@ -111,35 +106,31 @@ def test_degrees_and_turns_side_by_side():
         assert residual(half, np.zeros(3)).tolist() == [-180.0, 0.0, -0.5]
 
 
-@pytest.mark.parametrize(
-    "h", [lambda x: np.arctan2(np.sin(x), np.cos(x)), lambda x: (x + PI) % (2.0 * PI) - PI],
-    ids=["arctan2", "modulo"],
-)
-def test_jacobians_do_not_see_the_jump(h):
+def test_jacobians_do_not_see_the_jump():
     """Numerical ones at the seam and inwards from a bound there, and given ones in their check."""
     options = {"n": 1, "p": 1} | {name: qpmhe.angles([0]) for name in NAMES}
-    system = qpmhe.System(h, h, **options)
-    bounded = qpmhe.System(h, h, states=Box([PI - 1e-9], [PI + 0.1]), **options)
-    for at in (PI, -PI, np.nextafter(PI, 0.0), 3.0 * PI, PI - 1e-7):
-        for jacobian in (system.f_jacobian, system.h_jacobian):
-            np.testing.assert_allclose(jacobian(np.array([at]), np.zeros(0)), [[1.0]], rtol=1e-8)
-    at_bound = bounded.f_jacobian(np.array([PI - 1e-9]), np.zeros(0))
-    np.testing.assert_allclose(at_bound, [[1.0]], rtol=1e-6)
-    given = qpmhe.System(
-        h, h, h_jacobian=lambda x: [[1.0]], f_jacobian=lambda x: [[1.0]], scales=[1.0], **options
-    )
-    given.check(np.array([PI]), np.zeros(0))
+    for h in (lambda x: np.arctan2(np.sin(x), np.cos(x)), lambda x: (x + PI) % (2.0 * PI) - PI):
+        given = {"h_jacobian": lambda x: [[1.0]], "f_jacobian": lambda x: [[1.0]], "scales": [1.0]}
+        qpmhe.System(h, h, **options, **given).check(np.array([PI]), np.zeros(0))
+        bounded = qpmhe.System(h, h, states=Box([PI - 1e-9], [PI + 0.1]), **options)
+        for system, at in (
+            (bounded, PI - 1e-9),
+            *((qpmhe.System(h, h, **options), at) for at in (PI, -PI, 3.0 * PI, PI - 1e-7)),
+        ):
+            for jacobian in (system.f_jacobian, system.h_jacobian):
+                found = jacobian(np.array([at]), np.zeros(0))
+                np.testing.assert_allclose(found, [[1.0]], rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("error::qpmhe.ObserverWarning")
 def test_a_state_written_in_another_turn_is_in_its_bounds():
-    mhe = needle(compass(HALF), start=-175.0)  # a warning would be an error
+    mhe = needle(compass(HALF), start=-175.0)
     for start in (-175.0, 185.0, 545.0):
         mhe.reset([start, 0.0])
         estimate = mhe.update([-175.0])
         assert Status.OBSERVER_PROJECTED not in estimate.status
-        np.testing.assert_allclose(estimate.trajectory[:, 0], 185.0)
+        np.testing.assert_allclose([*estimate.trajectory[:, 0], estimate.filtered[0]], 185.0)
         assert estimate.cost < 1e-20
-        np.testing.assert_allclose(estimate.filtered, [185.0, 0.0])
     # Beyond them it is not: the nearer bound.
     for start, bound in ((-160.0, 190.0), (20.0, 170.0)):
         with pytest.warns(qpmhe.ObserverWarning, match="outside of the state set"):
@@ -147,12 +138,10 @@ def test_a_state_written_in_another_turn_is_in_its_bounds():
         assert mhe.initial_state.tolist() == [bound, 0.0]
 
 
-@pytest.mark.parametrize("candidate", ["observer", "reinitialized"])
-def test_projections_and_corrections_turn_the_short_way(candidate):
+def test_projections_and_corrections_turn_the_short_way():
     def first(y, start, gain, states=None, turn=0.0):
-        observer = qpmhe.Luenberger([gain, 0.0])
-        options = {"max_qps": 0, "candidate": candidate}
-        return needle(compass(states, turn=turn), observer, start, **options).update([y])
+        options = {"observer": qpmhe.Luenberger([gain, 0.0]), "start": start, "max_qps": 0}
+        return needle(compass(states, turn=turn), **options).update([y])
 
     # The prediction, -175 degrees, is inside; with the correction by 10 degrees it is not.
     one = first(-155.0, 185.0, 0.5, HALF)
@@ -160,25 +149,21 @@ def test_projections_and_corrections_turn_the_short_way(candidate):
     assert Status.PREDICTION_OUTSIDE not in one.status
     assert (one.state[0], one.disturbances[0, 0]) == (190.0, 5.0)
     # From 5 degrees over -9 to the bound at 190 the shorter way is backwards.
-    one = first(157.0, 185.0, 0.5, HALF, 180.0)
-    assert (one.state[0], one.disturbances[0, 0]) == (190.0, -175.0)
-    # A prediction half a turn off, and a correction by 210 degrees, which is one by -150.
-    one = first(150.0, -170.0, 1.0)
-    assert (one.noises[0, 0], one.disturbances[0, 0], one.state[0] % 360.0) == (-40.0, -40.0, 150.0)
+    assert first(157.0, 185.0, 0.5, HALF, 180.0).disturbances[0, 0] == -175.0
+    # A correction by 210 degrees is one by -150.
     one = first(30.0, 0.0, 7.0)
     assert one.disturbances[0, 0] == -150.0
     assert one.cost == pytest.approx(150.0**2 + 30.0**2 / 4.0)
 
 
 def test_bounds_of_a_period_and_those_that_leave_the_turn():
-    for lower, upper in ((-180.0, 180.0), (0.0, 360.0), (-500.0, 500.0)):
+    for lower, upper in ((-180.0, 180.0), (0.0, 360.0)):
         assert compass(Box([lower, -INF], [upper, INF])).states is None
         partly = compass(Box([lower, -9.0], [upper, 9.0]))
         assert (partly.states.lower.tolist(), partly.turns) == ([-INF, -9.0], None)
-    assert compass(Box([0.0, -9.0], [359.0, 9.0])).turns is not None
     mhe = needle(compass(ACROSS))
     before = mhe.update([-179.0])
-    for lower, upper in ((-INF, 190.0), (-20.0, 20.0), (170.0, 500.0), (-190.0, 190.0)):
+    for lower, upper in ((-INF, 190.0), (-20.0, 20.0), (170.0, 500.0)):
         with pytest.raises(SetError, match=r"component 0 of the states, an angle.*from 180\.0"):
             mhe.update([-179.0], bounds={"states": Box([lower, -9.0], [upper, 9.0])})
         assert np.array_equal(mhe.state, before.state)
@@ -192,58 +177,15 @@ def test_bounds_of_a_period_and_those_that_leave_the_turn():
         for residual in (None, turned):
             with pytest.raises(SetError, match=text):
                 compass(states, residual=residual)
-
-
-def test_every_way_to_make_a_system_takes_angles():
-    jnp, sp = pytest.importorskip("jax.numpy"), pytest.importorskip("sympy")
-    control, angle = pytest.importorskip("control"), {name: qpmhe.angles([0]) for name in NAMES}
-    one, plant = sp.symbols("x:1"), control.nlsys(
-        lambda t, x, u, params: -x, lambda t, x, u, params: x, inputs=0, outputs=1, states=1
-    )
-    made = [
-        make(lambda x: -x, lambda x: x, n=1, p=1, dt=0.1, **angle)
-        for make in (qpmhe.from_casadi, qpmhe.System.from_ode)
-    ]
-    for system in (
-        *made, *(system.timed for system in made),
-        qpmhe.from_jax(lambda x: -x, jnp.sin, n=1, p=1, dt=0.1, **angle),
-        qpmhe.from_sympy([-one[0]], one, one, dt=0.1, **angle),
-        qpmhe.from_control(plant, dt=0.1, **angle),
-    ):
-        for name in NAMES:
-            turned_once = getattr(system, name)(np.array([2.0 * PI + 0.5]), np.zeros(1))
-            assert turned_once[0] == pytest.approx(0.5)
-    # Parameters and errors of inputs are plain beside angles.
+    # A snapshot is of one circle, and parameters and errors of inputs are plain beside angles.
+    other = needle(compass(residual=qpmhe.angles(0, 90.0), states=None), start=0.0)
+    with pytest.raises(InvalidInputError, match="another"):
+        other.load_state_dict(mhe.state_dict())
+    angle = {name: qpmhe.angles([0]) for name in NAMES}
     driven = qpmhe.System(lambda x, u: x + u, lambda x: x, n=1, p=1, m=1, **angle)
     for larger in (qpmhe.noisy_inputs(driven), qpmhe.augment_parameters(driven, nominal=[2.0])):
         found = larger.state_residual(np.array([[2.0 * PI + 0.5, 7.0]]), np.zeros(2))
         np.testing.assert_allclose(found, [[0.5, 7.0]], atol=1e-14)
-
-
-def test_other_angles_are_refused_by_name():
-    for name in NAMES:
-        parts = qpmhe.Luenberger([0.1]), qpmhe.QuadraticCost(**ONES)
-        mhe, usual = (
-            qpmhe.MovingHorizonEstimator(
-                qpmhe.from_casadi(lambda x: x, lambda x: x, n=1, p=1, **options), *parts,
-                horizon=3, initial_state=[0.0], engine="python",
-            )
-            for options in ({name: untraced(lambda a, b: a - b)}, {name: qpmhe.angles([0], 6.0)})
-        )
-        with pytest.raises(OptionError, match=f"{name}, a function, has no C form"):
-            qpmhe.codegen.write(mhe, "/nonexistent")
-        mhe.update([1.0])
-        with pytest.raises(InvalidInputError, match=f"another {name}"):
-            usual.load_state_dict(mhe.state_dict())
-
-
-def test_divergence_to_infinity_is_a_failed_stage():
-    angle = {name: qpmhe.angles([0]) for name in NAMES}
-    mhe = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(lambda x: 1e200 * x, lambda x: x, n=1, p=1, **angle),
-        qpmhe.Luenberger([0.5]), qpmhe.QuadraticCost(**ONES), horizon=3, initial_state=[0.1],
-    )
-    assert all(np.isfinite(mhe.update([0.3]).state).all() for _ in range(6))
 
 
 @pytest.mark.parametrize("luck", ["raises", "stops", "shape", "nothing", "nan"])
@@ -257,42 +199,32 @@ def test_residual_functions_that_fail_at_some_calls_are_bad_luck(luck):
             return {"shape": np.zeros(3), "nothing": None}.get(luck, (a - b) * np.nan)
         return turned(a, b)
 
-    options = {"n": 1, "p": 1, "states": Box([-1.5], [1.5])} | dict.fromkeys(NAMES, residual)
-    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, **options)
-    for observer, candidate in itertools.product(
-        (qpmhe.Luenberger([0.3]), qpmhe.ExtendedKalman(**ONES), qpmhe.UnscentedKalman(**ONES)),
-        ("observer", "reinitialized"),
-    ):
-        mhe = qpmhe.MovingHorizonEstimator(
-            system, observer, qpmhe.QuadraticCost(**ONES), horizon=3, initial_state=[0.0],
-            max_qps=2, warm_start=True, candidate=candidate,
-        )
+    for observer in OBSERVERS:
+        options = {"candidate": "reinitialized"} if luck in ("stops", "nan") else {}
+        mhe = needle(compass(HALF, residual=residual), observer, warm_start=True, **options)
         messages = []
-        for t in range(60):
-            share = 0.2 if 3 <= t < 45 else 0.0
-            estimate = mhe.update([np.sin(t)])
+        for t in range(50):
+            share = 0.1 if 3 <= t < 35 else 0.0
+            estimate = mhe.update([degrees(180.0 + 5.0 * np.sin(t))])
             assert np.isfinite(estimate.trajectory).all()
             if np.isfinite(estimate.candidate_cost):
                 assert estimate.cost <= estimate.candidate_cost
             if Status.MODEL_FAILED in estimate.status:
                 messages.append(estimate.message)
         assert not estimate.status & (Status.MODEL_FAILED | Status.FAILED_STAGE)
-        assert messages
         assert luck != "raises" or any("no more" in message for message in messages)
+        assert messages
 
 
-EXPECTED = "expected the same change"
 RESIDUALS = [
     (5, ModelError, "expected qpmhe.angles"),
     (lambda a, b: a - b + 0.1, ModelError, r"\[0.1, .* at a = b = .*expected zeros"),
-    (lambda a, b: b - a, ModelError, EXPECTED), (lambda a, b: np.sin(a - b), ModelError, EXPECTED),
+    (lambda a, b: b - a, ModelError, "expected the same change"),
     (lambda a, b: (a - b)[:1], ModelError, r"shape \(1,\).*expected"),
     (lambda a, b: 1 / 0, ModelError, "raised ZeroDivisionError"),
     (lambda a, b: np.log(a - b), ModelError, "expected finite numbers"),
     (lambda a: a, ModelError, "takes 1 positional argument.*expected the difference a - b"),
     (qpmhe.angles([7]), InvalidInputError, "names component 7"),
-    (qpmhe.System(lambda x: x, lambda x: x, n=3, p=3, state_residual=turned).state_residual,
-     ShapeError, "is for 3 components; expected 2"),
 ]
 
 

@@ -55,16 +55,8 @@ class Case:
 
     def check(self, trajectory):
         """The blocks of the inverse Hessian of the majorising forms, where noise-free rows hold."""
-        kept, n, first = self.kept, self.n, self.kept.first
-        hessian, discount = np.zeros((trajectory.size, trajectory.size)), self.cost.discount
-        hessian[:n, :n] = discount**kept.count * self.cost.majorise_prior(
-            trajectory[0] - kept.z[first], kept.P
-        )
-        residuals, slopes = kept.residuals(trajectory), differences(kept.residuals, trajectory)
-        for i, slope in enumerate(slopes):
-            joint = self.cost.joint_weight(kept.weight(first + i))
-            weight = self.cost.majorise(residuals[i : i + 1], joint[None])[0]
-            hessian += discount ** (kept.count - 1 - i) * slope.T @ weight @ slope
+        hessian, n = self.kept.hessian(trajectory, self.cost), self.n
+        slopes = differences(self.kept.residuals, trajectory)
         exact = slopes[:, self.free].reshape(-1, trajectory.size)
         basis = np.linalg.svd(exact)[2][len(exact) :].T if self.free else np.eye(len(hessian))
         inverse = basis @ np.linalg.inv(basis.T @ hessian @ basis) @ basis.T

@@ -55,9 +55,8 @@ def watching(innovation, make=qpmhe.ExtendedKalman, **covariances):
 
 
 def estimator(observer, start, system=None):
-    cost = qpmhe.QuadraticCost.from_covariances(
-        prior=qpmhe.ObserverPrior(), disturbance=observer._disturbance, noise=observer._noise
-    )
+    n, p = (system.n, system.p) if system else (3, 4)
+    cost = qpmhe.QuadraticCost(prior=qpmhe.ObserverPrior(), disturbance=np.eye(n), noise=np.eye(p))
     return qpmhe.MovingHorizonEstimator(
         system or qpmhe.System(f, h, n=3, p=4), observer, cost, initial_state=start, horizon=6,
         max_qps=0,
@@ -144,14 +143,12 @@ def test_the_gated_filter_is_the_plain_one(groups):
         assert rejected.any()
 
 
-A = np.array([[1.0, DT], [0.0, 1.0]])
-SLOW = {"prior": 0.01 * np.eye(2), "disturbance": np.diag([1e-6, 1e-4])}
-
 @each_filter
 @pytest.mark.parametrize("reopen", [1, 7])
 def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make, reopen):
-    system = qpmhe.System(lambda x: A @ x, lambda x: x[:1], n=2, p=1)
-    gate = watching(qpmhe.Gate(reopen=reopen), make, **SLOW, noise=[[0.01]])
+    system = qpmhe.System(lambda x: [x[0] + DT * x[1], x[1]], lambda x: x[:1], n=2, p=1)
+    covariances = {"disturbance": np.diag([1e-6, 1e-4]), "noise": [[0.01]]}
+    gate = watching(qpmhe.Gate(reopen=reopen), make, prior=0.01 * np.eye(2), **covariances)
     truth, begins = 50.0 * (np.arange(140) >= 40), 40  # the only sensor jumps for good
     Y = truth + 0.1 * np.random.default_rng(4).standard_normal(140)
     run = estimator(gate, [0.0, 0.0], system).run(Y)
@@ -168,9 +165,7 @@ def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make, reop
 @each_filter
 def test_without_any_sensor_the_observer_predicts_and_says_so(make):
     mhe = estimator(watching(qpmhe.Gate(reopen=1000, groups=[[0, 2]]), make), START)
-    few = mhe.update([100.0, 0.0, 100.0, np.nan])
-    assert few.rejected_sensors == (0,)
-    assert few.status & (Status.SENSORS_REJECTED | Status.ALL_REJECTED) == Status.SENSORS_REJECTED
+    assert mhe.update([100.0, 0.0, 100.0, np.nan]).rejected_sensors == (0,)
     for y in ([50.0, 50.0, 50.0, 50.0], [50.0, np.nan, np.nan, -1e149]):
         z = mhe.observer_state
         estimate = mhe.update(y)
@@ -178,8 +173,8 @@ def test_without_any_sensor_the_observer_predicts_and_says_so(make):
         np.testing.assert_allclose(mhe.observer_state, f(z), rtol=0, atol=1e-12)
         np.testing.assert_allclose(estimate.filtered, z, rtol=0, atol=1e-12)
         assert "only predicted" in estimate.explain()
-        assert "Rejected sensors: 0, " in estimate.explain()
     assert estimate.rejected_sensors == (0, 2)
+    assert "Rejected sensors: 0, 2" in estimate.explain()
     assert mhe.run([[50.0] * 4] * 3).share(Status.ALL_REJECTED) == 1.0
 
 
@@ -225,19 +220,13 @@ def test_what_fits_nothing_is_refused():
         (Gate, {"groups": [[0, -1]]}, "integers >= 0"),
         (Gate, {"groups": [[0, 1], [1, 2]]}, "one group at most"),
         (Huber, {"threshold": math.inf}, "threshold is inf"),
-        (Huber, {"reopen": -3}, "reopen is -3"),
         (watching, {"innovation": 3.0}, "innovation is 3.0; expected qpmhe.Gate(...)"),
-        (watching, {"innovation": Gate(groups=[[0, 4]])},
-         "groups has the output 4; expected outputs from 0 to 3"),
+        (watching, {"innovation": Gate(groups=[[0, 4]])}, "the output 4; expected outputs from 0"),
     ):
         check(OptionError, [text], make, **options)
-    mhe = estimator(watching(Gate()), FAR)
+    mhe, other = (estimator(watching(Gate(reopen=k)), FAR) for k in (3, 9))
     mhe.run(disturbed(7)[:5])
-    for change in (1, -100):
-        state = mhe.state_dict()
-        state["window/rejections"][2, 1] += change
-        with pytest.raises(InvalidInputError, match=r"another observer|damaged"):
-            mhe.load_state_dict(state)
-    for other in (None, Gate(reopen=9), Huber()):
-        another = estimator(watching(other), FAR)
-        check(InvalidInputError, ["observer"], another.load_state_dict, mhe.state_dict())
+    check(InvalidInputError, ["observer"], other.load_state_dict, mhe.state_dict())
+    state = mhe.state_dict()
+    state["window/rejections"][2, 1] -= 100
+    check(InvalidInputError, ["damaged"], mhe.load_state_dict, state)

@@ -1,7 +1,6 @@
 """Losses by their definitions: values, majorising forms, constants, and graduation."""
 
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -30,8 +29,6 @@ def barron(shape, threshold):
             return 2.0 * square * np.log1p(q / (2.0 * square))
         if shape == -np.inf:
             return -2.0 * square * np.expm1(-q / (2.0 * square))
-        if shape == -2.0:  # Geman-McClure
-            return q / (1.0 + q / (4.0 * square))
         width = 2.0 - shape
         rise = np.expm1(np.log1p(q / (square * width)) * shape / 2.0)
         return 2.0 * square * width / shape * rise
@@ -81,6 +78,8 @@ def test_values_and_their_derivatives(mask):
             np.testing.assert_allclose(
                 loss.cost(s, given), expected, rtol=1e-12, err_msg=repr(loss)
             )
+        assert not loss.cost(0.0 * s, weight).any()
+        assert np.isfinite(loss.majorise(0.0 * s, weight)).all()
         # The majorising weights carry half the derivative.
         weights = loss.majorise(s, weight)
         np.testing.assert_allclose(weights, np.swapaxes(weights, 1, 2), rtol=1e-13)
@@ -93,9 +92,6 @@ def test_values_and_their_derivatives(mask):
             np.testing.assert_allclose(
                 2.0 * majorising @ row, slope, rtol=1e-9, atol=atol, err_msg=repr(loss)
             )
-        zeros = np.zeros((1, 3))
-        assert loss.cost(zeros, weight) == [0.0]
-        assert np.isfinite(loss.majorise(zeros, weight)).all()
 
 
 def test_majorising_forms_lie_above_the_loss():
@@ -169,30 +165,24 @@ Y[:, :2] += 4.0
 
 
 def estimator(start, graduation=50.0, max_qps=3):
-    cost = qpmhe.RobustCost(
-        prior=[[1e-4]], disturbance=[[1e4]],
-        noise=GemanMcClure(100.0 * np.eye(5), per_component=True, graduation=graduation),
-    )
-    system = qpmhe.System(
-        lambda x: 0.98 * x, lambda x: np.stack([x[..., 0]] * 5, axis=-1), n=1, p=5
-    )
+    noise = GemanMcClure(100.0 * np.eye(5), per_component=True, graduation=graduation)
     return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(np.zeros((1, 5))), cost, initial_state=[start], horizon=8,
-        warm_start=True, max_qps=max_qps, engine="python",
+        qpmhe.System(lambda x: 0.98 * x, lambda x: np.full(5, 1.0) * x[0], n=1, p=5),
+        qpmhe.Luenberger(np.zeros((1, 5))),
+        qpmhe.RobustCost(prior=1e-4, disturbance=1e4, noise=noise),
+        horizon=8, initial_state=[start], warm_start=True, max_qps=max_qps, engine="python",
     )
 
 
-@pytest.mark.parametrize("max_qps", [1, 3, None])
+@pytest.mark.parametrize("max_qps", [1, None])
 def test_widened_losses_lead_to_the_sensors_that_agree_from_any_start(max_qps):
     mhe = estimator(7.0, max_qps=max_qps)
-    for start in (-10.0, 3.0, 7.0, 40.0):
+    for start in (-10.0, 7.0, 40.0):
         mhe.reset([start])
         run = mhe.run(Y)
         assert np.abs(run.states[10:, 0] - STATES[10:]).max() < 0.3
-        assert (run.costs <= run.candidate_costs).all()
-        for t, status in enumerate(run.statuses):
-            assert (Status.GRADUATED in status) == (t + 1 < 8)
-            assert ("widened" in status.explain()) == (t + 1 < 8)
+        assert [Status.GRADUATED in one for one in run.statuses] == [True] * 7 + [False] * 23
+        assert ["widened" in one.explain() for one in run.statuses[6:8]] == [True, False]
     run = estimator(7.0, 1.0, max_qps).run(Y)  # without them, the start decides
     assert np.abs(run.states[10:, 0] - STATES[10:]).min() > 1.5
 
@@ -201,7 +191,7 @@ def test_the_surrogate_goes_on_where_the_candidate_is_the_estimate():
     """In a basin that costs less at first, a candidate hides the trajectory that is followed."""
     mhe, other = (estimator(float(Y[0, :2].mean()), max_qps=2) for _ in range(2))
     kept = [mhe.update(y) for y in Y[:4]]
-    other.load_state_dict(pickle.loads(pickle.dumps(mhe.state_dict())))
+    other.load_state_dict(mhe.state_dict())
     for y in Y[4:20]:
         kept.append(mhe.update(y))
         assert_same(other.update(y), kept[-1])

@@ -1,10 +1,22 @@
-"""Boxes, polytopes and intersections."""
+"""Boxes, polytopes and intersections; soft sets and nonlinear constraints in the estimator."""
+
+import pickle
+import re
 
 import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.errors import SetError
+from qpmhe import Box, Constraint, Polytope, Status
+from qpmhe.certificates.audit import checked_ingredients
+from qpmhe.codegen.library import uncovered
+from qpmhe.errors import InvalidInputError, ModelError, SetError
+from qpmhe.estimation.settings import Settings
+from qpmhe.studies.ipopt import IpoptEstimator
+
+from .same import assert_same
+
+pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 
 
 def plain_violation(one, point):
@@ -28,7 +40,7 @@ def test_a_point_is_in_an_intersection_as_far_as_in_each_part(kinds):
             lower = np.where(generator.random(d) < 0.3, -np.inf, -generator.exponential(size=d))
             upper = np.where(generator.random(d) < 0.3, np.inf, generator.exponential(size=d))
             rows, side = generator.standard_normal((2, d)), generator.exponential(size=2)
-            parts.append(qpmhe.Box(lower, upper) if kind == "b" else qpmhe.Polytope(rows, side))
+            parts.append(Box(lower, upper) if kind == "b" else Polytope(rows, side))
         whole = parts[0]
         for part in parts[1:]:
             whole = whole & part
@@ -43,16 +55,16 @@ def test_a_point_is_in_an_intersection_as_far_as_in_each_part(kinds):
 
 def test_components_that_are_bounded_and_fixed():
     given = np.zeros(2)
-    box, polytope = qpmhe.Box(given, given + 1.0), qpmhe.Polytope(np.eye(2), given)
+    box, polytope = Box(given, given + 1.0), Polytope(np.eye(2), given)
     given[:] = -9.0  # copies are kept
     assert (box.violation(given + 9.0), polytope.violation(given + 9.0)) == (0.0, 0.0)
-    wide = qpmhe.Box([-np.inf, 0.0, -1.0, -np.inf], [np.inf, 0.0, np.inf, 2.0])
+    wide = Box([-np.inf, 0.0, -1.0, -np.inf], [np.inf, 0.0, np.inf, 2.0])
     np.testing.assert_array_equal(wide.bounded_components, [1, 2, 3])
     np.testing.assert_array_equal(wide.fixed_components, [1])
     # Sets that only touch are not empty.
-    point = qpmhe.Box(0, 1) & qpmhe.Box([1.0], [2.0])
+    point = Box(0, 1) & Box([1.0], [2.0])
     np.testing.assert_array_equal(point.fixed_components, [0])
-    corner = qpmhe.Box([0.0, 0.0], [1.0, 1.0]) & qpmhe.Polytope([-1.0, -1.0], -2.0)
+    corner = Box([0.0, 0.0], [1.0, 1.0]) & Polytope([-1.0, -1.0], -2.0)
     assert corner.violation(np.array([1.0, 1.0])) == 0.0
 
 
@@ -60,16 +72,16 @@ def test_components_that_are_bounded_and_fixed():
 def test_whether_a_set_is_empty_depends_on_no_unit(units, row):
     units = np.array(units)
     matrix = row * np.array([[1.0, 1.0], [-1.0, -0.5], [0.0, -1.0]]) / units
-    made = qpmhe.Polytope(matrix, row * np.array([1.0, -0.9, 0.0]))
-    assert (made & qpmhe.Box(0.1 * units, units)).dimension == 2
+    made = Polytope(matrix, row * np.array([1.0, -0.9, 0.0]))
+    assert (made & Box(0.1 * units, units)).dimension == 2
     with pytest.raises(SetError, match="empty"):
-        made & qpmhe.Box([-np.inf, 0.6 * units[1]], [np.inf, np.inf])
+        made & Box([-np.inf, 0.6 * units[1]], [np.inf, np.inf])
     with pytest.raises(SetError, match="empty"):
-        qpmhe.Polytope(matrix, row * np.array([1.0, -1.2, 0.0]))
+        Polytope(matrix, row * np.array([1.0, -1.2, 0.0]))
 
 
 def test_inequalities_on_unknown_components_do_not_count():
-    one = qpmhe.Box([-1.0, -2.0, -3.0], [1.0, 2.0, np.inf]) & qpmhe.Polytope(
+    one = Box([-1.0, -2.0, -3.0], [1.0, 2.0, np.inf]) & Polytope(
         [[1.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 1.0, 1.0]], [2.5, 2.0, 3.0]
     )
     # Component 0 is out by 6, 1 by 2, 2 by 4; the rows by 8.5, 5 and 1.
@@ -78,3 +90,181 @@ def test_inequalities_on_unknown_components_do_not_count():
         assert one.violation(point, np.array(known, bool)) == expected
     rows = one.touched(np.array([[True, False, False], [False, False, True], [False] * 3]))
     np.testing.assert_array_equal(rows, [[1, 0, 1], [0, 1, 1], [0, 0, 0]])
+
+
+# In the estimator
+
+
+def f(x):
+    return np.array([x[0] + 0.1 * x[1], x[1] + 0.1 * ((1 - x[0] ** 2) * x[1] - x[0])])
+
+
+def h(x):
+    return np.array([x[0] + 0.1 * x[1] ** 2, x[1]])
+
+
+def ball(x):
+    return x[0] ** 2 + x[1] ** 2 - 2.0
+
+
+def within(w, v):
+    return np.array([w[0] ** 2 + w[1] ** 2 - 0.004, v[0] + 0.5 * v[1] - 0.2])
+
+
+COST = qpmhe.QuadraticCost.from_covariances(
+    prior=0.25 * np.eye(2), disturbance=0.01 * np.eye(2), noise=0.04 * np.eye(2)
+)
+OBSERVER = qpmhe.Luenberger(0.1 * np.eye(2))
+UNIT = Box([-1.0, -1.0], [1.0, 1.0])
+SOFT = {
+    "states": Box([-0.9, -np.inf], [1.0, 0.6]).soften(linear=3.0),
+    "noises": Box([-0.2, -0.2], [0.1, 0.3]).soften(quadratic=[20.0, 40.0]),
+    "constraints": [
+        Constraint(ball, linear=4.0),
+        Constraint(within, 2, linear=[10.0, 0.0], quadratic=[0.0, 30.0]),
+    ],
+}
+
+
+def record(steps=24):
+    rng, x, ys = np.random.default_rng(1), np.array([1.2, 0.5]), []
+    for _ in range(steps):
+        ys.append(h(x) + 0.2 * rng.standard_normal(2))
+        x = f(x) + 0.05 * rng.standard_normal(2)
+    return np.array(ys)
+
+
+def make(options=None, system=None, **given):
+    return qpmhe.MovingHorizonEstimator(
+        system or qpmhe.System(f, h, n=2, p=2, **(options or {})), OBSERVER, COST, horizon=6,
+        initial_state=[1.5, 0.8], **{"max_qps": None, **given},
+    )
+
+
+def test_hard_constraints_hold_or_are_named():
+    """Rows on missing outputs do not count."""
+    hard, named, kept = {"constraints": [Constraint(ball), Constraint(within, 2)]}, 0, 0
+    ys = record()
+    ys[5:12, 1] = np.nan
+    dropping, keeping = make(hard, max_qps=3), make(hard, infeasible="keep_candidate")
+    for y in ys:
+        estimate = dropping.update(y)
+        first = estimate.time + 1 - len(estimate.disturbances)
+        missed = set()
+        for i, x in enumerate(estimate.trajectory):
+            values = [ball(x)]
+            if i < len(estimate.disturbances) and np.isfinite(estimate.noises[i]).all():
+                values += within(estimate.disturbances[i], estimate.noises[i]).tolist()
+            missed |= {(j, first + i) for j, value in enumerate(values) if value > 1e-6}
+        if estimate.improved:
+            assert missed == {(row.row, row.time) for row in estimate.dropped}
+        named += bool(estimate.dropped)
+        other = keeping.update(y)
+        kept += Status.CANDIDATE_OUTSIDE in other.status and not other.dropped
+    assert named
+    assert kept
+
+
+@pytest.mark.parametrize(("bad", "penalty"), [
+    ("raise", {}), ("exit", {"linear": 5.0}), ("nan", {"linear": 5.0}), ("shape", {}),
+])
+def test_a_constraint_that_fails_far_from_the_data_never_escapes(bad, penalty):
+    armed, failed = [], 0
+
+    def g(x, v):
+        if armed and x[0] > 1.2 and x[1] > 0.0:
+            if bad in ("raise", "exit"):
+                raise ValueError("too far") if bad == "raise" else SystemExit
+            return [1.0, 2.0, 3.0] if bad == "shape" else np.nan
+        return x[0] - 1.1 + 0.1 * v[0]
+
+    mhe = make({"constraints": [Constraint(g, **penalty)]})
+    armed.append(True)
+    rng = np.random.default_rng(3)
+    for y in record():
+        estimate = mhe.update(y + rng.choice([0.0, 1.5]))
+        assert not estimate.cost > estimate.candidate_cost
+        if Status.MODEL_FAILED in estimate.status:
+            failed += 1
+            assert "constraints[0]" in estimate.message
+        assert np.isfinite(estimate.cost) or not estimate.improved
+    assert failed
+
+
+def test_snapshots_continue_bit_for_bit_with_the_same_constraints_only():
+    ys = record(18)
+    first, second = (make(SOFT, max_qps=3) for _ in range(2))
+    first.run(ys[:11])
+    third = pickle.loads(pickle.dumps(first))
+    second.load_state_dict(first.state_dict())
+    for y in ys[11:]:
+        expected = first.update(y)
+        assert_same(second.update(y), expected)
+        assert_same(third.update(y), expected)
+    soft = {"constraints": [Constraint(ball, linear=1.0)]}
+    for one, other, words in (
+        (soft, {"constraints": [Constraint(ball, linear=2.0)]}, "another constraints"),
+        ({"states": UNIT.soften(linear=2.0)}, {"states": UNIT.soften(linear=1.0)}, "set of states"),
+    ):
+        mhe = make(one)
+        mhe.update([1.0, 0.5])
+        with pytest.raises(InvalidInputError, match=words):
+            make(other).load_state_dict(mhe.state_dict())
+
+
+def test_constraints_of_inputs_count_with_steps_of_any_length():
+    options = {"n": 2, "p": 2, "m": 1, "dt": 0.1, "method": "euler"}
+    soft, free = (
+        make(system=qpmhe.System.from_ode(lambda x, u: [x[1] + u[0], -x[0]], h, **options, **more))
+        for more in ({"constraints": [Constraint(lambda x, u: u[0] - 0.8, quadratic=50.0)]}, {})
+    )
+    for t, y in enumerate(record(5)):
+        own = {"u": [0.3 * t], "dt": 0.2 if t == 2 else None}
+        one, other = soft.update(y, **own), free.update(y, **own)
+        missed = 0.1**2 * (t > 2) + 0.4**2 * (t > 3)  # at inputs of 0.9 and 1.2
+        assert one.candidate_cost == pytest.approx(other.candidate_cost + 50.0 * missed)
+
+
+def test_the_observer_is_not_projected_onto_a_soft_set():
+    mhe = make({"states": Box([-0.1, -0.1], [0.1, 0.1]).soften(linear=1.0)})
+    assert mhe.initial_state.tolist() == [1.5, 0.8]
+    outside = Status.OBSERVER_PROJECTED | Status.CANDIDATE_OUTSIDE
+    assert not any(mhe.update(y).status & outside for y in record())
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("states", "a soft set of states"), ("constraints", "nonlinear constraints"),
+])
+def test_what_does_not_have_them_says_so_by_name(name, words):
+    parts = qpmhe.System(f, h, n=2, p=2, **{name: SOFT[name]}), OBSERVER, COST
+    parts[0].symbolic = object()  # as if it had a CasADi form
+    assert words in uncovered(*parts, Settings(6, "auto", 1))
+    given = {"f": f, "h": h, "horizon": 6, "initial_state": np.zeros(2)}
+    for kind, options in ((checked_ingredients, {}), (IpoptEstimator, given)):
+        with pytest.raises(InvalidInputError, match=words):
+            kind(*parts, **options)
+
+
+WRONG = [
+    (lambda: UNIT.soften(), SetError, "row 0 of the soft set has no penalty"),
+    (lambda: UNIT.soften(linear=-1.0), SetError, "linear is -1.0; expected finite numbers >= 0"),
+    (lambda: UNIT & UNIT.soften(linear=1.0), SetError, "intersect sets first and soften"),
+    (lambda: Constraint(ball, linear=0.0), SetError, "leave the constraint hard"),
+    (lambda: Constraint(lambda z: z), ModelError, "has the parameter z; expected only x"),
+    (lambda: Constraint(lambda u: u), ModelError, "g takes u, so that no estimate"),
+    (lambda: make({"constraints": [ball]}), SetError, "expected a list of qpmhe.Constraint"),
+    (lambda: make({"constraints": [Constraint(lambda x, u: x[0])]}), ModelError,
+     "constraints[0] takes u, but the system has no inputs"),
+    (lambda: make({"constraints": [Constraint(lambda x: x, 3)]}), ModelError,
+     "constraints[0] returned shape (2,)"),
+    (lambda: make({"constraints": [Constraint(lambda x: np.log(x[0] - 3.0))]}), ModelError,
+     "constraints[0] is [nan] at the initial state"),
+    (lambda: make({"state_residual": qpmhe.angles([0]), "states": SOFT["states"]}), SetError,
+     "bounds an angle"),
+]
+
+
+def test_bad_input_is_refused():
+    for make_it, error, text in WRONG:
+        with np.errstate(all="ignore"), pytest.raises(error, match=re.escape(text)):
+            make_it()
