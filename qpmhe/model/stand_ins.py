@@ -87,16 +87,18 @@ def numpy_on_symbols(record: MakingRecord) -> Iterator[None]:
             if not _swaps:
                 for (module, name), function in _originals.items():
                     setattr(module, name, function)
+                _originals.clear()
 
 
 def _swap() -> None:
+    # After an interrupt, what is there may be a stand-in: the original is the one from before.
     for name in _MAKERS:
-        _originals[np, name] = getattr(np, name)
-        setattr(np, name, _maker(getattr(np, name)))
+        original = _originals.setdefault((np, name), getattr(np, name))
+        setattr(np, name, _maker(original))
     for name, other in _OF_MATH.items():
         if hasattr(math, name) and hasattr(np, other):
-            _originals[math, name] = getattr(math, name)
-            setattr(math, name, _of_math(getattr(math, name), getattr(np, other)))
+            original = _originals.setdefault((math, name), getattr(math, name))
+            setattr(math, name, _of_math(original, getattr(np, other)))
 
 
 def _maker(function: Callable[..., Any]) -> Callable[..., Any]:

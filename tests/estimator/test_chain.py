@@ -1,4 +1,4 @@
-"""The chain of masses: its forces, its derivatives, its observer, and what an estimate gains."""
+"""The chain of masses: its forces, its derivatives, its observer, and its sizes."""
 
 import numpy as np
 import pytest
@@ -8,24 +8,6 @@ from qpmhe.models.chain import casadi_output, casadi_rate, chain_of_masses
 
 NONE = np.zeros(0)
 MASS, STIFFNESS, LENGTH, DAMPING, GRAVITY, SPACING = 0.033, 1.0, 0.033, 0.04, 9.81, 0.25
-each_size = pytest.mark.parametrize(
-    ("masses", "dimension"), [(1, 1), (4, 1), (1, 2), (3, 2), (1, 3), (3, 3), (9, 3)]
-)
-
-
-def continuous(system):
-    """The rate, its Jacobian, the output and its Jacobian, which the system is made of."""
-    given = system.__reduce__()[1][1]
-    return given["rate"], given["rate_jacobian"], given["h"], given["h_jacobian"]
-
-
-def states(scenario, count):
-    """Random states, far from rest and from each other."""
-    generator = np.random.default_rng(5)
-    rest = scenario.initial_estimate
-    return rest + generator.uniform(0.1, 2.0, (count, 1)) * generator.standard_normal(
-        (count, rest.size)
-    )
 
 
 def energy(x, masses, dimension):
@@ -43,39 +25,40 @@ def energy(x, masses, dimension):
     return 0.5 * MASS * (v**2).sum() + stored, (moves**2).sum()
 
 
-@each_size
-def test_energy_is_lost_to_the_dampers_only(masses, dimension):
-    system, _, _, scenario = chain_of_masses(masses, dimension)
-    rate = continuous(system)[0]
-    for x in states(scenario, 5):
-        direction = rate(x)
-        step = 1e-6 / np.linalg.norm(direction)
-        ahead, behind = (energy(x + s * direction, masses, dimension)[0] for s in (step, -step))
-        lost = DAMPING * energy(x, masses, dimension)[1]
-        power = np.linalg.norm(direction) * np.linalg.norm(x)
-        assert lost > 0.0
-        assert (ahead - behind) / (2.0 * step) == pytest.approx(-lost, abs=1e-7 * power)
-
-
-@each_size
-def test_casadi_gives_the_same(masses, dimension):
+@pytest.mark.parametrize(("masses", "dimension"), [(1, 1), (4, 1), (3, 2), (1, 3), (9, 3)])
+def test_energy_is_lost_to_the_dampers_only_and_casadi_gives_the_same(masses, dimension):
     casadi = pytest.importorskip("casadi")
     system, _, _, scenario = chain_of_masses(masses, dimension)
-    x, points = casadi.SX.sym("x", system.n), states(scenario, 20)
+    given, generator = system.__reduce__()[1][1], np.random.default_rng(5)
+    rest, x = scenario.initial_estimate, casadi.SX.sym("x", system.n)
+    # Random states, far from rest and from each other.
+    points = rest + generator.uniform(0.1, 2.0, (20, 1)) * generator.standard_normal(
+        (20, rest.size)
+    )
+    for point in points[:5]:
+        direction = given["rate"](point)
+        step = 1e-6 / np.linalg.norm(direction)
+        ahead, behind = (
+            energy(point + s * direction, masses, dimension)[0] for s in (step, -step)
+        )
+        lost = DAMPING * energy(point, masses, dimension)[1]
+        power = np.linalg.norm(direction) * np.linalg.norm(point)
+        assert (ahead - behind) / (2.0 * step) == pytest.approx(-lost, abs=1e-7 * power)
     expressions = [casadi_rate(masses, dimension)(x), casadi_output(masses, dimension)(x)]
     symbolic = casadi.Function(
         "expected", [x], [g for e in expressions for g in (e, casadi.jacobian(e, x))]
     )
     values = zip(*([np.array(one) for one in symbolic(point)] for point in points), strict=True)
-    for k, (function, expected) in enumerate(zip(continuous(system), values, strict=True)):
+    names = ("rate", "rate_jacobian", "h", "h_jacobian")
+    for k, (name, expected) in enumerate(zip(names, values, strict=True)):
         expected = np.array(expected)[..., slice(None) if k % 2 else 0]
         tolerance = (1e-10 if k % 2 else 1e-12) * (1.0 + np.abs(expected).max())
-        for found in ([function(point) for point in points], function(points)):
+        for found in ([given[name](point) for point in points], given[name](points)):
             np.testing.assert_allclose(found, expected, rtol=0.0, atol=tolerance)
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
-@pytest.mark.parametrize(("masses", "dimension"), [(1, 1), (9, 1), (3, 2), (2, 3), (5, 3)])
+@pytest.mark.parametrize(("masses", "dimension"), [(9, 1), (3, 2), (5, 3)])
 def test_the_observer_converges(masses, dimension, method):
     system, observer, _, scenario = chain_of_masses(masses, dimension, method)
     # Independent of the design: the chain itself, and the error's linearisation, are stable.
@@ -90,12 +73,8 @@ def test_the_observer_converges(masses, dimension, method):
 
 
 def test_sizes_that_are_none():
-    for options, named in (
-        ({"masses": 0}, "masses is 0; expected an integer >= 1"),
-        ({"masses": 2.0}, r"masses is 2\.0"), ({"masses": True}, "masses is True"),
-        ({"dimension": 4}, "dimension is 4; expected 1, 2 or 3"),
-        ({"dimension": 3.0}, r"dimension is 3\.0"), ({"dimension": "3"}, "dimension is '3'"),
-    ):
-        for maker in (chain_of_masses, casadi_rate, casadi_output):
-            with pytest.raises(qpmhe.errors.OptionError, match=named):
-                maker(**options)
+    for maker in (chain_of_masses, casadi_rate, casadi_output):
+        with pytest.raises(qpmhe.errors.OptionError, match="masses is 0; expected an integer >= 1"):
+            maker(masses=0)
+        with pytest.raises(qpmhe.errors.OptionError, match="dimension is 4; expected 1, 2 or 3"):
+            maker(dimension=4)

@@ -1,27 +1,44 @@
-"""Jacobians of functions as they are written: by complex steps, or by differences."""
+"""Jacobians: by complex steps, by differences, or the user's own, in any unit."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.errors import ModelError, OptionError
+
+from .spoil import check
+from .untraced import untraced
 
 NONE = np.zeros(0)
 COMPLEX, DIFFERENCES = "complex step", "finite differences"
+LINEAR = np.array([[1.0, 0.1], [-0.2, 0.9]])
 
 
-def system_of(f, n=2, **options):
-    return qpmhe.System(f, lambda x: x[..., :1], n=n, p=1, **options)
+def system_of(f, jacobian=None, n=2, **options):
+    return qpmhe.System(f, lambda x: x[..., :1], n=n, p=1, f_jacobian=jacobian, **options)
 
 
-def check(jacobian, points, expected, **tolerance):
+def estimator(system, deviation, gain, start, noise=1.0):
+    """Costs in the unit of the deviation."""
+    prior = deviation**2 * np.eye(system.n)
+    cost = qpmhe.QuadraticCost.from_covariances(prior=prior, disturbance=prior / 100, noise=noise)
+    observer = gain if isinstance(gain, qpmhe.Observer) else qpmhe.Luenberger(gain)
+    return qpmhe.MovingHorizonEstimator(system, observer, cost, horizon=3, initial_state=start)
+
+
+def compare(jacobian, points, expected, **tolerance):
     """One state at a time, and all at once."""
     points = np.array(points)
     singles = [jacobian(x, NONE) for x in points]
     np.testing.assert_allclose(singles, expected, **tolerance)
     batch = jacobian.batch(points, np.zeros((len(points), 0)))
     np.testing.assert_allclose(batch, expected, **tolerance)
+
+
+# Functions as they are written
 
 
 def components(a, b, c):
@@ -44,23 +61,10 @@ def slopes(a, b, c):
         *(complex(s) if np.iscomplexobj(x) else float(s) for s in x))),
 ])
 def test_complex_step_is_exact_to_rounding(mode, f):
-    system = system_of(f, 3)
+    system = system_of(f, n=3)
     assert (system.f.mode, system.f_jacobian.method) == (mode, COMPLEX)
     points = np.random.default_rng(1).uniform(0.1, 4.0, (20, 3))
-    check(system.f_jacobian, points, [slopes(*x) for x in points], rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("scale", [1.0, 1e4, 1e8])
-def test_derivatives_are_accurate_at_any_scale(scale):
-    x = scale * np.array([0.7, 1.3])
-    system = system_of(lambda x: x**3 / scale**2)
-    check(system.f_jacobian, [x], [np.diag(3.0 * x**2 / scale**2)], rtol=1e-13)
-    system = system_of(
-        lambda x: [math.pow(x[0] / scale, 3) * scale, 2.0 * x[1]],
-        states=qpmhe.Box([0.5 * scale, 0.5 * scale], [3.0 * scale, 3.0 * scale]),
-    )
-    assert system.f_jacobian.method == DIFFERENCES
-    check(system.f_jacobian, [x], [np.diag([3 * 0.7**2, 2.0])], rtol=1e-6, atol=1e-6)
+    compare(system.f_jacobian, points, [slopes(*x) for x in points], rtol=1e-12, atol=1e-15)
 
 
 def real_array(x):
@@ -70,36 +74,24 @@ def real_array(x):
     return value
 
 
-# Each with the Jacobian; none of them can carry an imaginary part to its end.
-NOT_COMPLEX = {
-    "abs": (
-        lambda x: np.abs(x) * x[..., ::-1],
-        lambda a, b: [[np.sign(a) * b, abs(a)], [abs(b), np.sign(b) * a]],
-    ),
-    "float": (lambda x: [float(x[0]) ** 2, x[1]], lambda a, b: [[2 * a, 0], [0, 1]]),
-    "into a real array": (real_array, lambda a, b: [[2 * a, 0], [b, a]]),
-    "sign": (lambda x: np.sign(x) * x**2, lambda a, b: [[2 * abs(a), 0], [0, 2 * abs(b)]]),
-    "interpolation": (
-        lambda x: [np.interp(x[0], [-9.0, 9.0], [-18.0, 18.0]), x[1]],
-        lambda a, b: [[2, 0], [0, 1]],
-    ),
-    # Rows of large units hide nothing.
-    "a large row": (
-        lambda x: np.stack([1e6 * x[..., 0], np.abs(x[..., 1])], axis=-1),
-        lambda a, b: [[1e6, 0.0], [0.0, np.sign(b)]],
-    ),
-}
-
-
 def test_functions_that_break_the_complex_step():
+    """None of them can carry an imaginary part to its end."""
     generator = np.random.default_rng(2)
     points = generator.uniform(0.2, 3.0, (10, 2)) * generator.choice([-1.0, 1.0], (10, 2))
-    for case, (f, jacobian) in NOT_COMPLEX.items():
+    for f, jacobian in (
+        (lambda x: np.abs(x) * x[..., ::-1],
+         lambda a, b: [[np.sign(a) * b, abs(a)], [abs(b), np.sign(b) * a]]),
+        (lambda x: [float(x[0]) ** 2, x[1]], lambda a, b: [[2 * a, 0], [0, 1]]),
+        (real_array, lambda a, b: [[2 * a, 0], [b, a]]),
+        # Rows of large units hide nothing.
+        (lambda x: np.stack([1e6 * x[..., 0], np.abs(x[..., 1])], axis=-1),
+         lambda a, b: [[1e6, 0.0], [0.0, np.sign(b)]]),
+    ):
         system = system_of(f)
-        assert system.f_jacobian.method == DIFFERENCES, case
+        assert system.f_jacobian.method == DIFFERENCES
         expected = np.array([jacobian(*x) for x in points])
-        size = np.abs(expected).max(initial=1.0)
-        check(system.f_jacobian, points, expected, rtol=1e-6, atol=1e-6 * min(size, 1e3))
+        size = min(np.abs(expected).max(initial=1.0), 1e3)
+        compare(system.f_jacobian, points, expected, rtol=1e-6, atol=1e-6 * size)
 
 
 def test_branches():
@@ -107,13 +99,12 @@ def test_branches():
     points = np.random.default_rng(3).uniform(-2.0, 2.0, (10, 2))
     for f, slope in (
         (lambda x: np.maximum(x, 0.5) * x, lambda s: 2 * s if s > 0.5 else 0.5),
-        (lambda x: np.minimum(x, 0.5) * x, lambda s: 2 * s if s < 0.5 else 0.5),
         (lambda x: np.clip(x, -0.5, 0.5), lambda s: float(-0.5 < s < 0.5)),
         (lambda x: np.where(x > 0, x**2, x), lambda s: 2 * s if s > 0 else 1),
         (lambda x: [max(x[0], 0.5), max(x[1], 0.5)], lambda s: float(s > 0.5)),
     ):
         expected = [np.diag([slope(s) for s in x]) for x in points]
-        check(system_of(f).f_jacobian, points, expected, rtol=1e-6, atol=1e-6)
+        compare(system_of(f).f_jacobian, points, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_functions_that_are_others_at_the_probes_than_where_they_are_used():
@@ -132,3 +123,158 @@ def test_functions_that_are_others_at_the_probes_than_where_they_are_used():
         system.check(x, NONE)
         assert system.f_jacobian.method == methods[-1]
         np.testing.assert_allclose(system.f_jacobian(x, NONE), expected, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e8])
+def test_differences_at_a_bound_go_inwards(unit):
+    def f(x):
+        """Defined for x >= 0 alone, and for real numbers alone."""
+        a, b = x / unit
+        return [unit * (0.5 * math.sqrt(a) * a + 0.1 * b), unit * (b**1.5 + math.sqrt(a) * a)]
+
+    box = qpmhe.Box([0.0, 0.0], [np.inf, np.inf])
+    system = system_of(f, states=box, scales=[unit, unit])
+    for share in (0.0, 1e-12, 1e-7, 0.1):
+        for a, b in ((share, 1.0), (1.0, share), (share, share)):
+            np.testing.assert_allclose(
+                system.f_jacobian(unit * np.array([a, b]), NONE),
+                [[0.75 * math.sqrt(a), 0.1], [1.5 * math.sqrt(a), 1.5 * math.sqrt(b)]],
+                rtol=1e-6, atol=5e-3,  # of a root of a third order, a quotient of second order
+            )
+
+
+def test_an_estimator_on_a_bound_needs_no_model_beyond_it():
+    system = qpmhe.System(
+        untraced(lambda x: [0.9 * x[0] + 0.1 * x[0] * math.sqrt(x[0])]), lambda x: x, n=1, p=1,
+        states=qpmhe.Box([0.0], [np.inf]),
+    )
+    # Nor does the test of a correction.
+    observer = qpmhe.OutputInjection(lambda z, v: 0.1 * v * math.sqrt(z[0]))
+    for gain in ([0.5], observer):
+        estimate = estimator(system, 0.1, gain, [0.0], 0.01).update([0.2])
+        assert estimate.improved, estimate.message
+        assert not estimate.message
+
+
+# Jacobians of the user's own
+
+
+def spiral(x):
+    return np.stack([x[..., 0] * x[..., 1], np.sin(x[..., 0]) + 2.0 * x[..., 1]], axis=-1)
+
+
+def slope(x):
+    return np.array([[x[1], x[0]], [np.cos(x[0]), 2.0]])
+
+
+@pytest.mark.parametrize("wrong", [0.05, 1e4])
+def test_a_wrong_entry_is_named_with_both_values(wrong):
+    for entry in np.ndindex(2, 2):
+        def jacobian(x, entry=entry):
+            value = slope(x)
+            value[entry] += wrong
+            return value
+
+        with pytest.raises(ModelError) as caught:
+            system_of(spiral, jacobian, scales=[1.0, 1.0])
+        text = str(caught.value)
+        assert f"f_jacobian[{entry[0]}, {entry[1]}] is " in text
+        x = np.array(json.loads(text.split("x = ")[1].split(", but")[0]))
+        assert f"is {jacobian(x)[entry]:.6g} at" in text
+        right = float(text.split("there is ")[1].split(". Correct")[0])
+        assert right == pytest.approx(slope(x)[entry], rel=1e-5)
+
+
+def test_wrong_jacobians():
+    check(
+        ModelError, ["rate_jacobian[0, 1] is "], qpmhe.System.from_ode, spiral, lambda x: x,
+        rate_jacobian=lambda x: slope(x) + np.eye(2, k=1), dt=1e-6, n=2, p=2, scales=[1.0, 1.0],
+    )
+    for text, f, jacobian in (
+        (["f_jacobian[", "leave it out"], lambda x: x @ LINEAR.T, lambda x: LINEAR.T),
+        # A row of large units hides no wrong entry.
+        (["f_jacobian[1, 1] is 1.5 "], lambda x: x * np.array([1e6, 1.0]),
+         lambda x: np.diag([1e6, 1.5])),
+        (["f_jacobian returned shape (3, 2)", "expected (2, 2)"], spiral, lambda x: np.ones((3, 2)))
+    ):
+        check(ModelError, text, system_of, f, jacobian, scales=[1.0, 1.0])
+    # At the probes, near one, the wrong term is lost among the others.
+    system = system_of(lambda x: x + 1e-9 * x**4, lambda x: np.diag(1.0 + 0.0 * x))
+    words = ["f_jacobian[1, 1] is 1 at x = [1.0, 1000.0]", "there is 5"]
+    check(ModelError, words, estimator, system, 1.0, [0.1, 0.1], [1.0, 1000.0])
+    # At a kink any slope between the sides is a derivative.
+    for at_zero in (0.3, 0.6, 1.2):
+        system = system_of(
+            lambda x: np.where(x > 0, 0.9 * x, 0.3 * x), lambda x, at_zero=at_zero: np.where(
+                x > 0, 0.9, np.where(x < 0, 0.3, at_zero))[..., None], n=1, scales=[1.0],
+        )
+        if at_zero > 1.0:
+            check(ModelError, ["is 1.2 at"], system.check, np.zeros(1), NONE)
+        else:
+            system.check(np.zeros(1), NONE)
+
+
+def test_right_jacobians_are_used_as_given():
+    x = np.random.default_rng(6).standard_normal((5, 2))
+    for jacobian in (
+        slope, lambda x: [[x[1], x[0]], [math.cos(x[0]), 2.0]],
+        lambda x: np.stack([
+            np.stack([x[..., 1], x[..., 0]], axis=-1),
+            np.stack([np.cos(x[..., 0]), 2.0 + 0.0 * x[..., 0]], axis=-1),
+        ], axis=-2),
+        lambda x: np.array([[x[1], x[0]], [np.cos(x[0]), 2.0 + 0.0 * x[0]]]),
+    ):
+        system = system_of(spiral, jacobian)
+        assert (system.f_jacobian.method, system.h_jacobian.method) == ("given", COMPLEX)
+        compare(system.f_jacobian, x, [slope(xi) for xi in x], rtol=1e-14)
+    for f, m in ((lambda x: x @ LINEAR.T, 0), (lambda x, u: x @ LINEAR.T + u, 2)):
+        system = system_of(f, lambda x: LINEAR, m=m)  # of many states, too
+        found = system.f_jacobian.batch(np.ones((4, 2)), np.ones((4, m)))
+        np.testing.assert_array_equal(found, [LINEAR] * 4)
+    system = qpmhe.System(  # of one output a vector will do
+        spiral, lambda x: 2.0 * x[..., 1:], n=2, p=1, h_jacobian=lambda x: np.array([0.0, 2.0])
+    )
+    compare(system.h_jacobian, np.ones((3, 2)), [[[0.0, 2.0]]] * 3)
+
+
+# In any unit
+
+
+def uptake(km, given=None):
+    """Two concentrations, one of which is taken up with the constant Km."""
+
+    def f(x):
+        rate = x[0] / (km + x[0])
+        return np.array([x[0] - 0.1 * km * rate, 0.9 * x[1] + 0.1 * km * rate])
+
+    def jacobian(x):
+        steep = 0.1 * km * km / (km + x[0]) ** 2 if given is None else given
+        return np.array([[1.0 - steep, 0.0], [steep, 0.9]])
+
+    return f, jacobian
+
+
+@pytest.mark.parametrize("km", [5e-9, 5e9])
+def test_given_jacobians_are_compared_in_any_unit(km):
+    system = system_of(*uptake(km))
+    for start in (0.0, 0.3, 2.0):
+        mhe = estimator(system, km, [0.3, 0.1], [start * km, km], 0.01 * km**2)
+        assert np.isfinite(mhe.update([0.5 * km]).state).all()
+    wrong, words = uptake(km, 0.05), ["f_jacobian[0, 0] is 0.95 at ", "leave it out"]
+    check(ModelError, words, estimator, system_of(*wrong), km, [0.3, 0.1], [km, km])
+    check(ModelError, words, system_of, *wrong, scales=[km, km])
+    check(OptionError, ["scales"], system_of, *wrong, scales=[0.0, 1.0])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_a_correction_is_tried_near_the_start_in_any_unit(unit):
+    def correction(z, v):
+        # Defined near 3 units alone, and far from fits it would write into v.
+        assert abs(z[0] / unit - 3.0) < 2.0
+        if abs(v[0]) > 100.0 * unit:
+            v[0] = 0.0
+        return 0.2 * v
+
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
+    mhe = estimator(system, unit, qpmhe.OutputInjection(correction), [3.0 * unit], unit**2)
+    assert np.isfinite(mhe.update([3.1 * unit]).state).all()

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.errors import InvalidInputError, ModelError, OptionError, ShapeError, WeightError
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, ShapeError
 from qpmhe.observers import (
     ExtendedKalman,
     HighGain,
@@ -65,10 +65,6 @@ def oscillator():
 
 
 def test_luenberger():
-    for gain, shape in (
-        (0.3, (1, 1)), ([0.3, 0.1], (2, 1)), ([[0.3, 0.2]], (1, 2)), (np.ones((3, 2), int), (3, 2))
-    ):
-        assert Luenberger(gain).gain.shape == shape
     gain = np.random.default_rng(1).standard_normal((3, 2))
     observer, sample = Luenberger(gain), Sample(linear(np.eye(3), np.ones((2, 3))), NONE)
     left, values, right = np.linalg.svd(gain)
@@ -79,14 +75,6 @@ def test_luenberger():
     assert covariance is None
 
 
-def changing(which):
-    def correction(z, v):
-        (z if which == "z" else v)[...] *= 0.5
-        return 0.1 * v
-
-    return correction
-
-
 def test_output_injection():
     system, start = linear(0.5 * np.eye(2), np.eye(2)), [1.0, -2.0]
     listed = estimator(system, OutputInjection(lambda z, v: [0.1 * v[0] - v[1], 0.3 * v[1]]), start)
@@ -95,16 +83,12 @@ def test_output_injection():
     np.testing.assert_allclose(listed.run(Y).states, matrix.run(Y).states, rtol=1e-13, atol=1e-15)
     nothing = "L(z, 0) = 0"
     for correction, text in (
-        (lambda z, v: v + 1e-9, ["1e-09", nothing]),
         (lambda z, v: v + 0.01 * z, ["0.01", nothing]),
         (lambda z, v: np.array([v[0], z[0] - 1.0]), ["[0.0, ", nothing]),  # not at the start
         (lambda z, v: v / np.linalg.norm(v), ["nan", nothing]),
-        (lambda z, v: np.array([np.inf, 0.0]), ["inf", nothing]),
         (lambda z, v: 0.1 * v[:, None], ["correction returned shape (2, 1)", "(2,)"]),
-        (lambda z, v: 0.1 * v[0], ["correction returned shape ()", "(2,)"]),
         (lambda z, v: [][0], ["IndexError: ", "at z = [1.0, -2.0]"]),
-        (changing("z"), ["in place"]),
-        (changing("v"), ["in place"]),
+        (lambda z, v: np.multiply(0.5, v, out=v), ["in place"]),
     ):
         check(ModelError, text, estimator, system, OutputInjection(correction), start)
     check(ModelError, ["correction is 0.3; expected a function"], OutputInjection, 0.3)
@@ -161,11 +145,11 @@ def test_sigma_points_stay_within_the_bounds():
         system = qpmhe.System(f, lambda x: x, n=1, p=1, states=states)
         run = estimator(system, observer, [1.1]).run(Y)
         assert (run.share(Status.MODEL_FAILED) > 0) == fails
-    # On a linear system they change nothing.
+    # On a linear system the bounds change nothing.
     plant, v = Plant(32, n=2, p=1), np.array([0.7])
     observer = UnscentedKalman(prior=plant.P, **plant.covariances)
     expected = observer.correct(plant.start, v, plant.sample(plant.P))
-    for below in ([10.0, 5.0], [0.3, 1.0], [0.0, 0.0], [-1.0, 2.0]):
+    for below in ([10.0, 5.0], [0.0, 0.0], [-1.0, 2.0]):
         box = qpmhe.Box(plant.start - below, plant.start + np.array([5.0, np.inf]))
         sample = Sample(linear(plant.A, plant.C, states=box), NONE, covariance=plant.P)
         for one, other in zip(observer.correct(plant.start, v, sample), expected, strict=True):
@@ -177,19 +161,13 @@ def test_sigma_points_stay_within_the_bounds():
 
 def test_poles_are_placed_as_asked():
     for p, poles in (
-        (2, [0.3]), (1, [0.5 + 0.2j, 0.5 - 0.2j]), (2, [0.4, 0.4]), (1, [0.0, 0.0, 0.0]),
-        (1, [0.6, 0.6, -0.2]), (2, [0.3 - 0.6j, 0.9, 0.3 + 0.6j, -0.5]),
-        (3, [0.1, 0.2, 0.3, 0.4, 0.5]),
+        (2, [0.3]), (2, [0.4, 0.4]), (1, [0.0, 0.0, 0.0]), (1, [0.6, 0.6, -0.2]),
+        (2, [0.3 - 0.6j, 0.9, 0.3 + 0.6j, -0.5]),
     ):
         plant = Plant(20 + len(poles) + p, len(poles), p)
         gain = design_luenberger(plant.system, plant.start, poles=poles).gain
         placed = np.poly(plant.A - gain @ plant.C)
         np.testing.assert_allclose(placed, np.poly(poles).real, rtol=0, atol=1e-8)
-    for step in (1.0, 1e-2, 1e-4):  # close to 1 in short steps
-        A, poles = np.eye(4) + step * np.eye(4, k=1), np.exp(-step * np.arange(1.0, 5.0))
-        gain = design_luenberger(linear(A, np.eye(1, 4)), np.zeros(4), poles=poles).gain
-        rates = (1.0 - np.linalg.eigvals(A - gain @ np.eye(1, 4))) / step
-        np.testing.assert_allclose(np.sort(rates.real), np.sort((1.0 - poles) / step), rtol=1e-4)
     # Two outputs that say the same are one.
     A, C = np.eye(3) + 0.1 * np.eye(3, k=1), np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     gain = design_luenberger(linear(A, C), np.zeros(3), poles=[0.3, 0.4, 0.5]).gain
@@ -210,11 +188,8 @@ def test_a_gain_is_for_the_point_and_the_input():
     gain = design_luenberger(system, [2.0, 0.5], [3.0], poles=[0.4, 0.6]).gain
     A = np.array([[1.0, 0.1], [-0.3 * np.cos(2.0), 1.0]])
     np.testing.assert_allclose(poles_of(A - gain @ np.eye(1, 2)), [0.4, 0.6], atol=1e-9)
-    noises = {"disturbance": np.eye(2), "noise": 1.0}
-    check(
-        InvalidInputError, ["u is missing; the system has 1 inputs"],
-        SteadyStateKalman, system, [0.0, 0.0], **noises,
-    )
+    words = ["u is missing; the system has 1 inputs"]
+    check(InvalidInputError, words, design_luenberger, system, [0.0, 0.0], poles=[0.4, 0.6])
 
 
 def test_a_hidden_mode_is_named_in_any_coordinates():
@@ -222,13 +197,12 @@ def test_a_hidden_mode_is_named_in_any_coordinates():
     hidden = np.array([
         [0.9, 0.3, 0.0, 0.0], [0.0, 0.8, 0.0, 0.0], [0.2, 0.4, 1.25, 0.0], [0.1, 0.0, 0.5, 0.7]
     ])
-    for seed in range(3):
-        T = np.random.default_rng(seed).standard_normal((4, 4))
-        system = linear(T @ hidden @ np.linalg.inv(T), np.eye(1, 4) @ np.linalg.inv(T))
-        with pytest.raises(ModelError, match=r"not detectable: .* eigenvalue 1\.25, which does"):
-            design_luenberger(system, np.zeros(4), disturbance=np.eye(4), noise=[[1.0]])
-        with pytest.raises(ModelError, match=r"not observable: .* (1\.25, 0\.7|0\.7, 1\.25), and"):
-            design_luenberger(system, np.zeros(4), poles=[0.1, 0.2, 0.3, 0.4])
+    T = np.random.default_rng(0).standard_normal((4, 4))
+    system = linear(T @ hidden @ np.linalg.inv(T), np.eye(1, 4) @ np.linalg.inv(T))
+    with pytest.raises(ModelError, match=r"not detectable: .* eigenvalue 1\.25, which does"):
+        design_luenberger(system, np.zeros(4), disturbance=np.eye(4), noise=[[1.0]])
+    with pytest.raises(ModelError, match=r"not observable: .* (1\.25, 0\.7|0\.7, 1\.25), and"):
+        design_luenberger(system, np.zeros(4), poles=[0.1, 0.2, 0.3, 0.4])
     # y = x1 x2: at x2 = 0 the constant x1 is not seen.
     system = qpmhe.System(
         lambda x: x * np.array([1.0, 0.9]), lambda x: x[..., :1] * x[..., 1:], n=2, p=1
@@ -240,59 +214,38 @@ def test_a_hidden_mode_is_named_in_any_coordinates():
 
 
 def test_designs_that_cannot_be():
-    def cold(x):
-        if x[0] < -5:
-            raise ValueError("too cold")
-        return np.sqrt(x[:1])
-
-    rooted = {"system": qpmhe.System(lambda x: 0.9 * x, cold, n=1, p=1), "poles": [0.5]}
     for options, kind, text in (
         ({}, OptionError, ["given: none of them; expected either the poles, or"]),
         ({"poles": [0.1, 0.2], "noise": 1.0}, OptionError, ["given: poles, noise; expected"]),
-        ({"noise": [[1.0]]}, OptionError, ["given: noise; expected either"]),
         ({"poles": [0.1]}, ShapeError, ["poles has shape (1,); expected (n,) = (2,)"]),
         ({"poles": [0.1, 1.0]}, OptionError, ["poles 1 do not lie inside the unit", "exp(s dt)"]),
-        ({"poles": [0.1, np.nan]}, OptionError, ["nan do not lie inside the unit circle"]),
         ({"poles": [0.5j, 0.5j]}, OptionError, ["poles is ", "complex poles in conjugate"]),
         ({"poles": [0.5] * 3, "system": Plant(23).system, "at": np.zeros(3)}, OptionError,
          ["pole 0.5 is given 3 times", "rank C = 2 times"]),
-        ({"poles": "slow"}, InvalidInputError, ["'slow', not an array of numbers"]),
         ({"poles": [0.1, 0.2], "at": [1.0]}, ShapeError, ["at has shape (1,); expected (2,)"]),
-        ({"poles": [0.1, 0.2], "u": [1.0]}, ShapeError, ["u has shape (1,); expected (0,)"]),
-        (rooted | {"at": [-1.0]}, ModelError, ["h is [nan] at x = [-1.0]", "expected finite"]),
-        (rooted | {"at": [-6.0]}, ModelError, ["h cannot be linearised at ", "ValueError: too"]),
         ({"poles": np.linspace(0.1, 0.6, 6), "at": np.zeros(6),
           "system": linear(np.eye(6) + 1e-4 * np.eye(6, k=1), np.eye(1, 6) + 0.3)},
          ModelError, ["come out as ", "instead of ", "too ill-conditioned"]),
     ):
         given = {"system": linear([[1.0, 0.1], [0.0, 1.0]], [[1.0, 0.0]]), "at": [0.0, 0.0]}
         check(kind, text, design_luenberger, **given | options)
+    rooted = qpmhe.System(lambda x: 0.9 * x, lambda x: np.sqrt(x[:1]), n=1, p=1)
+    words = ["h is [nan] at x = [-1.0]", "expected finite"]
+    check(ModelError, words, design_luenberger, rooted, [-1.0], poles=[0.5])
 
 
 def test_kalman_type_observers_that_do_not_fit():
     plant = Plant(9)
     right = {"prior": plant.P, **plant.covariances}
-    for wrong, kind, text in (
-        ({"noise": -np.eye(2)}, WeightError, ["noise covariance has the eigenvalue -1"]),
-        ({"disturbance": np.eye(2)}, ShapeError, ["disturbance covariance", "expected (3, 3)"]),
-        ({"prior": np.eye(2)}, ShapeError, ["prior covariance", "expected (3, 3)"]),
-    ):
-        given = right | wrong
-        check(kind, text, SteadyStateKalman, plant.system, plant.start, **given)
-        check(kind, text, lambda given=given: estimator(
-            plant.system, UnscentedKalman(**given), plant.start
-        ))
-    text = ["at has shape (1,); expected (3,)"]
-    check(ShapeError, text, SteadyStateKalman, plant.system, [0.0], **right)
+    wrong = right | {"disturbance": np.eye(2)}
+    text = ["disturbance covariance", "expected (3, 3)"]
+    check(ShapeError, text, SteadyStateKalman, plant.system, plant.start, **wrong)
+    check(ShapeError, text, estimator, plant.system, UnscentedKalman(**wrong), plant.start)
     text = ["spread is 0.0; expected a finite number > 0"]
     check(OptionError, text, UnscentedKalman, **right, spread=0.0)
     steady = SteadyStateKalman(plant.system, plant.start, **right)
     text = ["for 3 states and 2 outputs; expected 2 and 1"]
-    for prior in (np.eye(2), qpmhe.ObserverPrior()):
-        check(
-            ShapeError, text, qpmhe.MovingHorizonEstimator, oscillator(), steady,
-            cost_of(prior=prior), horizon=3, initial_state=np.zeros(2),
-        )
+    check(ShapeError, text, estimator, oscillator(), steady, np.zeros(2))
 
 
 # The high-gain observer
@@ -304,10 +257,7 @@ def chain(n, step, sampling="exact"):
 
 
 def test_high_gain_gives_the_chain_the_sampled_poles():
-    for n, epsilon, sampling in (
-        (1, 0.2, "exact"), (2, 0.02, "euler"), (3, 3.0, "exact"), (3, 0.2, "euler"),
-        (4, 0.2, "exact"),
-    ):
+    for n, epsilon, sampling in ((1, 0.2, "exact"), (3, 0.2, "euler"), (4, 0.2, "exact")):
         coefficients = np.poly(-np.arange(1.0, n + 1))[1:]
         options = {"coefficients": coefficients, "sampling": sampling}
         gain = HighGain(n, epsilon=epsilon, dt=DT, **options).gain
@@ -317,8 +267,6 @@ def test_high_gain_gives_the_chain_the_sampled_poles():
         # In coordinates whose unit of time is another, the same observer.
         other = HighGain(n, epsilon=1000 * epsilon, dt=1000 * DT, **options).gain[:, 0]
         np.testing.assert_allclose(gain[:, 0], other * 1000.0 ** np.arange(n), rtol=1e-9)
-    slow = HighGain(3, epsilon=1.0, dt=1e-5).gain[:, 0]
-    np.testing.assert_allclose(slow, 1e-5 * np.array([3.0, 3.0, 1.0]), rtol=1e-4)
     fast = HighGain(3, epsilon=1e-9, dt=DT).gain
     error = np.linalg.matrix_power(chain(3, DT) - fast @ np.eye(1, 3), 3)
     np.testing.assert_allclose(error, 0.0, atol=1e-9)
@@ -328,10 +276,8 @@ def test_high_gain_observers_that_make_no_sense():
     for options, kind, text in (
         ({"n": 0}, OptionError, ["n is 0; expected an integer >= 1"]),
         ({"epsilon": 0.0}, OptionError, ["epsilon is 0.0; expected a finite number > 0"]),
-        ({"dt": -1.0}, OptionError, ["dt is -1.0; expected a finite number > 0"]),
         ({"sampling": "rk4"}, OptionError, ["sampling is 'rk4'; expected one of 'exact', 'euler'"]),
         ({"coefficients": [1.0]}, ShapeError, ["coefficients has shape (1,); expected (2,)"]),
-        ({"coefficients": [2.0, 0.0]}, OptionError, ["[2.0, 0.0]", "real part 0; expected all"]),
         ({"coefficients": [-2.0, 1.0]}, OptionError, ["real part 1", "roots in the left"]),
     ):
         check(kind, text, HighGain, **{"n": 2, "epsilon": 0.1, "dt": DT, **options})
@@ -339,7 +285,6 @@ def test_high_gain_observers_that_make_no_sense():
     for system, kind, text in (
         (linear(np.eye(2), np.eye(2)), ShapeError, ["the system has 2 outputs; expected 1"]),
         (linear(np.eye(3), np.eye(1, 3)), ShapeError, ["is for n = 2; expected 3 states"]),
-        (linear(chain(2, DT), [[0.0, 1.0]]), ModelError, ["radius ", "at the initial state"]),
         (linear(chain(2, DT), [[-1.0, 0.0]]), ModelError, ["C is [[-1.0, 0.0]]"]),
         (oscillator(), InvalidInputError, ["dt of the high-gain observer is 0.1; expected 0.05"]),
     ):
@@ -373,32 +318,30 @@ def test_nothing_is_corrected_where_the_output_fits():
                 assert np.linalg.norm(correction) < 500.0 * v
 
 
-# Its state, beside each estimate and along a run
-
-A, GAIN = np.array([[0.9, 0.2], [-0.1, 0.7]]), np.array([[0.4], [0.1]])
-Y = np.random.default_rng(0).standard_normal((9, 1))
+# Its state, beside each estimate
 
 
-def observed(f=lambda x: x @ A.T, **options):
+def observed(f, **options):
     system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
-    options = {"max_qps": 1, "warm_start": True} | options
-    return estimator(system, Luenberger(GAIN), [1.0, -1.0], **options)
+    return estimator(system, Luenberger([[0.4], [0.1]]), [1.0, -1.0], **options)
 
 
 def test_an_observer_that_starts_again_has_the_state_that_it_starts_from():
+    A = np.array([[0.9, 0.2], [-0.1, 0.7]])
+
     def f(x):
         if x[0] > 50.0:
             raise ValueError("too hot")
         return A @ x
 
-    mhe = observed(f, horizon=2, max_qps=3, warm_start=False)
+    mhe = observed(f, horizon=2, max_qps=3)
     mhe.run([0.5, 200.0])
     failed = mhe.update(0.5)
     assert Status.MODEL_FAILED in failed.status
     expected = failed.state if failed.improved else failed.candidate[-1]
     np.testing.assert_array_equal(failed.observer_state, expected)
     np.testing.assert_array_equal(mhe.update(0.4).candidate[-2], expected)
-    mhe = observed(candidate="reinitialized")
-    for y in Y:
+    mhe = observed(lambda x: x @ A.T, candidate="reinitialized", max_qps=1, warm_start=True)
+    for y in np.random.default_rng(0).standard_normal((9, 1)):
         estimate = mhe.update(y)
         np.testing.assert_array_equal(estimate.observer_state, estimate.candidate[-1])

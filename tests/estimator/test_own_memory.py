@@ -1,4 +1,6 @@
-"""What is handed out or in is never memory of the estimator."""
+"""What is handed out or in is never memory of the estimator; an interrupted step was not taken."""
+
+import contextlib
 
 import numpy as np
 import pytest
@@ -7,49 +9,42 @@ import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.estimation.settings import Settings
 
-from .same import assert_same
+from .same import Interruption, assert_same, interrupted
+from .untraced import untraced
 
 BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
 # Outside of which the candidate is, now and then.
 NARROW = {"disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}
-OPTIONS = {
-    "plain": {},
+CASES = {
+    "delayed": {"delay": 2, "discount": 0.8, "held": {1: 0.5}},
     "observer alone": {"max_qps": 0},
-    "best": {"warm_start": True, "max_qps": 2},
-    "reinitialized": {"candidate": "reinitialized", "warm_start": True},
-    "delayed": {"delay": 2},
-    "dropped": {"sets": NARROW, "max_qps": 3},
-    "projected": {"sets": BOX, "warm_start": True},
-    "kept": {"sets": NARROW, "infeasible": "keep_candidate"},
-    "discount": {"discount": 0.8},
-    "robust": {"robust": True},
-    "smoothed": {"arrival": "smoothed", "discount": 0.8},
-    "kalman": {"kalman": True, "candidate": "reinitialized"},
+    "reinitialized in a set": {"candidate": "reinitialized", "sets": BOX, "warm_start": True},
+    "dropped": {"sets": NARROW, "max_qps": 2},
+    "smoothed": {"arrival": "smoothed", "discount": 0.8, "warm_start": True},
+    "kalman": {"kalman": True, "robust": True, "candidate": "reinitialized", "max_qps": 2},
+    "compiled": {"engine": "compiled", "candidate": "reinitialized", "sets": NARROW},
 }
-HORIZON = 4
+BATCHES = {
+    "looped": {"warm_start": True, "max_qps": 2, "delay": 1},
+    "compiled": {"engine": "compiled"},
+}
+NEW = [0.2, 0.1]
 
 
-def system_of(engine, sets=None):
-    if engine == "compiled" and sets:
-        sets = NARROW
-    if engine == "numpy":
-        def rate(x, u):
-            return np.stack((x[..., 1], u[..., 0] - np.sin(x[..., 0])), axis=-1)
+def system_of(sets=None):
+    def rate(x, u):
+        return np.stack((x[..., 1], u[..., 0] - np.sin(x[..., 0])), axis=-1)
 
-        return qpmhe.System.from_ode(
-            rate, lambda x, u: x[..., :1] + 0.1 * x[..., :1] ** 2, dt=0.1, n=2, p=1, m=1,
-            method="euler", **(sets or {}),
-        )
-    ca = pytest.importorskip("casadi")
-    return qpmhe.from_casadi(
-        lambda x, u: [x[1], u[0] - ca.sin(x[0])], lambda x, u: x[0] + 0.1 * x[0] ** 2, dt=0.1,
-        method="euler", n=2, m=1, **(sets or {}),
+    return qpmhe.System.from_ode(
+        rate, lambda x, u: x[..., :1] + 0.1 * x[..., :1] ** 2, dt=0.1, n=2, p=1, m=1,
+        method="euler", **(sets or {}),
     )
 
 
-def estimator(
-    engine, sets=None, discount=1.0, robust=False, kalman=False, system=None, held=None, **options
-):
+def estimator(sets=None, discount=1.0, robust=False, kalman=False, held=None, **options):
+    """Of arrays that are spoilt afterwards."""
+    if options.get("engine") == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
     gain, weights = np.array([[0.3], [0.4]]), [np.eye(2), 10.0 * np.eye(2), np.eye(1)]
     start = np.array([0.5, 0.0])
     given = dict(zip(("prior", "disturbance", "noise"), weights, strict=True))
@@ -57,13 +52,12 @@ def estimator(
     if robust:
         cost = qpmhe.RobustCost(**given | {"noise": qpmhe.Huber(weights[2])}, discount=discount)
     observer = qpmhe.ExtendedKalman(**given) if kalman else qpmhe.Luenberger(gain)
-    own = engine if engine == "compiled" else "python"
-    system = system or system_of(engine, sets)
+    system = system_of(sets)
     if held:  # as `augment_parameters` does
         system.held = held
     mhe = qpmhe.MovingHorizonEstimator(
         system, observer, cost,
-        **{"horizon": HORIZON, "initial_state": start, "engine": own} | options,
+        **{"horizon": 4, "initial_state": start, "engine": "python"} | options,
     )
     for array in (gain, start, *weights):
         array[...] = np.nan
@@ -92,10 +86,9 @@ def arrays_of(value, depth=0):
         return []
     if isinstance(value, np.ndarray):
         return [value]
-    if isinstance(value, dict):
-        return [array for item in value.values() for array in arrays_of(item, depth)]
-    if isinstance(value, (list, tuple)):
-        return [array for item in value for array in arrays_of(item, depth)]
+    if isinstance(value, (dict, list, tuple)):
+        items = value.values() if isinstance(value, dict) else value
+        return [array for item in items for array in arrays_of(item, depth)]
     if depth > 3 or not type(value).__module__.startswith("qpmhe"):
         return []
     parts = [getattr(value, name, None) for name in dir(value) if not name.startswith("__")]
@@ -109,7 +102,7 @@ def spoil(value):
     return len(found)
 
 
-def feed(mhe, arguments, spoilt):
+def feed(mhe, arguments, spoilt=False):
     y, u, own = arguments
     if not spoilt:
         return mhe.update(y, u, **own)
@@ -119,15 +112,9 @@ def feed(mhe, arguments, spoilt):
     return estimate
 
 
-@pytest.mark.parametrize(("engine", "name"), [
-    *(("numpy", name) for name in OPTIONS), ("casadi", "reinitialized"),
-    *(("compiled", name) for name in ("plain", "reinitialized", "dropped")),
-])
-def test_a_spoilt_estimator_goes_on_as_its_twin(engine, name):
-    if engine == "compiled" and find_compiler() is None:
-        pytest.skip("there is no C compiler")
-    options = OPTIONS[name]
-    twin, spoilt = estimator(engine, **options), estimator(engine, **options)
+@pytest.mark.parametrize("name", CASES)
+def test_a_spoilt_estimator_goes_on_as_its_twin(name):
+    twin, spoilt = estimator(**CASES[name]), estimator(**CASES[name])
     assert spoil(spoilt.initial_state) == 1
 
     def both(do, *arrays, check=np.testing.assert_array_equal):
@@ -137,11 +124,10 @@ def test_a_spoilt_estimator_goes_on_as_its_twin(engine, name):
         check(found, expected)
         spoil([found, given])
 
-    for t, arguments in enumerate(samples(60)):
+    for t, arguments in enumerate(samples(40)):
         spoil(spoilt.state)
-        expected = feed(twin, arguments, False)
         estimate = feed(spoilt, arguments, True)
-        assert_same(estimate, expected)
+        assert_same(estimate, feed(twin, arguments))
         assert spoil(estimate) >= 6
         if t % 9 == 5:
             both(lambda mhe, y, t=t: mhe.amend(t - 2, y), np.array([0.1 * t]), check=assert_same)
@@ -160,63 +146,164 @@ def test_a_spoilt_estimator_goes_on_as_its_twin(engine, name):
     twin.reset()
     spoilt.reset()
     for arguments in samples(10, 1):
-        assert_same(feed(spoilt, arguments, True), feed(twin, arguments, False))
-
-
-BATCHES = {
-    "looped": {},
-    "looped best": {"warm_start": True, "max_qps": 2, "delay": 1},
-    "looped alone": {"max_qps": 0},
-    "looped anew": {"candidate": "reinitialized"},
-    "compiled": {"engine": "compiled"},
-}
-
-
-def batch_of(name, members=3):
-    options, starts = BATCHES[name], np.full((members, 2), 0.5)
-    if name == "compiled" and find_compiler() is None:
-        pytest.skip("there is no C compiler")
-    found = qpmhe.BatchEstimator(
-        system_of("casadi" if name == "compiled" else "numpy"), qpmhe.Luenberger([0.3, 0.4]),
-        qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10.0 * np.eye(2), noise=1.0),
-        members=members, horizon=HORIZON, initial_states=starts, **options,
-    )
-    spoil(starts)
-    return found
-
-
-TAKEN = ("trajectories", "candidates", "costs", "candidate_costs", "flags", "qps", "states")
-
-
-def assert_all_same(found, expected):
-    for name in TAKEN:
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
-
-
-@pytest.mark.parametrize("name", BATCHES)
-def test_a_spoilt_batch_goes_on_as_its_twin(name):
-    twin, spoilt, generator = batch_of(name), batch_of(name), np.random.default_rng(0)
-    assert name.startswith(spoilt.mode)
-    spoil(spoilt.initial_states)
-    for t in range(25):
-        if t == 20:
-            Y, U = generator.normal(0.0, 0.5, (3, 9, 1)), np.zeros((3, 9, 1))
-            expected, found = twin.run(Y.copy(), U.copy()), spoilt.run(Y, U)
-            np.testing.assert_array_equal(found.states, expected.states)
-            spoil([found, Y, U])
-            twin.reset()
-            spoilt.reset()
-        Y, U = generator.normal(0.0, 0.5, (3, 1)), generator.normal(0.0, 1.0, (3, 1))
-        expected = twin.update(Y.copy(), U.copy())
-        found = spoilt.update(Y, U)
-        assert_all_same(found, expected)
-        spoil([found, Y, U, spoilt.states])
+        assert_same(feed(spoilt, arguments, True), feed(twin, arguments))
 
 
 def test_state_and_filtered_are_rows_of_the_trajectory():
     """As documented: changing one changes the other, of this estimate alone."""
-    estimate = estimator("numpy", delay=1).update([0.1], [0.0])
+    estimate = estimator(delay=1).update([0.1], [0.0])
     estimate.state[...] = 7.0
     assert estimate.trajectory[-1].tolist() == [7.0, 7.0]
     assert np.shares_memory(estimate.filtered, estimate.trajectory)
     assert not np.shares_memory(estimate.candidate, estimate.trajectory)
+
+
+# Interrupts
+
+
+@pytest.fixture
+def stride(pytestconfig):
+    """Lines from one interrupt to the next, at most."""
+    return 150 if pytestconfig.option.all else 300
+
+
+@pytest.mark.parametrize("name", ["reinitialized in a set", "smoothed", "kalman", "compiled"])
+def test_an_interrupted_step_was_not_taken(name, stride):
+    options, generator = CASES[name], np.random.default_rng(1)
+    mhe, twin = estimator(**options), estimator(**options)
+    for one in (mhe, twin):  # a step of another length decides how the model is called
+        feed(one, samples(4)[3])
+        one.reset()
+
+    def both(do):
+        twin.state_dict()  # in which solvers forget, as they do after an interrupt
+        expected, found = do(twin), interrupted(mhe, do, generator, stride)
+        if expected is None:
+            assert found is None
+        else:
+            assert_same(found, expected)
+        np.testing.assert_array_equal(mhe.state, twin.state)
+        np.testing.assert_array_equal(mhe.initial_state, twin.initial_state)
+
+    other = estimator(**options).state_dict()
+    actions = {
+        22: lambda one: one.set(noise_weight=[[2.0]]), 26: lambda one: one.reset(),
+        24: lambda one: one.load_state_dict(other),
+        28: lambda one: one.reset(NEW),
+    }
+    for t, arguments in enumerate(samples(38)):
+        if t in (0, 3, 36):  # the first move of stages to the front is at 36
+            both(lambda one, a=arguments: feed(one, a))
+        else:
+            for one in (mhe, twin):
+                one.state_dict()
+            assert_same(feed(mhe, arguments), feed(twin, arguments))
+        if t in (2, 20):
+            both(lambda one, t=t: one.amend(t - 1, [0.3]))
+            np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
+        if t in actions:
+            both(actions[t])
+
+
+@pytest.mark.parametrize("where", ["f", "h", "observer", "solver"])
+def test_an_interrupt_out_of_what_the_user_wrote(where, monkeypatch):
+    fuse = [0]  # calls to the next interrupt
+
+    def ticking(name, function):
+        def call(*arguments):
+            fuse[0] -= name == where
+            if name == where and fuse[0] == 0:
+                raise KeyboardInterrupt
+            return function(*arguments)
+
+        return call
+
+    def made():
+        system = qpmhe.System(
+            untraced(ticking("f", lambda x: 0.9 * x)),
+            untraced(ticking("h", lambda x: x[..., :1] ** 2)), n=2, p=1,
+        )
+        correction = ticking("observer", lambda z, v: np.array([0.1, 0.2]) * v[0])
+        cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1))
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.OutputInjection(correction), cost, horizon=3, initial_state=[0.5, 0.4],
+            candidate="reinitialized", warm_start=True, max_qps=2,
+        )
+        solver = mhe._engine._solver
+        monkeypatch.setattr(solver, "solve", ticking("solver", solver.solve))
+        return mhe
+
+    mhe, twin, hit = made(), made(), 0
+    for y in np.random.default_rng(2).uniform(0.0, 1.0, (12, 1)):
+        for k in range(1, 30):
+            fuse[0] = k
+            try:
+                mhe.update(y)
+            except KeyboardInterrupt:
+                hit += 1
+            else:
+                break
+        fuse[0] = 0
+        twin.update(y)
+        np.testing.assert_array_equal(mhe.state, twin.state)
+        np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
+        assert mhe.time == twin.time
+    assert hit > 11
+
+
+# Batches
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_a_spoilt_and_interrupted_batch_goes_on_as_its_twin(name, stride):
+    if name == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
+
+    def made():
+        starts = np.full((3, 2), 0.5)
+        batch = qpmhe.BatchEstimator(
+            system_of(), qpmhe.Luenberger([0.3, 0.4]),
+            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10.0 * np.eye(2), noise=1.0),
+            members=3, horizon=4, initial_states=starts, **BATCHES[name],
+        )
+        spoil(starts)
+        return batch
+
+    mhe, twin, generator = made(), made(), np.random.default_rng(0)
+    assert mhe.mode == name
+
+    def try_and_interrupt(do):
+        after, before = 1, mhe.time
+        while True:
+            with Interruption(after) as interruption, contextlib.suppress(KeyboardInterrupt):
+                do(mhe)
+            if interruption.count < after or mhe.time != before:
+                break
+            np.testing.assert_array_equal(mhe.states, twin.states)
+            np.testing.assert_array_equal(mhe.initial_states, twin.initial_states)
+            after += int(generator.integers(1, stride))
+        assert interruption.count < after or name == "compiled"  # C has taken the sample, whole
+
+    spoil(mhe.initial_states)
+    for t in range(14):
+        Y, U = generator.normal(0.0, 0.5, (3, 1)), generator.normal(0.0, 1.0, (3, 1))
+        Y[generator.random((3, 1)) < 0.2] = np.nan
+        expected = twin.update(Y.copy(), U.copy()) if t % 3 else None
+        if expected is None:
+            try_and_interrupt(lambda one, Y=Y, U=U: one.update(Y, U))
+            twin.update(Y, U)
+        else:
+            found = mhe.update(Y, U)
+            for field in ("trajectories", "candidates", "costs", "candidate_costs", "flags"):
+                np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
+            spoil([found, Y, U, mhe.states])
+        if t == 11:
+            try_and_interrupt(lambda one: one.reset(NEW))
+            twin.reset(NEW)
+        np.testing.assert_array_equal(mhe.states, twin.states)
+    Y, U = generator.normal(0.0, 0.5, (3, 9, 1)), np.zeros((3, 9, 1))
+    expected, found = twin.run(Y.copy(), U.copy()), mhe.run(Y, U)
+    np.testing.assert_array_equal(found.states, expected.states)
+    spoil([found, Y, U])
+    np.testing.assert_array_equal(mhe.update(Y[:, 0], U[:, 0]).states, twin.update(
+        Y[:, 0], U[:, 0]).states)
