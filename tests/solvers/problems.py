@@ -9,11 +9,9 @@ import pytest
 
 from qpmhe_solvers import (
     QP,
-    Backend,
     SolverOptions,
     available,
     backend,
-    native,
     register,
     unregister,
 )
@@ -36,13 +34,6 @@ def registered(entry):
         yield entry
     finally:
         unregister(entry.name)
-
-
-def replace_natives(monkeypatch, factory):
-    """Have "auto" choose among backends that this makes."""
-    for name in ("clarabel", "daqp", "osqp", "piqp", "proxqp"):
-        entry = Backend(name, factory, "-", iterate_at_cap=True)
-        monkeypatch.setitem(native.NATIVE, name, entry)
 
 
 def overwrite(qp, other):

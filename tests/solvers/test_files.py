@@ -30,9 +30,7 @@ OPTIONS = SolverOptions(max_iterations=7, absolute_tolerance=1e-9, time_limit=0.
 def same_bits(one, other):
     assert (one.sizes, one.bounded) == (other.sizes, other.bounded)
     for name in ARRAYS:
-        first, second = getattr(one, name), getattr(other, name)
-        assert (first.shape, first.dtype) == (second.shape, second.dtype)
-        assert first.tobytes() == second.tobytes()
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
 
 
 def same_answer(one, other):
@@ -71,27 +69,27 @@ def test_everything_comes_back(stored):
     found = load(str(path))
     same_bits(found.qp, qp)
     same_answer(found.solution, solution)
-    assert found.solution.status is SolveStatus.SOLVED
     assert (found.path, found.backend, found.options) == (path, "quadprog", OPTIONS)
     assert found.start.tolist() == np.ones((qp.stages, qp.n)).tolist()
     assert {"python", "numpy", "qpmhe", "qpsolvers", "quadprog"} <= set(found.versions)
     assert found.versions["numpy"] == np.__version__
-    assert create("quadprog").solve(found.qp).d.tobytes() == solution.d.tobytes()
     found.qp.band[...] = 0.0  # can be overwritten
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_a_qp_comes_back_bit_for_bit(case, tmp_path):
-    qp, _ = make(**CASES[case])
-    found = load(dump(qp, tmp_path / "qp.npz"))
-    same_bits(found.qp, qp)
-    assert (found.solution, found.backend, found.options, found.start) == (None, "", None, None)
-    rng = np.random.default_rng(0)
-    for name in ARRAYS:
-        bits = rng.integers(0, 2**64, getattr(qp, name).shape, dtype=np.uint64)
-        getattr(qp, name)[...] = bits.view(np.float64)  # NaNs with payloads, denormals, infinities
-    qp.gradient[0, 0], qp.bounded = -0.0, True
-    same_bits(load(dump(qp, tmp_path / "qp.npz")).qp, qp)
+    for case in CASES.values():
+        qp, _ = make(**case)
+        rng = np.random.default_rng(0)
+        for name in ARRAYS:  # NaNs with payloads, denormals, infinities
+            bits = rng.integers(0, 2**64, getattr(qp, name).shape, dtype=np.uint64)
+            getattr(qp, name)[...] = bits.view(np.float64)
+        qp.gradient[0, 0], qp.bounded = -0.0, True
+        found = load(dump(qp, path))
+        same_bits(found.qp, qp)
+        assert (found.solution, found.backend, found.options, found.start) == (None, "", None, None)
+    for status in SolveStatus:
+        d = np.full((qp.stages, qp.n), np.pi) if status.usable else None
+        residuals = Residuals(0.5, np.nan, np.inf) if status.usable else None
+        message = 'said "the" solver: \u2265 \ud800'
+        solution = Solution(d, status, np.int64(3), residuals, message=message)
+        same_answer(load(dump(qp, path, solution=solution)).solution, solution)
 
 
 @pytest.mark.parametrize("limit", [-5.0, np.nan, -np.inf])
@@ -103,19 +101,6 @@ def test_a_promise_that_the_numbers_break_is_not_believed(limit, tmp_path):
     assert found.qp.bounded
     replayed = solve_qp.replay(found, "auto", TIGHT).solution
     assert (replayed.status is SolveStatus.SOLVED) == (limit == -5.0)
-    if limit == -5.0:
-        assert replayed.d[1, 1] == pytest.approx(-5.0)
-        assert replayed.bound_duals[3] > 1.0
-
-
-@pytest.mark.parametrize("status", SolveStatus)
-def test_every_verdict_comes_back(status, tmp_path):
-    qp, _ = make(3, 2, bounds="all")
-    d = np.full((3, 2), np.pi) if status.usable else None
-    residuals = Residuals(0.5, np.nan, np.inf) if status.usable else None
-    message = 'said "the" solver: \u2265 \ud800'
-    solution = Solution(d, status, np.int64(3), residuals, message=message)
-    same_answer(load(dump(qp, tmp_path / "qp.npz", solution=solution)).solution, solution)
 
 
 def test_numpy_alone_reads_it_by_what_it_says_of_itself(stored):
@@ -138,11 +123,11 @@ def test_numpy_alone_reads_it_by_what_it_says_of_itself(stored):
 def test_damage_is_reported_or_does_not_matter(stored):
     path, qp, solution = stored
     whole, rng, reported = path.read_bytes(), np.random.default_rng(0), 0
-    for length in np.linspace(0, len(whole) - 1, 30).astype(int):
+    for length in np.linspace(0, len(whole) - 1, 15).astype(int):
         path.write_bytes(whole[:length])
         with pytest.raises(InvalidInputError, match=r"one.npz is (damaged|not a QP file)"):
             load(path)
-    for place in rng.integers(0, len(whole), 150):
+    for place in rng.integers(0, len(whole), 100):
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << rng.integers(0, 8)
         path.write_bytes(spoilt)
@@ -153,7 +138,12 @@ def test_damage_is_reported_or_does_not_matter(stored):
             continue
         same_bits(found.qp, qp)
         assert found.solution.status is solution.status
-    assert reported > 75
+    assert reported > 50
+
+
+class Trap:
+    def __reduce__(self):
+        return pytest.fail, ("a pickle was run",)
 
 
 def archive(**members):
@@ -162,50 +152,30 @@ def archive(**members):
     return buffer.getvalue()
 
 
-def zipped(name, text):
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as opened:
-        opened.writestr(name, text)
-    return buffer.getvalue()
-
-
-class Trap:
-    def __reduce__(self):
-        return pytest.fail, ("a pickle was run",)
-
-
-FOREIGN, DAMAGED = "not a QP file.*qpmhe.solvers.dump", "damaged"
-
-
-def test_files_of_another_kind_are_refused(tmp_path):
-    for content, fault in [
-        *((one, FOREIGN) for one in (
-            b"", b"P", b"not a QP", b"\x93NUMPY\x01\x00v\x00{}", pickle.dumps({"a": 1}),
-            archive(P=np.eye(2)), zipped("a.txt", "text"),
-            archive(header=np.array("[1, 2]")), archive(header=np.array('{"format": "other"}')),
-        )),
-        (archive(header=np.array("no JSON")), DAMAGED),
-        (archive(header=np.array(Trap(), object)), DAMAGED),
-        (zipped("header.npy", "no array"), DAMAGED),
-    ]:
-        path = tmp_path / "other.npz"
-        path.write_bytes(content)
-        with pytest.raises(InvalidInputError, match=f"other.npz is {fault}"):
-            load(path)
-
-
 ANSWER = {"status": "SOLVED", "iterations": 3, "message": ""}
 
 
-def test_contents_that_do_not_fit_together_are_refused(stored):
+def test_what_cannot_be_read_is_refused(stored, tmp_path):
     path, whole = stored[0], stored[0].read_bytes()
+    with zipfile.ZipFile(tmp_path / "text.zip", "w") as opened:
+        opened.writestr("header.npy", "no array")
+    foreign = "not a QP file.*qpmhe.solvers.dump"
+    for content, fault in [
+        (b"not a QP", foreign), (pickle.dumps({"a": 1}), foreign),
+        (archive(P=np.eye(2)), foreign), (archive(header=np.array("[1, 2]")), foreign),
+        (archive(header=np.array('{"format": "other"}')), foreign),
+        (archive(header=np.array(Trap(), object)), "damaged"),
+        ((tmp_path / "text.zip").read_bytes(), "damaged"),
+    ]:
+        path.write_bytes(content)
+        with pytest.raises(InvalidInputError, match=f"one.npz is {fault}"):
+            load(path)
     for change in [
         {"gradient": None}, {"band": np.zeros((1, 2, 3))}, {"lower": np.zeros((7, 3), np.float32)},
-        {"d": None}, {"d": np.zeros(21)}, {"residuals": np.zeros(2)}, {"start": np.zeros(1)},
+        {"d": None}, {"residuals": np.zeros(2)}, {"start": np.zeros(1)},
         *({"header": header} for header in (
-            {"version": None}, {"version": 0}, {"stages": 10**15}, {"n": -3}, {"rows": "2"},
-            {"stages": None}, {"bounded": 1}, {"versions": 3}, {"options": {"max_iterations": 0}},
-            {"options": {"unknown": 1}}, {"answer": {}}, {"answer": ANSWER | {"status": "GOOD"}},
+            {"version": None}, {"stages": 10**15}, {"n": -3}, {"bounded": 1}, {"versions": 3},
+            {"options": {"max_iterations": 0}}, {"options": {"unknown": 1}}, {"answer": {}},
             {"answer": ANSWER | {"status": "FAILED"}}, {"answer": ANSWER | {"iterations": "3"}},
         )),
     ]:
@@ -213,22 +183,21 @@ def test_contents_that_do_not_fit_together_are_refused(stored):
         rewritten(path, **change)
         with pytest.raises(InvalidInputError, match=r"one.npz is damaged"):
             load(path)
-
-
-def test_a_newer_file_asks_for_an_upgrade(stored):
-    path = rewritten(stored[0], header={"version": 2})
+    path.write_bytes(whole)
+    rewritten(path, header={"version": 2})
     with pytest.raises(InvalidInputError, match=r"one.npz has version 2 .* up to 1; upgrade qpmhe"):
         load(path)
+    with pytest.raises(InvalidInputError, match=r"cannot read .*none.npz: No such file"):
+        load(tmp_path / "none.npz")
 
 
-def test_what_cannot_be_dumped(tmp_path):
+def test_what_cannot_be_dumped_leaves_nothing_behind(tmp_path, monkeypatch):
     for change, words in [
         ({"qp": None}, "qp is None; expected a QP"),
         ({"solution": np.zeros(6)}, "expected a Solution"),
         ({"options": {}}, "options is {}; expected a SolverOptions"),
         ({"backend": None}, "backend is None; expected a str"),
         ({"start": np.zeros(5)}, r"start does not fit the QP .*\(3, 2\)"),
-        ({"start": "here"}, "start does not fit"),
         ({"path": "none/qp.npz"}, "cannot write .*qp.npz: No such file .*folder"),
     ]:
         arguments = {"qp": QP(3, 2)} | change
@@ -236,16 +205,6 @@ def test_what_cannot_be_dumped(tmp_path):
         with pytest.raises(InvalidInputError, match=words):
             dump(**arguments)
         assert not list(tmp_path.iterdir())
-
-
-def test_what_cannot_be_read(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"cannot read .*none.npz: No such file"):
-        load(tmp_path / "none.npz")
-    with pytest.raises(InvalidInputError, match=r"cannot read .*: Is a directory"):
-        load(tmp_path)
-
-
-def test_an_existing_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
     path = tmp_path / "no ending"
     for stages in (3, 2):
         assert dump(QP(stages, 1), str(path)) == path
@@ -265,11 +224,10 @@ def test_an_existing_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch)
 def test_files_and_folders_are_listed(tmp_path):
     folder = tmp_path / "folder"
     folder.mkdir()
-    with pytest.raises(InvalidInputError, match=r"folder holds no .npz file"):
-        qp_files([folder])
+    for missing, words in ((folder, "folder holds no .npz file"), (tmp_path / "no", "no file")):
+        with pytest.raises(InvalidInputError, match=words):
+            qp_files([missing])
     paths = [dump(QP(1, 1), folder / name) for name in ("b.npz", "a.npz")]
     single = dump(QP(1, 1), tmp_path / "single")
     (folder / "notes.txt").write_text("")
     assert qp_files([single, str(folder)]) == [single, *paths[::-1]]
-    with pytest.raises(InvalidInputError, match=r"there is no file .*none.npz"):
-        qp_files([tmp_path / "none.npz"])

@@ -34,71 +34,50 @@ class Nothing(Solver):
         return RawSolution(None, False)
 
 
-@pytest.mark.parametrize("function", [backend, create, unregister])
-def test_unknown_name_lists_the_known_ones(function):
-    for name in ("osqpp", "OSQP", "", None, 3, ["osqp"]):
-        with pytest.raises(BackendError) as caught:
-            function(name)
-        expected = f"backend {name!r} is not known; expected one of {', '.join(NAMES)}."
-        assert expected in str(caught.value)
-        assert isinstance(caught.value, InvalidInputError)
-
-
 def test_register_create_unregister():
     options = SolverOptions(max_iterations=3)
-    with registered(Backend("mine", Nothing, "none at all")) as entry:
-        assert backend("mine") is entry
-        assert backends()[-1] is entry
-        assert available()[-1] == "mine"
-        assert isinstance(create("mine"), Nothing)
-        assert create("mine", options).options is options
-        assert create("mine").options == SolverOptions()
-        with pytest.raises(BackendError, match=r"backend 'mine' is registered already.*unregister"):
-            register(Backend("mine", Nothing, "another"))
-        assert backend("mine") is entry
-    assert "mine" not in available()
-    assert [entry.name for entry in backends()] == NAMES
-    for thing in (3, None, "mine", Nothing, Nothing(SolverOptions())):
-        with pytest.raises(BackendError, match=r"expected a qpmhe\.solvers\.Backend") as caught:
-            register(thing)
-        assert repr(thing) in str(caught.value)
-
-
-def test_names_that_can_be_written_and_others():
-    for name in ("mine", "my_solver-2.0", "qpsolvers:mine", "c++", "2x2"):
-        with registered(Backend(name, Nothing, "none at all")):
+    for name in ("mine", "my_solver-2.0", "qpsolvers:mine", "c++"):
+        with registered(Backend(name, Nothing, "none at all")) as entry:
+            assert backend(name) is backends()[-1] is entry
+            assert available()[-1] == name
             assert isinstance(create(name), Nothing)
-    for name in ("", " ", "a b", "a,b", "-a", "a\n", "a/b", None, 3, ["a"]):
-        with pytest.raises(BackendError, match=r"the name of a backend is .*; expected let") as it:
-            Backend(name, Nothing, "none at all")
-        assert repr(name) in str(it.value)
-
-
-KINDS = "expected one of 'banded', 'csc', 'dense'"
-PACKAGE = "or None if it needs no package"
+            assert create(name, options).options is options
+            assert create(name).options == SolverOptions()
+            with pytest.raises(BackendError, match=r"is registered already.*unregister"):
+                register(Backend(name, Nothing, "another"))
+            assert backend(name) is entry
+        assert [entry.name for entry in backends()] == NAMES
+    for name in ("osqpp", "", None, ["osqp"]):
+        for function in (backend, create, unregister):
+            with pytest.raises(BackendError) as caught:
+                function(name)
+            expected = f"backend {name!r} is not known; expected one of {', '.join(NAMES)}."
+            assert expected in str(caught.value)
+            assert isinstance(caught.value, InvalidInputError)
+    for thing in (None, "mine", Nothing):
+        with pytest.raises(BackendError, match=r"expected a qpmhe\.solvers\.Backend"):
+            register(thing)
+    for name in ("auto", "banded"):
+        with pytest.raises(OptionError, match=r"options is 'fast'; expected qpmhe\.solvers"):
+            create(name, "fast")
 
 
 def test_an_entry_that_can_never_work_is_refused():
-    for field, values, words in [
-        ("factory", [None, "Nothing"], "expected a callable"),
-        ("factory", [Nothing(SolverOptions())], "give the class itself"),
-        ("matrices", ["weird", None, ["csc"]], KINDS),
-        ("method", ["", 3], "expected a text"),
-        ("module", [3, ""], PACKAGE), ("distribution", [b"daqp"], PACKAGE),
-        ("iteration_cap", ["yes"], "expected True or False"),
-        ("inequalities", [None], "expected True or False"),
+    for field, value, words in [
+        ("name", "a b", "the name of a backend is 'a b'; expected let"),
+        ("name", None, "the name of a backend is None; expected let"),
+        ("factory", "Nothing", "expected a callable"),
+        ("factory", Nothing(SolverOptions()), "give the class itself"),
+        ("matrices", "weird", "expected one of 'banded', 'csc', 'dense'"),
+        ("method", "", "expected a text"), ("module", 3, "or None if it needs no package"),
+        ("iteration_cap", "yes", "expected True or False"),
     ]:
-        for value in values:
-            with pytest.raises(BackendError) as caught:
-                Backend(**{"name": "mine", "factory": Nothing, "method": "none", field: value})
-            for part in (field, repr(value), "'mine'", words):
-                assert part in str(caught.value)
-        with pytest.raises(OptionError, match="Did you mean inequalities"):
-            Backend("mine", Nothing, "none", inequality=False)
-
-
-class Abstract(Solver):
-    pass
+        with pytest.raises(BackendError) as caught:
+            Backend(**{"name": "mine", "factory": Nothing, "method": "none", field: value})
+        for part in (field, repr(value), words):
+            assert part in str(caught.value)
+    with pytest.raises(OptionError, match="Did you mean inequalities"):
+        Backend("mine", Nothing, "none", inequality=False)
 
 
 class Without(Nothing):
@@ -112,52 +91,25 @@ def broken(options):
 
 def test_a_factory_that_makes_no_solver():
     for factory, words in [
-        (dict, "TypeError: .*; correct the factory"),
-        (Abstract, "TypeError: .*abstract.*; correct the factory"),
-        (lambda: None, "TypeError: .*; correct the factory"),
+        (Solver, "TypeError: .*abstract.*; correct the factory"),
         (lambda options: sys.exit(3), "SystemExit: 3; correct the factory"),
         (lambda options: None, "made None; expected an instance of a subclass"),
-        (lambda options: Nothing, "made <class .*; expected an instance of a subclass"),
         (Without, r"has no options; call super\(\).__init__\(options\)"),
         (broken, "ImportError: broken; reinstall numpy"),
     ]:
         package = ("numpy", "numpy") if factory is broken else ()
         with registered(Backend("mine", factory, "none at all", *package)):
             for ask in (create, qpmhe.solvers.check):
-                with pytest.raises(BackendError, match=f"backend 'mine' .*{words}") as caught:
+                with pytest.raises(BackendError, match=f"backend 'mine' .*{words}"):
                     ask("mine")
-        if factory is broken:
-            assert isinstance(caught.value.__cause__, ImportError)
-
-
-def test_our_own_errors_leave_a_factory_as_they_are():
-    def factory(options):
-        raise OptionError("mine")
-
-    with registered(Backend("mine", factory, "none")), pytest.raises(OptionError, match=r"^mine$"):
-        create("mine")
-
-
-def test_options_that_are_none_are_refused():
-    for options in [3, {"max_iterations": 3}, "fast", SolverOptions]:
-        for name in ("auto", "banded"):
-            with pytest.raises(OptionError, match=r"options is .*; expected qpmhe\.solvers"):
-                create(name, options)
-
-
-def test_an_absent_package_is_named():
-    for module, distribution in [
-        ("no_such_module", "no-such-package"), ("no_such_module", None), ("no_such.part", None),
-    ]:
-        entry = Backend("ghost", broken, "none at all", module=module, distribution=distribution)
+    for distribution in ("no-such-package", None):
+        entry = Backend("ghost", broken, "-", module="no_such.part", distribution=distribution)
+        package = distribution or "no_such.part"
         with registered(entry):
-            assert not entry.available
-            assert entry.version == ""
+            assert (entry.available, entry.version) == (False, "")
             assert "ghost" not in available()
-            assert entry in backends()
             with pytest.raises(BackendError) as caught:
                 create("ghost")
-        package = distribution or module
         for part in (
             f"backend 'ghost' needs the package {package}", f"pip install {package}",
             ", ".join(available()),
@@ -165,23 +117,18 @@ def test_an_absent_package_is_named():
             assert part in str(caught.value)
 
 
-@pytest.mark.parametrize("entry", backends(), ids=NAMES)
-def test_own_table_is_consistent(entry):
-    assert entry.matrices in ("banded", "csc", "dense")
-    assert entry.method
-    assert (entry.module is None) == (entry.distribution is None)
-    assert entry.iteration_cap or not entry.iterate_at_cap
-    if entry.available and entry.distribution:
-        assert entry.version == metadata.version(entry.distribution)
-
-
 def fresh_interpreter(code):
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_looking_for_backends_imports_none():
+def test_the_own_table_is_consistent_and_looking_imports_none():
+    for entry in backends():
+        assert entry.matrices in ("banded", "csc", "dense")
+        assert entry.method
+        assert entry.iteration_cap or not entry.iterate_at_cap
+        if entry.available and entry.distribution:
+            assert entry.version == metadata.version(entry.distribution)
     modules = [entry.module for entry in backends() if entry.module]
     names, imported = fresh_interpreter(
         "import sys, qpmhe_solvers as s\n"
@@ -192,6 +139,9 @@ def test_looking_for_backends_imports_none():
     ).splitlines()
     assert tuple(names.split()) == available()
     assert imported == ""
+    assert set(qpmhe.solvers.__all__) <= set(qpmhe_solvers.__all__)
+    for name in qpmhe.solvers.__all__:
+        assert getattr(qpmhe.solvers, name) is getattr(qpmhe_solvers, name)
 
 
 PLUGIN = """
@@ -205,8 +155,6 @@ class Zero(Solver):
 one = Backend("zero", Zero, "none")
 def two():
     return [Backend("zero2", Zero, "none"), Backend("zero3", Zero, "none")]
-def nothing():
-    return 3
 def taken():
     return Backend("osqp", Zero, "none")
 def mixed():
@@ -237,25 +185,18 @@ def test_entry_points(tmp_path, lookup):
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        "[qpmhe.backends]\none = plugin:one\ntwo = plugin:two\nodd = plugin:nothing\n"
-        "gone = nosuch:x\nclash = plugin:taken\nmixed = plugin:mixed\nleaves = plugin:leaving\n"
+        "[qpmhe.backends]\none = plugin:one\ntwo = plugin:two\ngone = nosuch:x\n"
+        "clash = plugin:taken\nmixed = plugin:mixed\nleaves = plugin:leaving\n"
     )
     told = fresh_interpreter(SCRIPT.format(folder=str(tmp_path), lookup=lookup))
     early, names, status, *warned = told.splitlines()
     assert early == "False"  # importing the package loads nobody's entry points
-    assert names == "['zero', 'zero2', 'zero3']"
-    assert status == "STOPPED"
-    assert len(warned) == 5
+    assert (names, status) == ("['zero', 'zero2', 'zero3']", "STOPPED")
+    assert len(warned) == 4
     for name, words in (
-        ("odd", "TypeError"), ("gone", "ModuleNotFoundError"), ("clash", "registered already"),
+        ("gone", "ModuleNotFoundError"), ("clash", "registered already"),
         ("mixed", "cannot register 3"), ("leaves", "SystemExit: 3"),
     ):
         (line,) = (one for one in warned if f"the entry point {name!r}" in one)
         assert words in line
         assert line.startswith("UserWarning")
-
-
-def test_the_facade_hands_on_the_same_objects():
-    assert set(qpmhe.solvers.__all__) <= set(qpmhe_solvers.__all__)
-    for name in qpmhe.solvers.__all__:
-        assert getattr(qpmhe.solvers, name) is getattr(qpmhe_solvers, name)
