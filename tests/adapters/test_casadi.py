@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from adapters.twins import NONE, M, N, P, check, numpy_output, output, plain, points, rate, same
+from adapters.twins import NONE, M, N, P, check, output, plain, points, rate
 from qpmhe import from_casadi
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import (
@@ -14,24 +14,21 @@ from qpmhe.errors import (
     InvalidInputError,
     ModelError,
     OptionError,
-    QpmheError,
     SetError,
     ShapeError,
 )
 
 ca = pytest.importorskip("casadi")
 
-BOTH = [
-    False,
-    pytest.param(True, marks=pytest.mark.skipif(find_compiler() is None, reason="no compiler")),
-]
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+BOTH = [False, pytest.param(True, marks=needs_compiler)]
 KNOWN = ["SX", "MX", "row", "sparse"]  # ways of writing that state their sizes
 
 
 def written(way):
     """f and h in one of the ways in which CasADi's users write them."""
     if way not in KNOWN:
-        finish = {"list": list, "tuple": tuple, "column": lambda values: ca.vertcat(*values)}[way]
+        finish = {"list": list, "column": lambda values: ca.vertcat(*values)}[way]
         return lambda x, u: finish(rate(x, u, ca)), lambda x, u: finish(output(x, u, ca))
     kind = ca.MX if way == "MX" else ca.SX
     x, u = (kind.sym("x", 1, N) if way == "row" else kind.sym("x", N)), kind.sym("u", M)
@@ -46,12 +43,14 @@ def written(way):
     return made
 
 
-@pytest.mark.parametrize("way", [*KNOWN, "column", "list", "tuple"])
+@pytest.mark.parametrize("way", [*KNOWN, "column", "list"])
 def test_ways_of_writing(way):
     sizes = {} if way in KNOWN else {"n": N, "m": M}
     system = from_casadi(*written(way), dt=0.1, compiled=False, **sizes)
     assert (system.n, system.p, system.m) == (N, P, M)
     check(system, lambda x, u: plain("rk4", x, u), *points())
+    with pytest.raises((ValueError, ShapeError)):  # not broadcast
+        system.f(np.zeros(N - 1), np.zeros(M))
 
 
 @pytest.mark.parametrize("compiled", BOTH)
@@ -72,129 +71,50 @@ def test_matrix_functions_that_cannot_be_expanded(compiled):
     check(system, values, xs, us)
 
 
-@pytest.mark.parametrize("compiled", BOTH)
-def test_functions_of_a_system_in_observer_designs_and_augmented_models(compiled):
-    system = from_casadi(*written("SX"), dt=0.1, compiled=compiled)
-    twin = qpmhe.System.from_ode(
-        lambda x, u: np.array(rate(x, u, np)), numpy_output, dt=0.1, n=N, p=P, m=M
-    )
-    at, u = np.array([0.1, 0.2, 0.3, 0.4]), points(1)[1][0]
-    gains = [
-        qpmhe.design_luenberger(one, at, u=u, disturbance=np.eye(N), noise=0.1 * np.eye(P)).gain
-        for one in (system, twin)
-    ]
-    np.testing.assert_allclose(*gains, rtol=1e-7, atol=1e-9)
-    # The functions themselves, with their inputs as parameters.
-    joint = qpmhe.augment_parameters(system.f, system.h, n=N, p=P, nominal=u)
-    expected = qpmhe.augment_parameters(twin, nominal=u)
-    zs = np.array([np.append(at, u), np.append(2.0 * at, -u)])
-    same(joint, expected, zs, np.zeros((2, 0)), 1e-7)
-
-
 def test_without_a_compiler_the_virtual_machine_evaluates(monkeypatch):
     monkeypatch.setenv("CC", "/nowhere/cc")
-    f, h = written("SX")
-    system = from_casadi(f, h)
     (x,), (u,) = points(1)
+    system = from_casadi(*written("SX"))
     np.testing.assert_allclose(system.f(x, u), plain("discrete", x, u)[0], rtol=1e-14)
     with pytest.raises(CompilationError, match="compiler"):
-        from_casadi(f, h, compiled=True)
+        from_casadi(*written("SX"), compiled=True)
 
 
 X, U = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
 F, H = ca.Function("f", [X], [0.9 * X]), ca.Function("h", [X], [X[0]])
-FU = ca.Function("f", [X, U], [0.9 * X + U])
-WRONG = {
-    "n": ((F, H), {"n": 3}, ModelError, "n is 2.*expected 3"),
-    "p": ((F, H), {"p": 2}, ModelError, "p is 1.*expected 2"),
-    "m": ((FU, H), {"m": 2}, ModelError, "m is 1.*expected 2"),
-    "no n": ((lambda x: x, H), {}, InvalidInputError, "n is missing"),
-    "n = 0": ((lambda x: x, H), {"n": 0}, OptionError, "n is 0"),
-    "m < 0": ((lambda x: x, H), {"n": 2, "m": -1}, OptionError, "m is -1"),
-    "size of f": ((lambda x: x[0], H), {"n": 2}, ModelError, "f is 1.*expected 2"),
-    "size of x": (
-        (F, ca.Function("h", [ca.SX.sym("x", 3)], [1.0])), {}, ModelError, "h takes.*n = 2"
-    ),
-    "matrix": (
-        (ca.Function("f", [ca.SX.sym("x", 2, 2)], [1.0]), H), {}, ModelError, "f "
-    ),
-    "two outputs": ((ca.Function("f", [X], [X, X]), H), {}, ModelError, "2 outputs"),
-    "three inputs": (
-        (ca.Function("f", [X, U, ca.SX.sym("q")], [X]), H), {}, ModelError, "3 inputs"
-    ),
-    "no output": ((lambda x: x, lambda x: []), {"n": 2}, QpmheError, "p is 0"),
-    "None": ((None, H), {"n": 2}, ModelError, "f is None.*casadi"),
-    "expression": ((X, H), {"n": 2}, ModelError, "f is SX"),
-    "text": ((F, "h"), {}, ModelError, "h is 'h'"),
-    "returns text": ((lambda x: "x", H), {"n": 2}, ModelError, "(?s)f cannot be evaluated.*System"),
-    "raises": ((F, lambda x: 1 / 0), {}, ModelError, "h cannot.*ZeroDivisionError"),
-    "branches": (
-        (lambda x: x if x[0] > 0 else -x, H), {"n": 2}, ModelError, "f cannot.*casadi"
-    ),
-    "arguments": ((lambda x, u: x, H), {"n": 2}, ModelError, "f "),
-    "method": ((F, H), {"dt": 0.1, "method": "heun"}, OptionError, "method is 'heun'.*rk4"),
-    "dt = 0": ((F, H), {"dt": 0.0}, OptionError, "dt is 0.0"),
-    "dt < 0": ((F, H), {"dt": -0.1}, OptionError, "dt is -0.1"),
-    "dt": ((F, H), {"dt": "0.1"}, OptionError, "dt is '0.1'"),
-    "dt = nan": ((F, H), {"dt": np.nan}, OptionError, "dt is nan"),
-    "X": ((F, H), {"states": qpmhe.Box([0.0], [1.0])}, SetError, "states has dimension 1"),
-    "V": ((F, H), {"noises": [0.0, 1.0]}, SetError, "noises is"),
-    "compiled": ((F, H), {"compiled": "no"}, OptionError, "compiled is 'no'"),
-    "type of n": ((F, H), {"n": "2"}, QpmheError, "n is '2'"),
-}
+LARGE = ca.Function("h", [ca.SX.sym("x", 3)], [1.0])
+THREE = ca.Function("f", [X, U, ca.SX.sym("q")], [X])
+WRONG = [
+    ((F, H), {"n": 3}, ModelError, "n is 2.*expected 3"),
+    ((lambda x: x, H), {}, InvalidInputError, "n is missing"),
+    ((lambda x: x, H), {"n": 2, "m": -1}, OptionError, "m is -1"),
+    ((lambda x: x[0], H), {"n": 2}, ModelError, "f is 1.*expected 2"),
+    ((F, LARGE), {}, ModelError, "h takes.*n = 2"),
+    ((ca.Function("f", [ca.SX.sym("x", 2, 2)], [1.0]), H), {}, ModelError, "f "),
+    ((ca.Function("f", [X], [X, X]), H), {}, ModelError, "2 outputs"),
+    ((THREE, H), {}, ModelError, "3 inputs"),
+    ((X, H), {"n": 2}, ModelError, "f is SX"),
+    ((lambda x: "x", H), {"n": 2}, ModelError, "(?s)f cannot be evaluated.*System"),
+    ((F, lambda x: 1 / 0), {}, ModelError, "h cannot.*ZeroDivisionError"),
+    ((lambda x: x if x[0] > 0 else -x, H), {"n": 2}, ModelError, "f cannot.*casadi"),
+    ((F, H), {"dt": 0.1, "method": "heun"}, OptionError, "method is 'heun'.*rk4"),
+    ((F, H), {"dt": np.nan}, OptionError, "dt is nan"),
+    ((F, H), {"states": qpmhe.Box([0.0], [1.0])}, SetError, "states has dimension 1"),
+    ((F, H), {"compiled": "no"}, OptionError, "compiled is 'no'"),
+]
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_fails_at_construction(case):
-    functions, options, error, text = WRONG[case]
+@pytest.mark.parametrize(("functions", "options", "error", "text"), WRONG)
+def test_wrong_input_fails_at_construction(functions, options, error, text):
     with pytest.raises(error, match=text):
         from_casadi(*functions, **{"compiled": False, **options})
 
 
-@pytest.mark.parametrize("compiled", BOTH)
-def test_states_of_a_wrong_size_are_not_broadcast(compiled):
-    system = from_casadi(*written("SX"), compiled=compiled)
-    with pytest.raises((ValueError, ShapeError)):
-        system.f(np.zeros(3), np.zeros(M))
-    with pytest.raises((ValueError, ShapeError)):
-        system.f.batch(np.zeros((5, 4)), np.zeros((3, M)))
-
-
 def test_a_model_of_nan_is_refused():
     """math.sin turns a symbol into NaN silently."""
-    system = from_casadi(
-        lambda x: [math.sin(x[0]), x[1]], lambda x: x[0], n=2, compiled=False
-    )
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=1.0)
+    system = from_casadi(lambda x: [math.sin(x[0]), x[1]], lambda x: x[0], n=2, compiled=False)
     with pytest.raises(ModelError, match=r"f is .*nan"):
-        qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([0.1, 0.1]), cost, horizon=5, initial_state=[0.1, 0.1]
-        )
-
-
-@pytest.mark.parametrize("compiled", [None, *BOTH])
-def test_functions_without_code(compiled):
-    """What CasADi cannot write as C is evaluated by it, or refused where C was asked for."""
-    z, q, x = ca.SX.sym("z"), ca.SX.sym("q"), ca.MX.sym("x", 2)
-    root = ca.rootfinder("root", "newton", {"x": z, "p": q, "g": z + 0.1 * ca.sin(z) - q})
-    f = ca.Function("f", [x], [ca.vertcat(root(0, x[0]), 0.5 * x[1])])
-    h = ca.Function("h", [x], [x[0]])
-    if compiled:
-        with pytest.raises(CompilationError):
-            from_casadi(f, h, compiled=True)
-        return
-    system = from_casadi(f, h, compiled=compiled)
-    z = system.f(np.array([0.7, 0.2]), NONE)
-    assert z[0] + 0.1 * np.sin(z[0]) == pytest.approx(0.7, abs=1e-7)
-
-
-def test_an_input_of_the_output_alone():
-    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
-    system = from_casadi(
-        ca.Function("f", [x], [0.5 * x]), ca.Function("h", [x, u], [x[0] * u]), compiled=False
-    )
-    assert system.m == 1
-    assert system.h(np.array([2.0, 1.0]), np.array([3.0])) == [6.0]
+        estimator(system)
 
 
 def falling(case):
@@ -223,80 +143,64 @@ def falling(case):
     return f, ca.Function("h", [x], [h + 0 * x[1]]), value
 
 
-FALLING = ["linear solver", "QP", "root"]
-
-
-@pytest.mark.parametrize("case", FALLING)
-def test_an_evaluation_that_breaks_off_is_no_number(case):
-    f, h, value = falling(case)
-    system = from_casadi(f, h, compiled=False)
-    xs = np.array([[0.5, 0.2], [3.0, 0.1], [0.25, 0.3], [2.0, 0.4], [-0.2, 0.5]])
-    us, bad = np.zeros((5, 0)), np.array([False, True, False, True, False])
-    expected = np.array([[np.nan if k else value(x)] for x, k in zip(xs, bad, strict=True)])
-    for _ in range(2):
-        for x, y in zip(xs, expected, strict=True):
-            np.testing.assert_allclose(system.h(x, NONE), y, rtol=1e-9)
-            assert np.isnan(system.h_jacobian(x, NONE)).any() == np.isnan(y)
-            # What can be evaluated is, whatever is asked for beside it.
-            ahead, output, slope = system.kernel.stage(x, NONE)
-            np.testing.assert_allclose(ahead, 0.9 * x)
-            np.testing.assert_allclose(output, y, rtol=1e-9)
-            np.testing.assert_allclose(slope[:2], 0.9 * np.eye(2))
-        np.testing.assert_allclose(system.h.batch(xs, us), expected, rtol=1e-9)
-        np.testing.assert_allclose(system.f.batch(xs, us), 0.9 * xs)
-        slopes = system.h_jacobian.batch(xs, us)
-        np.testing.assert_array_equal(np.isnan(slopes).any(axis=(1, 2)), bad)
-        residuals = system.kernel.residuals(np.vstack((xs, xs[:1])), np.zeros((5, 1)), us)
-        np.testing.assert_allclose(residuals[:, 2:], -expected, rtol=1e-9)
-        np.testing.assert_allclose(residuals[:, :2], np.roll(xs, -1, axis=0) - 0.9 * xs)
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
-def test_an_evaluation_that_breaks_off_in_compiled_code():
-    f, h, value = falling("QP")
-    system = from_casadi(f, h, compiled=True)
-    xs, us = np.array([[0.5, 0.2], [3.0, 0.1], [-0.2, 0.5]]), np.zeros((3, 0))
-    expected = np.array([[value(xs[0])], [np.nan], [value(xs[2])]])
-    np.testing.assert_allclose(system.h.batch(xs, us), expected)
-    np.testing.assert_array_equal(np.isnan(system.h_jacobian.batch(xs, us)), [
-        [[False] * 2], [[True] * 2], [[False] * 2]])
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
-def test_rootfinders_that_hide_their_failure_are_not_compiled():
-    f, h, value = falling("root")
-    with pytest.raises(CompilationError, match="fast_newton"):
-        from_casadi(f, h, compiled=True)
-    system = from_casadi(f, h)  # evaluated by CasADi
-    assert system.h(np.array([0.5, 0.0]), NONE)[0] == pytest.approx(value([0.5, 0.0]))
-    assert np.isnan(system.h(np.array([3.0, 0.0]), NONE)[0])
+def estimator(system):
+    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[5.0]])
+    return qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.5, 0.1]), cost, horizon=3, initial_state=[0.4, 0.0], max_qps=2
+    )
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
-@pytest.mark.parametrize("case", FALLING)
-def test_a_step_in_which_the_evaluation_breaks_off(case):
-    f, h, _ = falling(case)
-    system = from_casadi(f, h, compiled=False)
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[5.0]])
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.5, 0.1]), cost, horizon=3, initial_state=[0.4, 0.0],
-        max_qps=2,
-    )
-    start = mhe.update([0.5])
-    assert qpmhe.Status.IMPROVED in start.status
+@pytest.mark.parametrize(("case", "compiled"), [
+    ("linear solver", False), ("QP", False), ("root", False), ("root", None),
+    pytest.param("QP", True, marks=needs_compiler),
+])  # fmt: skip
+def test_an_evaluation_that_breaks_off_is_no_number_and_fails_a_step_only(case, compiled):
+    f, h, value = falling(case)
+    system = from_casadi(f, h, compiled=compiled)
+    xs = np.array([[0.5, 0.2], [3.0, 0.1], [0.25, 0.3], [2.0, 0.4], [-0.2, 0.5]])
+    us, bad = np.zeros((5, 0)), np.array([False, True, False, True, False])
+    expected = np.array([[np.nan if k else value(x)] for x, k in zip(xs, bad, strict=True)])
+    for x, y in zip(xs, expected, strict=True):
+        np.testing.assert_allclose(system.h(x, NONE), y, rtol=1e-9)
+        assert np.isnan(system.h_jacobian(x, NONE)).any() == np.isnan(y)
+        # What can be evaluated is, whatever is asked for beside it.
+        ahead, found, slope = system.kernel.stage(x, NONE)
+        np.testing.assert_allclose(ahead, 0.9 * x)
+        np.testing.assert_allclose(found, y, rtol=1e-9)
+        np.testing.assert_allclose(slope[:2], 0.9 * np.eye(2))
+    np.testing.assert_allclose(system.h.batch(xs, us), expected, rtol=1e-9)
+    np.testing.assert_allclose(system.f.batch(xs, us), 0.9 * xs)
+    slopes = system.h_jacobian.batch(xs, us)
+    np.testing.assert_array_equal(np.isnan(slopes).any(axis=(1, 2)), bad)
+    residuals = system.kernel.residuals(np.vstack((xs, xs[:1])), np.zeros((5, 1)), us)
+    np.testing.assert_allclose(residuals[:, 2:], -expected, rtol=1e-9)
+    mhe = estimator(system)
+    assert qpmhe.Status.IMPROVED in mhe.update([0.5]).status
     mhe.update([60.0])  # throws the observer to where h cannot be evaluated
     failed = mhe.update([0.5])
-    assert failed.candidate[-2, 0] > 1
     assert qpmhe.Status.MODEL_FAILED in failed.status
     assert failed.candidate_cost == np.inf
     assert np.isfinite(failed.state).all()
     later = [mhe.update([0.5]) for _ in range(6)]
     assert qpmhe.Status.IMPROVED in later[-1].status
-    assert np.isfinite(later[-1].cost)
+
+
+@needs_compiler
+def test_functions_without_code_and_rootfinders_that_hide_their_failure_are_not_compiled():
+    z, q, x = ca.SX.sym("z"), ca.SX.sym("q"), ca.MX.sym("x", 2)
+    root = ca.rootfinder("root", "newton", {"x": z, "p": q, "g": z + 0.1 * ca.sin(z) - q})
+    f = ca.Function("f", [x], [ca.vertcat(root(0, x[0]), 0.5 * x[1])])
+    with pytest.raises(CompilationError):
+        from_casadi(f, H, compiled=True)
+    z = from_casadi(f, H).f(np.array([0.7, 0.2]), NONE)
+    assert z[0] + 0.1 * np.sin(z[0]) == pytest.approx(0.7, abs=1e-7)
+    with pytest.raises(CompilationError, match="fast_newton"):
+        from_casadi(*falling("root")[:2], compiled=True)
 
 
 @pytest.mark.parametrize("compiled", BOTH)
-@pytest.mark.parametrize("way", ["function", "inner", "callable", "mapped"])
+@pytest.mark.parametrize("way", ["function", "inner", "mapped"])
 def test_assertions_hold(way, compiled):
     """A state at which one fails has no value, however the model is evaluated."""
     x = ca.MX.sym("x", 2)
@@ -305,10 +209,9 @@ def test_assertions_hold(way, compiled):
     h = {
         "function": inner,
         "inner": ca.Function("h", [x], [ca.if_else(x[1] > 9, 0, inner(x), True)]),
-        "callable": lambda x: inner(x),
         "mapped": ca.Function("h", [x], [ca.sum2(inner.map(2)(ca.horzcat(x, x))) / 2]),
     }[way]
-    system = from_casadi(ca.Function("f", [x], [0.9 * x]), h, compiled=compiled)
+    system = from_casadi(F, h, compiled=compiled)
     xs, us = np.array([[0.5, 1.0], [-2.0, 1.0], [2.0, 0.0]]), np.zeros((3, 0))
     expected = np.array([[0.6], [np.nan], [2.0]])
     for x, y in zip(xs, expected, strict=True):

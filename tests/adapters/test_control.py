@@ -1,7 +1,8 @@
-"""What only python-control's systems have: linear ones, sampling, dependence on time."""
+"""Systems of python-control, and estimators as blocks in its own simulations."""
 
 import pickle
 
+import control
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete
@@ -10,8 +11,6 @@ import qpmhe
 from adapters.twins import same
 from qpmhe import System, from_control
 from qpmhe.errors import InvalidInputError, ModelError, OptionError
-
-control = pytest.importorskip("control")
 
 A = np.array([[0.0, 1.0], [-2.0, -0.3]])
 B, C, D = np.array([[0.0], [1.5]]), np.array([[1.0, 0.2]]), np.array([[0.4]])
@@ -33,48 +32,24 @@ def linear(a, b):
     )
 
 
-def test_a_linear_system_in_continuous_time_is_sampled_exactly():
+def nonlinear(f, h=angle, **options):
+    return control.NonlinearIOSystem(f, h, **{"inputs": 1, "outputs": 1, "states": 2} | options)
+
+
+def test_a_linear_system_is_sampled_exactly_discretised_or_taken_as_it_is():
+    plant = control.ss(A, B, C, D)
     ad, bd, *_ = cont2discrete((A, B, C, D), 0.1, "zoh")
-    same(from_control(control.ss(A, B, C, D), dt=0.1), linear(ad, bd), POINTS, INPUTS)
-
-
-@pytest.mark.parametrize("method", ["euler", "rk4"])
-def test_a_linear_system_is_discretised_like_any_rate(method):
-    plain = System.from_ode(
-        lambda x, u: x @ A.T + u @ B.T, lambda x, u: x @ C.T + u @ D.T, dt=0.1, n=2, p=1, m=1,
-        method=method,
-    )
-    same(from_control(control.ss(A, B, C, D), dt=0.1, method=method), plain, POINTS, INPUTS)
-
-
-@pytest.mark.parametrize("dt", [True, 0.1])
-def test_a_linear_system_in_discrete_time_is_taken_as_it_is(dt):
-    same(from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B), POINTS, INPUTS)
-
-
-def test_a_nonlinear_system_in_discrete_time_without_inputs():
-    theirs = control.NonlinearIOSystem(
-        lambda t, x, u, params: 0.9 * np.sin(x), lambda t, x, u, params: x[:1],
-        inputs=0, outputs=1, states=2, dt=True,
-    )
-    system = from_control(theirs)
+    exact = from_control(plant, dt=0.1, states=qpmhe.Box([-5, -5], [5, 5]))
+    same(pickle.loads(pickle.dumps(exact)), linear(ad, bd), POINTS, INPUTS)
+    for method in ("euler", "rk4"):
+        plain = System.from_ode(
+            linear(A, B).f, linear(A, B).h, dt=0.1, n=2, p=1, m=1, method=method)
+        same(from_control(plant, dt=0.1, method=method), plain, POINTS, INPUTS)
+    for dt in (True, 0.1):
+        same(from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B), POINTS, INPUTS)
+    system = from_control(nonlinear(lambda t, x, u, params: 0.9 * np.sin(x), inputs=0, dt=True))
     assert system.m == 0
     np.testing.assert_allclose(system.f.batch(POINTS, np.empty((7, 0))), 0.9 * np.sin(POINTS))
-
-
-def test_an_estimator_runs_on_it_and_it_pickles():
-    system = from_control(
-        control.ss(A, B, C, 0), dt=0.1, states=qpmhe.Box([-5, -5], [5, 5])
-    )
-    copy = pickle.loads(pickle.dumps(system))
-    same(copy, system, POINTS, INPUTS)
-    assert repr(copy.states) == repr(system.states)
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.3, 0.2]),
-        qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]]),
-        horizon=5, initial_state=[0, 0],
-    )
-    assert mhe.update([1.0], [0.0]).improved
 
 
 def rotating():
@@ -92,7 +67,6 @@ def rotating():
         (rotating, {"dt": 0.1}, ModelError, "A of the .*imaginary"),
         (lambda: control.ss(A, B, C, np.inf), {"dt": 0.1}, InvalidInputError, "D of the system"),
         (lambda: control.ss(A, B, C, D), {}, OptionError, "dt is missing"),
-        (lambda: control.ss(A, B, C, D), {"dt": -1.0}, InvalidInputError, "dt"),
         (lambda: control.ss(A, B, C, D, 0.1), {"dt": 0.2}, OptionError, "leave it out"),
         (lambda: control.ss(A, B, C, D, 0.1), {"method": "rk4"}, OptionError, "discrete"),
         (lambda: control.ss(A, B, C, D), {"dt": 0.1, "method": "foo"}, OptionError, "foo"),
@@ -103,46 +77,16 @@ def test_what_does_not_fit_is_refused(made, options, error, words):
         from_control(made(), **options)
 
 
-def in_time(change, where):
-    """The swing with an update or output that change(t) is added to."""
-
-    def changed(function):
-        return lambda t, x, u, params: function(t, x, u, params) + change(t)
-
-    functions = {"dynamics": swing, "output": angle}
-    functions[where] = changed(functions[where])
-    return functions["dynamics"], functions["output"]
-
-
-def table(t):
-    return [0.0, 0.0, 0.0][int(t / 0.125)]
-
-
-@pytest.mark.parametrize("where", ["dynamics", "output"])
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda t: 1e-9 * t,
-        lambda t: float(t % 0.125 > 0.03),
-        lambda t: float(t > 12.0),
-        table,
-    ],
-    ids=["slowly", "periodic", "once", "table"],
-)
-def test_a_system_that_depends_on_time_is_refused(change, where):
-    theirs = control.NonlinearIOSystem(
-        *in_time(change, where), inputs=1, outputs=1, states=2
-    )
-    with pytest.raises(ModelError, match=rf"the {where} of .*at time 0 and .*time-invariant"):
-        from_control(theirs, dt=0.125)
-
-
-def test_a_map_that_depends_on_time_is_refused():
-    theirs = control.NonlinearIOSystem(
-        *in_time(lambda t: float(t > 0.0), "dynamics"), inputs=1, outputs=1, states=2, dt=0.1
-    )
-    with pytest.raises(ModelError, match=r"dynamics of .*at time 0\.1"):
-        from_control(theirs)
+@pytest.mark.parametrize(("change", "dt", "at"), [
+    (lambda t: 1e-9 * t, 0, "at time 0 and"), (lambda t: float(t % 0.125 > 0.03), 0, "at time 0"),
+    (lambda t: float(t > 12.0), 0, "at time 0"), (lambda t: [0.0] * int(t < 0.3), 0, "at time 0"),
+    (lambda t: float(t > 0.0), 0.1, r"at time 0\.1"),
+], ids=["slowly", "periodic", "once", "table", "map"])  # fmt: skip
+def test_a_system_that_depends_on_time_is_refused(change, dt, at):
+    changed = [lambda *given, g=one: g(*given) + change(given[0]) for one in (swing, angle)]
+    for where, functions in (("dynamics", (changed[0], angle)), ("output", (swing, changed[1]))):
+        with pytest.raises(ModelError, match=rf"the {where} of .*{at}.*time-invariant"):
+            from_control(nonlinear(*functions, dt=dt), dt=None if dt else 0.125)
 
 
 def test_a_map_is_asked_at_its_own_times_only():
@@ -150,5 +94,75 @@ def test_a_map_is_asked_at_its_own_times_only():
         assert t == pytest.approx(round(t))
         return 0.5 * np.sqrt(x - 0.7)  # not a number at some probes, at all times
 
-    theirs = control.NonlinearIOSystem(update, angle, inputs=1, outputs=1, states=2, dt=True)
-    assert from_control(theirs).n == 2
+    assert from_control(nonlinear(update, dt=True)).n == 2
+
+
+F, G = np.array([[1.0, 0.1], [0.2, 0.95]]), np.array([[0.0], [0.1]])
+FEEDBACK, OUTPUT = np.array([[8.0, 6.0]]), np.array([[1.0, 0.0]])
+START, GUESS = np.array([1.0, -0.5]), np.array([0.4, 0.2])
+NOISES = 0.02 * np.random.default_rng(5).standard_normal((60, 1))
+
+
+def estimator(system=None, **options):
+    system = from_control(control.ss(F, G, OUTPUT, 0, 0.1)) if system is None else system
+    covariances = {"prior": np.eye(2), "disturbance": 1e-3 * np.eye(2), "noise": 4e-4 * np.eye(1)}
+    return qpmhe.MovingHorizonEstimator(
+        system, qpmhe.ExtendedKalman(**covariances),
+        qpmhe.QuadraticCost.from_covariances(**covariances), horizon=8, initial_state=GUESS,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("engine", ["python", "auto"])
+def test_a_closed_loop_is_a_plain_loop_and_starts_anew(engine):
+    plant = control.ss(F, G, OUTPUT, 0, 0.1, name="plant", inputs=["u[0]"], outputs=["clean"])
+    noise = control.summing_junction(["clean", "v"], "y[0]", name="noise", dt=0.1)
+    law = control.ss([], [], [], -FEEDBACK, 0.1, name="law", inputs=["xhat[0]", "xhat[1]"],
+                     outputs=["u[0]"])
+    block = qpmhe.to_iosystem(estimator(engine=engine), dt=0.1)
+    loop = control.interconnect(
+        [plant, noise, law, block], inputs=["v"],
+        outputs=["clean", "u[0]", "xhat[0]", "xhat[1]"], dt=0.1,
+    )
+    x, rows, mhe = START, [], estimator(engine=engine)
+    for v in NOISES:
+        u = -FEEDBACK @ mhe.state
+        rows.append([*(OUTPUT @ x), *u, *mhe.state])
+        mhe.update(OUTPUT @ x + v, u)
+        x = F @ x + G @ u
+    time = 0.1 * np.arange(len(NOISES))
+    for guess in (GUESS, GUESS + 0.3, GUESS):
+        answer = control.input_output_response(
+            loop, time, NOISES.T, np.concatenate([START, guess])).outputs
+        np.testing.assert_array_equal(answer[2:, 0], guess)
+    np.testing.assert_allclose(answer, np.transpose(rows), rtol=1e-9, atol=1e-12)
+
+
+def test_a_block_takes_missing_measurements_and_repeated_calls():
+    mhe, other = estimator(), estimator()
+    block, x = qpmhe.to_iosystem(mhe), GUESS
+    for t, y in enumerate([0.7, np.nan, 0.6]):
+        before = x
+        for _ in range(2):  # a second call is not another sample
+            x = block.dynamics(t, before, [y, 0.1])
+            assert mhe.time == t + 1
+        np.testing.assert_array_equal(x, other.update([y], [0.1]).state)
+
+
+def test_labels_and_options_of_a_block():
+    mhe = estimator(System.from_ode(lambda x, u: u - x, lambda x: x[..., :1], dt=0.2, n=2, p=1,
+                                    m=1))
+    block = qpmhe.to_iosystem(
+        mhe, name="level", measurement_labels=["h"], control_labels="pump", estimate_labels="x{i}"
+    )
+    assert (block.dt, block.name) == (0.2, "level")
+    assert (block.input_labels, block.output_labels) == (["h", "pump"], ["x0", "x1"])
+    for options, words in (
+        ({"dt": 0.1}, r"dt is 0\.1, but the system has 0\.2"),
+        ({"measurement_labels": ["a", "b"]}, "measurement_labels is"),
+        ({"estimate_labels": "x"}, "estimate_labels is 'x'; expected 2 different names"),
+    ):
+        with pytest.raises(OptionError, match=words):
+            qpmhe.to_iosystem(mhe, **options)
+    with pytest.raises(InvalidInputError, match="mhe is a System"):
+        qpmhe.to_iosystem(mhe.system)

@@ -1,13 +1,12 @@
 """What only JAX's models have: tracing, precision, compiled programs, indices, expressions."""
 
 import math
-import pickle
 
 import numpy as np
 import pytest
 
 import qpmhe
-from adapters.twins import FUNCTIONS, NONE, same
+from adapters.twins import FUNCTIONS, NONE
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
 
 jax = pytest.importorskip("jax")
@@ -15,112 +14,33 @@ jnp = jax.numpy
 
 from qpmhe import from_jax  # noqa: E402
 
-SWITCH = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
+HOME = jax if hasattr(jax, "enable_x64") else jax.experimental
+SWITCH = HOME.enable_x64
 
 
-def estimator(system, gain=0.3, **options):
+def estimator(system, **options):
     n, p = system.n, system.p
     cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=100.0 * np.eye(p))
     return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(np.full((n, p), gain)), cost,
+        system, qpmhe.Luenberger(np.full((n, p), 0.3)), cost,
         **{"horizon": 4, "initial_state": np.ones(n), **options},
     )
 
 
-@pytest.mark.parametrize(
-    ("f", "h"),
-    [
-        pytest.param(lambda x: [x[1], -jnp.sin(x[0])], lambda x: x[0], id="list, scalar"),
-        pytest.param(
-            jax.jit(lambda x: jnp.array([x[1], -jnp.sin(x[0])])), jax.jit(lambda x: x[:1]),
-            id="jitted",
-        ),
-        pytest.param(
-            lambda x: jnp.array([x[1], jax.lax.cond(x[0] > 0.0, lambda a: -jnp.sin(a),
-                                                    lambda a: -jnp.sin(a), x[0])]),
-            lambda x: jax.lax.fori_loop(0, 3, lambda i, s: s + x[:1] / 3.0, jnp.zeros(1)),
-            id="control flow",
-        ),
-    ],
-)
-def test_ways_of_writing(f, h):
-    system = from_jax(f, h, n=2, p=1)
-    twin = qpmhe.System(
-        lambda x: np.stack([x[..., 1], -np.sin(x[..., 0])], -1), lambda x: x[..., :1], n=2, p=1
-    )
-    x = np.random.default_rng(7).standard_normal((6, 2))
-    same(system, twin, x, np.empty((6, 0)))
-
-
-def test_functions_that_do_not_see_the_input():
-    system = from_jax(lambda x: 0.5 * x, lambda x, u: x + u, n=1, p=1, m=1)
-    np.testing.assert_array_equal(system.f(np.array([3.0]), np.array([8.0])), [1.5])
-    np.testing.assert_array_equal(system.h(np.array([3.0]), np.array([8.0])), [11.0])
-
-
-def network(xp, x):
-    """Thousands of operations at a state."""
-    weights = np.random.default_rng(1).standard_normal((24, 30)) / 5.0
-    hidden = xp.tanh(xp.tanh(x @ weights[:, :6].T) @ weights[:, 6:].T)
-    return 0.9 * x + hidden @ weights[:, :6]
-
-
-def chain(xp, x):
-    """Many states, few operations at each."""
-    return 0.9 * x + 0.1 * x**2 * xp.roll(x, 1, axis=-1)
-
-
-@pytest.mark.parametrize(("model", "n"), [(network, 6), (chain, 12)])
-def test_large_models_over_a_long_window(model, n):
-    systems = (
-        from_jax(lambda x: model(jnp, x), lambda x: x[:2], n=n, p=2),
-        qpmhe.System(lambda x: model(np, x), lambda x: x[..., :2], n=n, p=2),
-    )
-    xs = 0.5 * np.random.default_rng(2).standard_normal((40, n))
-    same(*systems, xs, np.empty((40, 0)), 1e-11)
-    both = [estimator(one, horizon=20, gain=0.01, max_qps=2) for one in systems]
-    for y in xs[:, :2]:
-        one, two = (mhe.update(y) for mhe in both)
-        np.testing.assert_allclose(one.trajectory, two.trajectory, rtol=1e-8, atol=1e-9)
-
-
-# Precision
-
-
-def precision():
-    return jax.config.jax_enable_x64, jnp.ones(1).dtype, jnp.zeros(1, int).dtype
-
-
-AT_FIRST = precision()
-
-
-def test_the_precision_of_the_process_is_left_alone():
-    before = precision()
-    assert before == AT_FIRST
-    system = from_jax(lambda x: 0.1 * x, lambda x: x, n=1, p=1)
-    assert system.f(np.array([1.0]), NONE)[0] == 0.1
-    assert precision() == before
-    with pytest.raises(ModelError):
-        from_jax(lambda x: x[0, 0, 0], lambda x: x, n=1, p=1)
-    assert precision() == before
-
-
 @pytest.mark.parametrize("double", [False, True])
-def test_results_are_double_whatever_the_default(double):
+def test_results_are_double_and_the_precision_of_the_process_is_left_alone(double):
     third = np.array([1.0 / 3.0])
     with SWITCH(double):
         system = from_jax(lambda x: x + 1e-12, lambda x: jnp.exp(x), n=1, p=1)
         assert system.f(third, NONE)[0] == third[0] + 1e-12
-        assert precision()[0] is double
-    for _ in range(2):  # made under one default, used under the other
-        with SWITCH(not double):
-            assert system.f(2.0 * third, NONE)[0] == 2.0 * third[0] + 1e-12
-            found = system.h.batch(np.tile(third, (20, 1)), np.empty((20, 0)))
-            np.testing.assert_allclose(found, math.exp(1.0 / 3.0), rtol=1e-15)
-            assert precision()[0] is not double
-
-
-# Compilation
+        with pytest.raises(ModelError):
+            from_jax(lambda x: x[0, 0, 0], lambda x: x, n=1, p=1)
+        assert jax.config.jax_enable_x64 is double
+    with SWITCH(not double):  # made under one default, used under the other
+        assert system.f(2.0 * third, NONE)[0] == 2.0 * third[0] + 1e-12
+        found = system.h.batch(np.tile(third, (20, 1)), np.empty((20, 0)))
+        np.testing.assert_allclose(found, math.exp(1.0 / 3.0), rtol=1e-15)
+        assert jnp.ones(1).dtype == (np.float32 if double else np.float64)
 
 
 def test_lengths_that_share_a_size_are_compiled_once():
@@ -132,112 +52,80 @@ def test_lengths_that_share_a_size_are_compiled_once():
     at_first = len(compiled)
     assert at_first >= 3
     x = np.random.default_rng(12).standard_normal((32, 2))
-    for size in range(1, 17):
-        for name in FUNCTIONS:
-            getattr(system, name).batch(x[:size], np.empty((size, 0)))
-            getattr(system, name)(x[size], NONE)
-    assert len(compiled) == at_first
-    for size in range(17, 33):
-        for name in FUNCTIONS:
-            getattr(system, name).batch(x[:size], np.empty((size, 0)))
-    assert len(compiled) == at_first + 2  # f with h, and both Jacobians
+    # Beyond 16 f with h, and both Jacobians, once more.
+    for sizes, more in ((range(1, 17), 0), (range(17, 33), 2)):
+        for size in sizes:
+            for name in FUNCTIONS:
+                getattr(system, name).batch(x[:size], np.empty((size, 0)))
+                getattr(system, name)(x[size - 1], NONE)
+        assert len(compiled) == at_first + more
 
 
-@pytest.fixture
-def calls(monkeypatch):
-    """Entries of the switch to double precision: one at each call into a program."""
-    home = jax if hasattr(jax, "enable_x64") else jax.experimental
-    switch, entries = home.enable_x64, []
-
-    def counted(value):
-        entries.append(value)
-        return switch(value)
-
-    monkeypatch.setattr(home, "enable_x64", counted)
-    return entries
-
-
-def test_one_call_serves_both_functions(calls):
+def test_calls_of_a_step_and_estimators_that_share_programs(monkeypatch):
+    calls = []
+    # Entries of the switch to double precision: one at each call into a program.
+    monkeypatch.setattr(HOME, "enable_x64", lambda value: calls.append(value) or SWITCH(value))
     system = from_jax(lambda x: 0.9 * x, lambda x: x[:1] ** 2, n=2, p=1)
-    x = np.random.default_rng(14).standard_normal((2, 5, 2))
-    nothing = np.empty((5, 0))
-    calls.clear()
-    for k, states in enumerate(x):
-        for names in (("f", "h", "f"), ("f_jacobian", "h_jacobian", "f_jacobian")):
-            for name in names:
-                getattr(system, name).batch(states, nothing)
-                getattr(system, name)(states[0], NONE)
-        assert len(calls) == 4 * (k + 1)
-
-
-@pytest.mark.parametrize("max_qps", [0, 1])
-def test_calls_of_a_step(calls, max_qps):
-    system = from_jax(lambda x: 0.9 * x, lambda x: x[:1] ** 2, n=2, p=1)
-    mhe = estimator(system, max_qps=max_qps)
     ys = 1.0 + 0.1 * np.random.default_rng(8).standard_normal((40, 1))
-    for y in ys[:20]:
-        mhe.update(y)
-    calls.clear()
-    assert sum(mhe.update(y).improved for y in ys[20:]) == 20 * max_qps
-    # The new stage, the trial, and now and then a batch to see that batches may be trusted.
-    assert 20 * (1 + max_qps) <= len(calls) <= 20 * (1 + max_qps) + 2
-
-
-def test_estimators_of_one_system_share_its_programs(monkeypatch):
-    system = from_jax(lambda x: 0.9 * x, lambda x: x[:1] ** 2, n=2, p=1)
-    expected, compiled = estimator(system).update([2.5]), []
+    for max_qps in (0, 1):
+        mhe = estimator(system, max_qps=max_qps)
+        for y in ys[:20]:
+            mhe.update(y)
+        calls.clear()
+        assert sum(mhe.update(y).improved for y in ys[20:]) == 20 * max_qps
+        # The new stage, the trial, and now and then a batch to see that batches may be trusted.
+        assert 20 * (1 + max_qps) <= len(calls) <= 20 * (1 + max_qps) + 2
+    compiled = []
     monkeypatch.setattr(
         "qpmhe.adapters.jax_programs.Programs._compiled", lambda *given: compiled.append(given)
     )
-    assert estimator(system).update([2.5]).cost == expected.cost
+    assert estimator(system).update([2.5]).improved
     assert compiled == []
 
 
-# What goes wrong
+def callback(x):
+    return jax.pure_callback(np.asarray, jax.ShapeDtypeStruct((2,), np.float64), x)
 
 
-@pytest.mark.parametrize("dt", [None, 0.1])
-@pytest.mark.parametrize(
-    ("f", "h", "words"),
-    [
-        (lambda x: jnp.ones(3), lambda x: x[:1], r"f returned shape \(3,\); expected \(2,\)"),
-        (lambda x: x[0], lambda x: x[:1], r"f returned shape \(\)"),
-        (lambda x: x[None], lambda x: x[:1], r"f returned shape \(1, 2\)"),
-        (lambda x: x, lambda x: x, r"h returned shape \(2,\); expected \(1,\)"),
-        (lambda x: x, lambda x: x[:1, None], r"h returned shape \(1, 1\)"),
-    ],
-)
-def test_a_function_of_the_wrong_shape_is_refused(f, h, words, dt):
-    with pytest.raises(ModelError, match=words):
-        from_jax(f, h, n=2, p=1, dt=dt)
+WRONG = [
+    (lambda x: jnp.ones(3), r"f returned shape \(3,\); expected \(2,\)"),
+    (lambda x: x[0], r"f returned shape \(\)"),
+    (lambda x: x if x[0] > 0 else -x, "JAX cannot trace f: TracerBool"),
+    (lambda x: x * math.sin(x[0]), "JAX cannot trace f: .*jnp.where or lax.cond"),
+    (lambda x: x.astype(jnp.float32), "f returned float32 where x is float64"),
+    (lambda x: x + 1j, "f returned complex128"),
+    (lambda x, u: x + u, "f needs 2 arguments, but the system has no inputs"),
+    (lambda: 1.0, "f takes no argument; expected"),
+    (3.0, "f is 3.0; expected a function"),
+    (callback, "JAX cannot differentiate f and h: "),
+]
 
 
-@pytest.mark.parametrize(
-    ("f", "words"),
-    [
-        (lambda x: x if x[0] > 0 else -x, "JAX cannot trace f: TracerBool"),
-        (lambda x: x * math.sin(x[0]), "JAX cannot trace f: .*jnp.where or lax.cond"),
-        (lambda x: np.asarray(x) * 2.0, "JAX cannot trace f: TracerArray"),
-        (lambda x: x + undefined, "JAX cannot trace f: NameError"),  # noqa: F821
-        (lambda x: x.astype(jnp.float32), "f returned float32 where x is float64"),
-        (lambda x: x + 1j, "f returned complex128"),
-        (lambda x, u: x + u, "f needs 2 arguments, but the system has no inputs"),
-        (lambda: 1.0, "f takes no argument; expected"),
-        (3.0, "f is 3.0; expected a function"),
-        (
-            lambda x: jax.pure_callback(
-                lambda v: np.asarray(v), jax.ShapeDtypeStruct((2,), np.float64), x
-            ),
-            "JAX cannot differentiate f and h: ",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("f", "words"), WRONG)
 def test_a_function_that_cannot_be_used_is_refused_in_words(f, words):
-    with pytest.raises(ModelError, match=words):
-        from_jax(f, lambda x: x[:1], n=2, p=1)
+    for dt in (None, 0.1):
+        with pytest.raises(ModelError, match=words):
+            from_jax(f, lambda x: x[:1], n=2, p=1, dt=dt)
 
 
-def test_a_wrong_derivative_is_refused():
+def test_wrong_options_and_a_missing_cpu_are_refused(monkeypatch):
+    for options, error, words in [
+        ({"n": 0}, OptionError, "n is 0"), ({"dt": 0.0}, OptionError, "dt is 0.0"),
+        ({"method": "heun"}, OptionError, "method is 'heun'"),
+        ({"states": qpmhe.Box([0.0], [1.0])}, SetError, "states has dimension 1"),
+    ]:
+        with pytest.raises(error, match=words):
+            from_jax(lambda x: x, lambda x: x[:1], **{"n": 2, "p": 1, **options})
+
+    def none(backend):
+        raise RuntimeError(f"Unknown backend {backend}")
+
+    monkeypatch.setattr(jax, "local_devices", none)
+    with pytest.raises(InvalidInputError, match=r"Unknown backend cpu.*JAX_PLATFORMS"):
+        from_jax(lambda x: x, lambda x: x, n=1, p=1)
+
+
+def test_a_wrong_derivative_is_refused_and_a_kink_is_not():
     @jax.custom_jvp
     def squared(x):
         return x**2
@@ -247,75 +135,12 @@ def test_a_wrong_derivative_is_refused():
         from_jax(squared, lambda x: x, n=1, p=1).use_scales([1.0])
     with pytest.raises(ModelError, match=r"h_jacobian.* custom derivative within h"):
         from_jax(lambda x: x, squared, n=1, p=1).use_scales([1.0])
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"n": 0}, OptionError, "n is 0"),
-        ({"p": 1.5}, OptionError, "p is 1.5"),
-        ({"m": -1}, OptionError, "m is -1"),
-        ({"dt": 0.0}, OptionError, "dt is 0.0"),
-        ({"dt": 0.1, "method": "heun"}, OptionError, "'heun'; expected one of 'euler', 'rk4'"),
-        ({"method": "heun"}, OptionError, "method is 'heun'"),
-        ({"states": qpmhe.Box([0.0], [1.0])}, SetError, "states has dimension 1"),
-    ],
-)
-def test_wrong_options_are_refused(options, error, words):
-    with pytest.raises(error, match=words):
-        from_jax(lambda x: x, lambda x: x[:1], **{"n": 2, "p": 1, **options})
-
-
-def test_without_a_cpu_the_remedy_is_named(monkeypatch):
-    def none(backend):
-        raise RuntimeError(f"Unknown backend {backend}")
-
-    monkeypatch.setattr(jax, "local_devices", none)
-    with pytest.raises(InvalidInputError, match=r"Unknown backend cpu.*JAX_PLATFORMS"):
-        from_jax(lambda x: x, lambda x: x, n=1, p=1)
-
-
-def test_a_model_that_is_not_a_number_far_away_falls_back():
-    # A tank: the root of a negative level is not a number.
-    def rate(xp, x):
-        return 0.2 - 0.5 * xp.sqrt(x)
-
-    pair = [
-        estimator(system, initial_state=[0.5], gain=0.9, max_qps=2)
-        for system in (
-            from_jax(lambda x: rate(jnp, x), lambda x: x, n=1, p=1, dt=0.1),
-            qpmhe.System.from_ode(lambda x: rate(np, x), lambda x: x, n=1, p=1, dt=0.1),
-        )
-    ]
-    statuses = []
-    with np.errstate(invalid="ignore"):
-        for y in [0.5, 0.4, -3.0, -3.0, 0.6, 0.5, 0.5, 0.4, 0.5, 0.5, 0.5]:
-            one, other = (mhe.update([y]) for mhe in pair)
-            np.testing.assert_allclose(one.trajectory, other.trajectory, rtol=1e-9, atol=1e-9)
-            assert np.isfinite(one.state).all()
-            assert one.status == other.status
-            statuses.append(one.status)
-    failed = [qpmhe.Status.MODEL_FAILED in status for status in statuses]
-    assert any(failed)
-    assert not failed[0]
-    assert not failed[-1]
-
-
-@pytest.mark.parametrize("start", [0.0, 1.0])
-def test_the_estimation_may_start_at_a_kink(start):
     # Differences across it give the mean of both slopes, JAX one of them.
-    system = from_jax(
-        lambda x: jnp.where(x > start, 0.9 * x, 0.9 * start + 0.3 * (x - start)),
-        lambda x: x, n=1, p=1,
+    bent = from_jax(
+        lambda x: jnp.where(x > 1.0, 0.9 * x, 0.6 + 0.3 * x), lambda x, u: x + u, n=1, p=1, m=1
     )
-    mhe = estimator(system, initial_state=[start])
-    assert mhe.update([start + 0.5]).improved
-    assert system.f_jacobian(np.array([start]), NONE)[0, 0] in (0.3, 0.9)
-
-
-def test_a_model_of_nameless_functions_does_not_pickle():
-    with pytest.raises((pickle.PicklingError, AttributeError)):
-        pickle.dumps(from_jax(lambda x: x, lambda x: x, n=1, p=1))
+    assert estimator(bent, initial_state=[1.0]).update([1.5], [0.0]).improved
+    assert bent.f_jacobian(np.ones(1), np.ones(1))[0, 0] in (0.3, 0.9)
 
 
 # Indices out of range, where JAX reads another entry
@@ -343,9 +168,7 @@ OUT_OF_RANGE = {
     "negative": (lambda x, u: x * x[-3], "index -3 on axis 0, of size 2"),
     "input": (lambda x, u: x * u[1], "index 1 on axis 0, of size 1, of an array (1,)"),
     "list": (lambda x, u: x[jnp.array([0, 2])], "index 2 on axis 0, of size 2"),
-    "list in NumPy": (lambda x, u: x[np.array([0, -3])], "index -3 on axis 0"),
     "nested constants": (lambda x, u: x * jnp.asarray(ROWS)[1, 2], "index 2 on axis 1, of size 2"),
-    "row": (lambda x, u: x + jnp.asarray(ROWS)[3], "index 3 on axis 0, of size 3"),
     "table": (lambda x, u: x * jnp.asarray(TABLE)[place(10.0 * x)], "on axis 0, of size 8"),
     "write": (lambda x, u: x.at[2].set(1.0), "index 2 on axis 0, of size 2"),
     "slice": (lambda x, u: jax.lax.dynamic_slice(x, (1,), (2,)), "index 1 on axis 0, of size 2"),
@@ -358,18 +181,14 @@ OUT_OF_RANGE = {
 }
 IN_RANGE = {
     "last": lambda x, u: x * x[-1] + u[-1],
-    "turned": lambda x, u: x[::-1],
-    "slice": lambda x, u: x[0:9],
+    "turned": lambda x, u: x[::-1] + x[0:9],
     "write": lambda x, u: x.at[-1].set(1.0).at[:1].add(u),
-    "unpacked": lambda x, u: jnp.array([x[1], *u]),
     "clipped": lambda x, u: x * jnp.asarray(TABLE)[jnp.clip(place(x), 0, 7)],
     "clip": lambda x, u: x * jnp.take(jnp.asarray(TABLE), place(x), mode="clip"),
-    "clipped rows": lambda x, u: jnp.asarray(ROWS).at[(9.0 * x).astype(int)].get(mode="clip")[0],
     "clip in a loop": lambda x, u: jax.lax.fori_loop(
         0, 4, lambda i, z: 0.5 * z + jnp.take(x, i, mode="clip"), x
     ),
     "wrap": lambda x, u: x * jnp.take(jnp.asarray(TABLE), place(x), mode="wrap"),
-    "fill": lambda x, u: x * jnp.take(jnp.asarray(TABLE), place(x), mode="fill", fill_value=0.0),
     "filled": lambda x, u: x * jnp.asarray(TABLE).at[place(x)].get(mode="fill", fill_value=0.5),
     "clipped write": lambda x, u: x.at[place(x)].set(1.0, mode="clip"),
     "interpolation": lambda x, u: x * jnp.interp(x[0], jnp.asarray(TABLE), jnp.asarray(TABLE)),
@@ -377,24 +196,19 @@ IN_RANGE = {
     "loop": lambda x, u: loop(x, 2),
     "sorted": lambda x, u: x[jnp.argsort(x)] + x[jnp.argmax(x)],
     "solved": lambda x, u: jnp.linalg.solve(jnp.eye(2) + jnp.outer(x, x), x),
-    "guarded by a branch": lambda x, u: jax.lax.cond(
-        u[0] < 0.0, lambda: x * x[5], lambda: x
-    ),
+    "guarded by a branch": lambda x, u: jax.lax.cond(u[0] < 0.0, lambda: x * x[5], lambda: x),
 }
 
 
 @pytest.mark.parametrize("name", OUT_OF_RANGE)
 def test_an_index_out_of_range_is_refused(name):
     function, words = OUT_OF_RANGE[name]
-    for method in (None, "rk4"):
-        timing = {} if method is None else {"dt": 0.1, "method": method}
-        with pytest.raises(ModelError) as caught:
-            from_jax(function, lambda x: x[0], n=2, p=1, m=1, **timing)
-        assert str(caught.value).startswith("f uses index ")
+    for f, h, p, which in (
+        (function, lambda x: x[0], 1, "f"), (lambda x: x, lambda x, u: function(x, u), 2, "h")
+    ):
+        with pytest.raises(ModelError, match=rf"^{which} uses index .*jnp\.clip") as caught:
+            from_jax(f, h, n=2, p=p, m=1, dt=0.1 if which == "f" else None)
         assert words in str(caught.value)
-        assert "jnp.clip" in str(caught.value)
-    with pytest.raises(ModelError, match=r"^h uses index "):
-        from_jax(lambda x: x, lambda x, u: function(x, u), n=2, p=2, m=1)
 
 
 @pytest.mark.parametrize("name", IN_RANGE)
@@ -407,22 +221,13 @@ def test_indices_in_range_or_with_a_meaning_are_taken(name):
 
 
 def test_indices_are_checked_within_the_set_of_states():
-    inside = qpmhe.Box([0.0, 0.0], [0.9, 0.9])
-
     def lookup(x):
         return x * jnp.asarray(TABLE)[place(x)]
 
+    inside = qpmhe.Box([0.0, 0.0], [0.9, 0.9])
     assert from_jax(lookup, lambda x: x[0], n=2, p=1, states=inside).n == 2
     with pytest.raises(ModelError, match="f uses index"):
         from_jax(lookup, lambda x: x[0], n=2, p=1)
-
-
-def test_functions_without_such_indices_are_not_compiled_for_the_check(monkeypatch):
-    from jax.experimental import checkify
-
-    monkeypatch.setattr(checkify, "checkify", None)
-    system = from_jax(lambda x: 0.5 * x[::-1], lambda x: x[1:], n=2, p=1)
-    assert system.n == 2
 
 
 # As CasADi expressions, for the compiled step and the certificates
@@ -442,7 +247,6 @@ def shuffled(x):
 
 
 EXPRESSIONS = {
-    "affine": lambda x: x + 0.1 * V @ (W @ x),
     "network": lambda x: V @ jnp.tanh(W @ x) + jax.nn.sigmoid(x) + jax.nn.softplus(x),
     "list": lambda x: [x[1], -jnp.sin(x[0])],
     "where": lambda x: jnp.where(x > 0.0, x, jnp.exp(x) - 1.0),
@@ -457,20 +261,6 @@ EXPRESSIONS = {
     "cond": lambda x: jax.lax.cond(x[0] > 0.0, lambda a: a, lambda a: 2.0 * a, x),
     "jit": jax.jit(lambda x: jnp.sqrt(1.0 + x * x)),
 }
-
-
-@pytest.mark.parametrize("name", EXPRESSIONS)
-def test_a_jax_model_is_the_expression(name):
-    system = qpmhe.from_jax(EXPRESSIONS[name], lambda x: x[0] * x[1], n=2, p=1)
-    assert system.derivatives == {"f": "jax", "h": "jax"}
-    model = system.symbolic
-    assert model is not None, system.no_symbolic
-    for x in 3.0 * generator.normal(size=(20, 2)):
-        np.testing.assert_allclose(
-            np.array(model.f(x, []))[:, 0], system.f(x, np.zeros(0)), rtol=1e-12, atol=1e-14
-        )
-
-
 WITHOUT = {
     "while": (lambda x: jax.lax.while_loop(lambda c: c[0] > 1.0, lambda c: 0.5 * c, x), "while"),
     "a look-up": (lambda x: jnp.asarray(TURNS)[jnp.int32(jnp.abs(x[0])) % 3] * x, "int32"),
@@ -481,12 +271,21 @@ WITHOUT = {
 }
 
 
+@pytest.mark.parametrize("name", EXPRESSIONS)
+def test_a_jax_model_is_the_expression(name):
+    system = from_jax(EXPRESSIONS[name], lambda x: x[0] * x[1], n=2, p=1)
+    model = system.symbolic
+    assert model is not None, system.no_symbolic
+    for x in 3.0 * generator.normal(size=(20, 2)):
+        np.testing.assert_allclose(
+            np.array(model.f(x, []))[:, 0], system.f(x, NONE), rtol=1e-12, atol=1e-14
+        )
+
+
 @pytest.mark.parametrize("name", WITHOUT)
 def test_a_jax_model_without_an_expression_says_why(name):
     function, word = WITHOUT[name]
-    system = qpmhe.from_jax(function, lambda x: x, n=2, p=2)
+    system = from_jax(function, lambda x: x, n=2, p=2)
     assert system.symbolic is None
     assert word in system.no_symbolic
     assert word in system.explain()
-
-

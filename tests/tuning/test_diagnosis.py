@@ -102,14 +102,11 @@ def simple(system, y, noise=0.01, settings=None, **options):
     ).run(y)
 
 
-def test_rounded_sensor_that_rests_is_neither_dead_nor_saturated():
+def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_noted():
     system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
     y = 0.5 * np.round(3.0 * 0.8 ** np.arange(100) / 0.5)
     run = simple(system, y, 0.5**2 / 12 + 0.01, {"initial_state": [3.0]})
     assert not {"dead", "saturated"} & set(kinds(qpmhe.diagnose(run)))
-
-
-def test_what_a_gate_rejected_is_noted():
     generator = np.random.default_rng(8)
     y = generator.standard_normal((300, 2)) * 0.1
     y[generator.random(300) < 0.1, 1] += 5.0
