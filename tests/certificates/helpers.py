@@ -4,6 +4,8 @@ import numpy as np
 
 import qpmhe
 from qpmhe.certificates import certify, certify_detectability, certify_observer, synthesise_gain
+from qpmhe.certificates.enclosures import SmoothModel
+from qpmhe.certificates.regions import bounded_region
 
 REACTOR = qpmhe.Box([0.1, 0.0], [9.0, 9.0])
 PENDULUM = qpmhe.Box([-3.0, -10.0], [3.0, 10.0])
@@ -32,6 +34,12 @@ def unit_cost(n=1, p=1):
     return qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=np.eye(p))
 
 
+def smooth(system, states):
+    """The model with its enclosures on a region, and the region."""
+    region = bounded_region(system, states)
+    return SmoothModel(system, region), region
+
+
 # What may be asked of a scalar system on a region.
 GAIN = qpmhe.Luenberger([[0.1]])
 QUESTIONS = {
@@ -42,16 +50,3 @@ QUESTIONS = {
         system, GAIN, unit_cost(), horizon=2, region=region, **how
     ),
 }
-
-
-def two_tanks():
-    """Two tanks in a row with Torricelli's outflow; the second level is measured."""
-
-    def rate(x):
-        flow = np.sqrt(x) * 0.3
-        out = np.empty(x.shape, x.dtype)
-        out[..., 0] = 0.35 - flow[..., 0]
-        out[..., 1] = flow[..., 0] - flow[..., 1]
-        return out / 0.5
-
-    return qpmhe.System.from_ode(rate, lambda x: x[..., 1:], dt=0.1, n=2, p=1)

@@ -23,18 +23,15 @@ def _interpolated(s):
 
 # As the expressions have it, in double precision.
 _LOG10 = 0.43429448190325176
+_SAME = "sin", "cos", "tan", "exp", "expm1", "log", "log1p", "sqrt", "sinh", "cosh", "tanh"
+_INVERSE = "sin", "cos", "tan", "sinh", "cosh", "tanh"
 
 # A function of NumPy, and the same of numbers with 40 digits.
-ONE = {
-    "sin": (np.sin, mpmath.sin), "cos": (np.cos, mpmath.cos), "tan": (np.tan, mpmath.tan),
-    "exp": (np.exp, mpmath.exp), "expm1": (np.expm1, mpmath.expm1), "log": (np.log, mpmath.log),
-    "log1p": (np.log1p, mpmath.log1p), "log2": (np.log2, lambda s: mpmath.log(s) / math.log(2.0)),
-    "log10": (np.log10, lambda s: mpmath.log(s) * _LOG10), "sqrt": (np.sqrt, mpmath.sqrt),
-    "arcsin": (np.arcsin, mpmath.asin), "arccos": (np.arccos, mpmath.acos),
-    "arctan": (np.arctan, mpmath.atan), "sinh": (np.sinh, mpmath.sinh),
-    "cosh": (np.cosh, mpmath.cosh), "tanh": (np.tanh, mpmath.tanh),
-    "arcsinh": (np.arcsinh, mpmath.asinh), "arccosh": (np.arccosh, mpmath.acosh),
-    "arctanh": (np.arctanh, mpmath.atanh),
+ONE = {name: (getattr(np, name), getattr(mpmath, name)) for name in _SAME}
+ONE |= {f"arc{name}": (getattr(np, f"arc{name}"), getattr(mpmath, f"a{name}")) for name in _INVERSE}
+ONE |= {
+    "log2": (np.log2, lambda s: mpmath.log(s) / math.log(2.0)),
+    "log10": (np.log10, lambda s: mpmath.log(s) * _LOG10),
     "cbrt": (np.cbrt, lambda s: mpmath.sign(s) * mpmath.cbrt(abs(s))),
     "deg2rad": (lambda s: np.deg2rad(40.0 * s), lambda s: s * 40 * (math.pi / 180)),
     "rad2deg": (lambda s: 0.01 * np.rad2deg(s), lambda s: 0.01 * (s * (180 / math.pi))),

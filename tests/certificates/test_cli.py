@@ -1,15 +1,25 @@
-"""``qpmhe certify``: tables, JSON, and what it says where nothing is certified."""
+"""``qpmhe certify``: tables, JSON, what it says where nothing is certified, and the zoo."""
 
 import io
 import json
-import math
 import re
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+import qpmhe
+from qpmhe.certificates import (
+    CertificateError,
+    Evidence,
+    NotCertifiedError,
+    certify_detectability,
+    certify_observer,
+)
 from qpmhe.cli.certify import certify
 from qpmhe.errors import ModelError, OptionError, QpmheError, SetError
+
+from .helpers import box
 
 MODEL = '''
 import numpy as np
@@ -51,33 +61,35 @@ SQUARE = "-2:2,-2:2"
 
 @pytest.fixture
 def shown(tmp_path):
-    """Calls the command on the model above, and gives what it returned and printed."""
+    """Calls the command on the model above; what it returned, printed and reported."""
     (tmp_path / "two.py").write_text(MODEL)
+    report = tmp_path / "out" / "two.json"
 
     def call(arguments="", width=200, of="model", **options):
         console = Console(file=io.StringIO(), width=width, color_system=None)
+        options = {"report": report} | options
         done = certify(console, f"{tmp_path}/two.py:{of}{arguments}", **options)
-        return done, console.file.getvalue()
+        return done, console.file.getvalue(), json.loads(report.read_text())
 
     return call
 
 
 def test_the_first_line_is_the_observers_bound_in_the_states_units(shown):
-    done, text = shown(box=SQUARE)
-    assert done
+    done, text, _ = shown(box=SQUARE)
     first, *rest = text.splitlines()
+    assert done
     assert re.fullmatch(
         r"\|x1 - z1\| <= [\d.]+, \|x2 - z2\| <= [\d.]+ after \d+ samples "
         r"\(proved( while x stays in the region)?\), on a region 4 x 4 wide", first,
     )
-    assert len(rest) < 10
+    assert len(rest) < 11
     for words in (
         "Two [bold] states", "x1 in [-2, 2]", "z is checked at each sample", "--details",
         "|w1| <= 0.03, |w2| <= 0.03, |v| <= 0.3 (three standard deviations of the model's",
         "the bound holds at all 20 samples", "by the paper's constants",
     ):
         assert words in text, words
-    done, text = shown("(discount=0.9)")  # the box is made around the record
+    done, text, _ = shown("(discount=0.9)")  # the box is made around the record
     low, high = map(float, re.search(r"x1 in \[([-\d.]+), ([-\d.]+)\]", text).groups())
     assert done
     assert low < 0.0 < 1.0 < high
@@ -85,15 +97,11 @@ def test_the_first_line_is_the_observers_bound_in_the_states_units(shown):
     assert "Not certified: the theorem: the cost has no constants: the discount" in text
 
 
-def test_the_report_holds_what_the_terminal_shows(shown, tmp_path):
-    report = tmp_path / "out" / "two.json"
-    done, text = shown(
-        width=80, horizon="1,10,100", report=report, box=SQUARE, details=True, seconds=math.inf
-    )
+def test_the_report_holds_what_the_terminal_shows(shown):
+    done, text, content = shown(width=80, horizon="1,10,100", box=SQUARE, details=True)
     assert done
     assert "…" not in text
-    assert max(map(len, text.splitlines())) <= max(80, 7 + len(str(report)))
-    content = json.loads(report.read_text())
+    assert max(map(len, text.splitlines()[:-1])) <= 80
     assert (content["certified"], content["failures"]) == (True, [])
     assert content["region"]["lower"] == [-2.0, -2.0]
     assert content["simulated"].endswith("the bound holds at all 20 samples")
@@ -104,40 +112,30 @@ def test_the_report_holds_what_the_terminal_shows(shown, tmp_path):
         assert words in text, words
 
 
-def test_an_unstable_observer_is_named_and_another_one_is_made(shown, tmp_path):
-    report = tmp_path / "other.json"
-    done, text = shown("(gain=-2.0)", box=SQUARE, report=report)
+def test_an_unstable_observer_is_replaced_and_an_undetectable_mode_is_named(shown):
+    _, stated, _ = shown("(gain=-2.0,meant=2.0)")  # the model states its region
+    done, text, content = shown("(gain=-2.0)", box=SQUARE)
     assert done
-    _, stated = shown("(gain=-2.0,meant=2.0)")  # the model states its region
     assert stated.splitlines()[0] == text.splitlines()[0]
     assert text.startswith("With a gain made for the region: |x1 - z1| <= ")
     words = " ".join(text.split())
     assert "in place of the model's own: the observer's error does not contract" in words
-    content = json.loads(report.read_text())
     assert content["certified"] is True
     assert content["replaced"].startswith("Luenberger([[")
     assert content["observer"]["gain"] != [[-2.0], [0.1]]
-
-
-def test_an_undetectable_mode_is_named(shown, tmp_path):
-    report = tmp_path / "failed.json"
-    done, text = shown("(growth=1.1)", report=report, box=SQUARE, details=True)
+    done, text, content = shown("(growth=1.1)", box=SQUARE, details=True)
     assert not done
     assert text.startswith("No bound on the observer's error is proved.")
     for words in ("Not certified", "eigenvalue 1.1", "What may help", "another gain"):
         assert words in text, words
-    assert "candidate, at each step and with any solver" in " ".join(text.split())
-    content = json.loads(report.read_text())
     assert (content["certified"], len(content["failures"])) == (False, 2)
     assert (content["detectability"], content["observer"]) == (None, None)
 
 
-def test_an_estimator_and_parts_are_certified_as_well(shown, tmp_path):
-    report = tmp_path / "made.json"
-    done, text = shown(of="estimator", report=report)
+def test_an_estimator_and_parts_are_certified_as_well(shown):
+    done, text, content = shown(of="estimator")
     assert done
     assert "three standard deviations of the cost's inverse weights" in text
-    content = json.loads(report.read_text())
     assert [each["horizon"] for each in content["paper"]] == [7]
     assert content["simulated"] == ""
     assert shown(of="parts", box=SQUARE, horizon="3")[0]
@@ -150,7 +148,6 @@ def test_bad_options_files_and_models_are_named(shown, tmp_path):
         ("", {"box": "-1:1,a:b"}, OptionError, "--box"),
         ("", {"box": "-1:1,2:1"}, SetError, "empty"),
         ("", {"box": "-1:1,-inf:1"}, SetError, "unbounded"),
-        ("", {"horizon": "0"}, OptionError, "--horizon"),
         ("", {"horizon": "two"}, OptionError, "--horizon"),
         ("", {"input_box": "0:1"}, OptionError, "--input-box"),
         ("", {"report": tmp_path / "x.txt"}, OptionError, r"--report is .*x.*\.json"),
@@ -163,3 +160,49 @@ def test_bad_options_files_and_models_are_named(shown, tmp_path):
         with pytest.raises(error, match=words):
             shown(arguments, **options)
     assert list(tmp_path.glob("x*")) == []
+
+
+# Models of the zoo with a stated region, and whether their own observer has a bound within it.
+OWN = {
+    "batch_reactor": True, "pendulum": True, "van_der_pol": False, "cstr": False,
+    "battery_cell": False, "vehicle": False,
+}
+
+
+@pytest.mark.parametrize("name", sorted(qpmhe.models.catalogue()))
+def test_a_model_with_a_stated_region_has_a_bound_that_is_smaller(name, tmp_path):
+    scenario = qpmhe.models.catalogue()[name]().scenario
+    assert (scenario.region is not None) == (name in OWN)
+    if name not in OWN:
+        return
+    report = tmp_path / "it.json"
+    assert certify(Console(file=io.StringIO()), name, report=report, seconds=300.0)
+    content, n = json.loads(report.read_text()), scenario.initial_state.size
+    assert (content["replaced"] == "") is OWN[name]
+    assert content["observer_bound"]["evidence"] == "proved"
+    width = np.subtract(content["region"]["upper"], content["region"]["lower"])[:n]
+    assert (content["observer_bound"]["components"] < width).all()
+
+
+def test_angles_are_certified_where_they_do_not_wrap():
+    system, inputs = qpmhe.models.vehicle()[0], box([0.0, -1.5], [2.0, 1.5])
+    observer = qpmhe.Luenberger([
+        [-0.4, -0.4, -0.5, 0.5], [0.75, -0.8, -0.1, -0.1], [-0.05, 0.05, -0.35, -0.4],
+    ])
+    place = box([-1.0, -1.0, -0.2], [1.0, 1.0, 0.2])
+
+    def found(noise):
+        sizes = [0.06] * 3, [0.6, 0.6, noise, 0.15]
+        return certify_observer(system, observer, place, inputs=inputs, sizes=sizes)
+
+    assert found(0.15).evidence is Evidence.PROVED
+    # Half a turn, less twice 0.2 of the heading and what the bearing moves by.
+    note = next(each for each in found(0.15).notes if "y[2]" in each)
+    room = float(note.split("less than ")[1].split(":")[0])
+    x = np.random.default_rng(4).uniform(place.lower, place.upper, (2000, 3))
+    bearings = system.h.batch(x, np.zeros((2000, 2)))[:, 2]
+    assert np.pi - 0.3 < np.ptp(bearings) + room <= np.pi
+    with pytest.raises(NotCertifiedError, match=r"angle y\[2\] may wrap"):
+        found(3.0)
+    with pytest.raises(CertificateError, match="the system has angles"):
+        certify_detectability(system, place, inputs=inputs)

@@ -34,44 +34,42 @@ def exactly_definite(matrix, shift=0.0):
     return True
 
 
-@pytest.mark.parametrize("n", [1, 2, 4, 7])
-def test_never_more_than_exact_arithmetic_and_hardly_less(n):
-    generator = np.random.default_rng(n)
-    proved = 0
-    for _ in range(60):
-        basis = generator.standard_normal((n, n))
-        matrix = basis @ np.diag(10.0 ** generator.uniform(-8, 0, n)) @ basis.T
-        matrix = 0.5 * (matrix + matrix.T)
+def random_matrix(generator, n, decades):
+    basis = generator.standard_normal((n, n))
+    matrix = basis @ np.diag(10.0 ** generator.uniform(-decades, 0, n)) @ basis.T
+    return 0.5 * (matrix + matrix.T)
+
+
+def test_never_more_than_exact_arithmetic_and_hardly_less():
+    generator, proved = np.random.default_rng(1), 0
+    for n in np.repeat([1, 2, 4, 7], 50):
+        matrix = random_matrix(generator, n, 8)
         # About the boundary of the cone: some just inside, some just outside.
         matrix -= generator.choice([0.0, 0.5, 0.999999, 1.000001, 2.0]) * float(
             np.linalg.eigvalsh(matrix)[0]
         ) * np.eye(n)
         shown = bool(definite(Matrices.exact(matrix[None]))[0])
-        truth = exactly_definite(matrix)
-        assert truth or not shown
+        assert exactly_definite(matrix) or not shown
         proved += shown
-    assert proved > 10
-
-
-def test_radii_are_covered_and_what_is_singular_is_refused():
-    generator = np.random.default_rng(8)
-    shown = 0
-    for _ in range(200):
-        n = int(generator.integers(1, 8))
-        basis = generator.standard_normal((n, n)) * 10.0 ** generator.uniform(-3, 3, (n, 1))
-        matrix = basis @ basis.T
-        matrix = 0.5 * (matrix + matrix.T)
-        sizes = np.sqrt(np.diag(matrix))
-        radius = 10.0 ** generator.uniform(-6, 0) * np.outer(sizes, sizes)
-        if not definite(Matrices(matrix[None], radius[None]))[0]:
-            continue
-        shown += 1
-        noise = generator.choice([-1.0, 1.0], (n, n)) * radius
-        assert exactly_definite(matrix + 0.5 * (noise + noise.T))
-    assert shown > 50
+    assert proved > 80
     ones, nan = np.ones((3, 3)), np.full((3, 3), np.nan)
     stack = np.stack((ones, nan, -np.eye(3), np.eye(3), 1e-30 * np.eye(3)))
     assert definite(Matrices.exact(stack)).tolist() == [False, False, False, True, True]
+
+
+def test_radii_are_covered():
+    generator, shown = np.random.default_rng(8), 0
+    for _ in range(150):
+        n = int(generator.integers(1, 8))
+        matrix, sizes = random_matrix(generator, n, 3), 10.0 ** generator.uniform(-3, 3, n)
+        matrix = np.outer(sizes, sizes) * matrix
+        sizes = np.sqrt(np.diag(matrix))
+        radius = 10.0 ** generator.uniform(-6, -1) * np.outer(sizes, sizes)
+        if definite(Matrices(matrix[None], radius[None]))[0]:
+            shown += 1
+            noise = generator.choice([-1.0, 1.0], (n, n)) * radius
+            assert exactly_definite(matrix + 0.5 * (noise + noise.T))
+    assert shown > 30
 
 
 def test_products_hold_exact_products():
@@ -83,7 +81,7 @@ def test_products_hold_exact_products():
     assert product.radius.max() < 1e-13
 
 
-def test_eigenvalue_and_norm_bounds_are_outward_and_tight():
+def test_eigenvalue_and_norm_bounds_and_constants_are_outward_and_tight():
     generator = np.random.default_rng(7)
     for n in (1, 3, 6):
         basis = generator.standard_normal((n, n))
@@ -98,12 +96,18 @@ def test_eigenvalue_and_norm_bounds_are_outward_and_tight():
         assert np.linalg.norm(basis, 2) <= bound <= np.linalg.norm(basis, 2) * (1 + 1e-8)
     with pytest.raises(CertificateError, match="eigenvalues"):
         eigenvalue_bounds(np.diag([1.0, -1.0]))
+    found = np.array(euclidean_constants(np.diag([1.0, 4.0]), np.array([[9.0]]), 0.5))
+    np.testing.assert_allclose(found, [2.0, 4.0, 6.0], rtol=1e-8)
+    assert (found >= [2.0, 4.0, 6.0]).all()
+    # An output weight below zero by rounding is no weight.
+    c_p, c_w, c_v = euclidean_constants(np.eye(1), np.array([[-1e-9]]), 0.5)
+    assert (c_p, c_w) == pytest.approx((1.0, 2.0))
+    assert 0.0 < c_v < 1e-3
 
 
 @pytest.mark.parametrize("observes", [False, True])
 def test_the_sum_of_squares_follows_from_both_inequalities(observes):
-    generator = np.random.default_rng(9)
-    shown = 0
+    generator, shown = np.random.default_rng(9), 0
     for _ in range(200):
         A, C, G, L = (
             0.4 * generator.standard_normal(size) for size in ((2, 2), (1, 2), (2, 2), (2, 1))
@@ -124,13 +128,3 @@ def test_the_sum_of_squares_follows_from_both_inequalities(observes):
         assert (norms(ahead, P) ** 2 <= supplied).all()
         assert (form.excess(e, e @ A.T, e @ C.T) <= 0.0).all()
     assert shown > 20
-
-
-def test_constants_of_a_contraction():
-    c_p, c_w, c_v = euclidean_constants(np.diag([1.0, 4.0]), np.array([[9.0]]), 0.5)
-    np.testing.assert_allclose([c_p, c_w, c_v], [2.0, 4.0, 6.0], rtol=1e-8)
-    assert (np.array([c_p, c_w, c_v]) >= [2.0, 4.0, 6.0]).all()
-    # An output weight below zero by rounding is no weight.
-    c_p, c_w, c_v = euclidean_constants(np.eye(1), np.array([[-1e-9]]), 0.5)
-    assert (c_p, c_w) == pytest.approx((1.0, 2.0))
-    assert 0.0 < c_v < 1e-3

@@ -1,90 +1,88 @@
 """The observer's bound against adversaries, and against plain computations of the same."""
 
 import itertools
-from functools import cache
 
 import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import ObserverBound, Sizes, certify, certify_observer, observer_bound
+from qpmhe.certificates import (
+    Evidence,
+    NotCertifiedError,
+    ObserverBound,
+    OutOfTimeError,
+    Sizes,
+    certify,
+    observer_bound,
+)
 from qpmhe.certificates import certificate as certification
-from qpmhe.certificates.evidence import Evidence, NotCertifiedError, OutOfTimeError
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.sizes import lengths_of
 from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError
 
-from . import helpers
 from .attacks import RELATIVE
-from .helpers import box, unit_cost
-
-STEPS = 60
+from .helpers import box, linear, scalar, unit_box, unit_cost
 
 
 def bound_of(system, gain, region, disturbances, noises):
     """The certified bound of a Luenberger observer."""
-    place = bounded_region(system, region)
-    stability = certify_observer(system, qpmhe.Luenberger(gain), place)
-    return ObserverBound(stability, place, Sizes(disturbances, noises))
+    return certify(
+        system, qpmhe.Luenberger(gain), unit_cost(system.n, system.p), horizon=1, region=region,
+        sizes=Sizes(disturbances, noises),
+    ).observer_bound
 
 
-@cache
 def reactor():
     system, observer, _, _ = qpmhe.models.batch_reactor()
-    return bound_of(
-        system, observer.gain, qpmhe.Box([2.0, 0.0], [6.0, 4.0]),
-        qpmhe.Box([-0.1, -0.1], [0.1, 0.1]), qpmhe.Box([-0.2], [0.2]),
-    ), system
+    sizes = box([-0.1, -0.1], [0.1, 0.1]), box(-0.2, 0.2)
+    return bound_of(system, observer.gain, box([2.0, 0.0], [6.0, 4.0]), *sizes), system
 
 
-@cache
-def coupled():
+@pytest.fixture(scope="module")
+def four():
     """Four states in a row, with a sine at its first; the outer ones are measured."""
     A = 0.6 * np.eye(4) + 0.1 * np.eye(4, k=1) + 0.1 * np.eye(4, k=-1)
     system = qpmhe.System(
         lambda x: x @ A.T + 0.1 * np.sin(x[..., :1]) * np.eye(4)[0], lambda x: x[..., [0, 3]],
         n=4, p=2,
     )
-    K = np.zeros((4, 2))
+    K, half = np.zeros((4, 2)), np.full(4, 0.005)
     K[0, 0] = K[3, 1] = 0.3
-    half = np.full(4, 0.005)
-    return bound_of(
-        system, K, qpmhe.Box(-0.5 * np.ones(4), 0.5 * np.ones(4)), qpmhe.Box(-half, half), 0.01
-    ), system
+    region = box(-0.5 * np.ones(4), 0.5 * np.ones(4))
+    return bound_of(system, K, region, box(-half, half), 0.01), system
 
 
-def candidates(size, dimension, rng):
-    """Extreme values: the corners of a box, or the ends of many directions."""
+def extremes(size, dimension, rng):
+    """The corners of a box, or the ends of many directions."""
     if isinstance(size, qpmhe.Box):
         return np.array(list(itertools.product(*zip(size.lower, size.upper, strict=True))))
     directions = rng.standard_normal((12, dimension))
     return size * directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("made", [reactor, coupled])
-def test_no_adversary_exceeds_the_bound(made, pytestconfig):
+@pytest.mark.parametrize("made", ["reactor", "four"])
+def test_no_adversary_exceeds_the_bound(made, four, pytestconfig):
     """Each takes the w and v, of all extreme ones, that take the error farthest in P."""
-    (bound, system), runs = made(), 4000 if pytestconfig.option.all else 300
+    bound, system = four if made == "four" else reactor()
     assert bound.evidence is Evidence.PROVED
-    rng, P, K = np.random.default_rng(0), bound.metric, bound.gain
-    n, p = K.shape
+    runs, rng = 4000 if pytestconfig.option.all else 300, np.random.default_rng(0)
+    P, K, (n, p) = bound.metric, bound.gain, bound.gain.shape
     low, high = bound.region.lower[:n], bound.region.upper[:n]
     x, z = (rng.choice([0.0, 0.1, 0.5, 0.9, 1.0], (runs, n)) * (high - low) + low for _ in "xz")
     x[::7] = z[::7]  # some begin without an error: the noise alone
     pairs = list(itertools.product(
-        candidates(bound.sizes.disturbance, n, rng), candidates(bound.sizes.noise, p, rng)
+        extremes(bound.sizes.disturbance, n, rng), extremes(bound.sizes.noise, p, rng)
     ))
     u, alive = np.zeros((runs, 0)), np.ones(runs, bool)
     b = np.array([bound.initial(e) for e in x - z])
     quiet, entering, sums = b == 0.0, bound.entering(), bound.stability.sums
     paper, share = sums.initial * np.linalg.norm(x - z, axis=1), 0.0  # (eq:RGES)
-    for _ in range(STEPS):
+    for _ in range(60):
         f, h, ahead = system.f.batch(x, u), system.h.batch(x, u), system.f.batch(z, u)
         best, chosen, added = np.full(runs, -1.0), np.array([f, ahead]), np.zeros(runs)
         for w, v in pairs:
             after, following = f + w, ahead + (h + v - system.h.batch(z, u)) @ K.T
-            e = after - following
-            size = np.einsum("ti,ij,tj->t", e, P, e)
+            size = np.einsum("ti,ij,tj->t", after - following, P, after - following)
             size[~bound.region.contains(after)] = -1.0
             better = size > best
             chosen[:, better] = after[better], following[better]
@@ -111,18 +109,9 @@ def test_no_adversary_exceeds_the_bound(made, pytestconfig):
     assert bound.limit() / np.sqrt(best[alive & quiet]).max() < 4.0
 
 
-# Sizes
-
-
-def scalar(disturbance=0.1, noise=0.2, side=9.0):
-    system = helpers.scalar(lambda x: 0.8 * x)
-    return bound_of(system, [[0.3]], box(-side, side), disturbance, noise)
-
-
 def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
-    bound = scalar()
-    scale = float(np.sqrt(bound.metric[0, 0]))
-    assert bound.entering()[0] == pytest.approx(scale * (0.1 + 0.3 * 0.2))
+    bound = bound_of(linear(0.8, 1.0), [[0.3]], box(-9.0, 9.0), 0.1, 0.2)
+    assert bound.entering()[0] == pytest.approx(np.sqrt(bound.metric[0, 0]) * (0.1 + 0.3 * 0.2))
     # The worst that w and v can do is 0.16 / (1 - 0.5).
     assert 0.32 <= bound.components(bound.limit())[0] <= 1.1 * 0.32
     reached = bound.components(bound.radii(1, 2.0)[1])[0]
@@ -134,17 +123,10 @@ def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
     true = 2.0 * 0.5 ** np.arange(41) + 0.32 * (1.0 - 0.5 ** np.arange(41))
     assert (true <= found).all()
     assert found[-1] <= 1.5 * true[-1]
-    always = bound.components(bound.radii(400, 2.0))[:, 0]
-    np.testing.assert_allclose(found, always[:41])
-    assert bound.components(bound.limit())[0] == pytest.approx(always[-1])
+    np.testing.assert_allclose(found, bound.components(bound.radii(40, 2.0))[:, 0])
     samples = bound.settling_samples
     whole = bound.radii(samples, box(-18.0, 18.0))
     assert whole[samples] <= 1.1 * bound.limit() < whole[samples - 1]
-
-
-@pytest.fixture(scope="module")
-def four():
-    return coupled()[0]
 
 
 def plain(vectors, weight):
@@ -152,57 +134,47 @@ def plain(vectors, weight):
 
 
 def test_sizes_may_be_lengths_sets_or_vectors(four):
-    rng, P, Q, R = np.random.default_rng(1), four.metric, four.stability.Q, four.stability.R
+    (four, _), rng = four, np.random.default_rng(1)
+    P, Q, R, V = four.metric, four.stability.Q, four.stability.R, four.gain.T
+    V = V @ P @ four.gain
     w, v = 0.02 * rng.standard_normal((50, 4)), 0.05 * rng.standard_normal((50, 2))
     vectors = four.entering(w, v)
-    V = four.gain.T @ P @ four.gain
     np.testing.assert_allclose(vectors[:, 0], plain(w, P) + plain(v, V), rtol=1e-9)
     np.testing.assert_allclose(vectors[:, 1], np.hypot(plain(w, Q), plain(v, R)), rtol=1e-9)
-    sides = np.abs(w).max(axis=0), np.abs(v).max(axis=0)
-    boxes = [qpmhe.Box(-side, side) for side in sides]
-    corners = [
-        max(plain(np.array(signs) * side, weight)
-            for signs in itertools.product((-1, 1), repeat=side.size))
-        for side, weight in zip(sides, (P, V), strict=True)
-    ]
+    boxes = [box(-side, side) for side in (np.abs(w).max(axis=0), np.abs(v).max(axis=0))]
+    corners = (plain(extremes(*each, rng), M).max() for each, M in zip(
+        ((boxes[0], 4), (boxes[1], 2)), (P, V), strict=True
+    ))
     assert four.entering(*boxes)[0] == pytest.approx(sum(corners), rel=1e-9)
     most = max(np.linalg.norm(w, axis=1)), max(np.linalg.norm(v, axis=1))
     for larger in (four.entering(*boxes), four.entering(*most), four.entering(boxes[0], v)):
         assert (vectors <= larger).all()
     # A box with too many corners is bounded by its sides.
     side, weight = np.linspace(0.1, 0.2, 14), np.full((14, 14), -0.05) + np.eye(14)
-    found = float(lengths_of("w", qpmhe.Box(-side, side), weight))
+    found = float(lengths_of("w", box(-side, side), weight))
     assert found == pytest.approx(plain(side, np.abs(weight)), rel=1e-9)
-
-
-def test_the_systems_own_sets_come_first_and_are_named():
-    sets = {"disturbances": box(-0.1, 0.2), "noises": box(-np.inf, np.inf)}
-    system = helpers.scalar(**sets)
+    # The system's own sets come first.
+    system = scalar(disturbances=box(-0.1, 0.2), noises=box(-np.inf, np.inf))
     found = Sizes.usual(system, np.eye(1), 4.0 * np.eye(1), "the data")
-    assert found.disturbance is sets["disturbances"]
     assert str(found) == (
         "w in [-0.1, 0.2], |v| <= 6 (the system's W and three standard deviations of the data)"
     )
     assert found.largest == pytest.approx((0.2, 6.0))
-    assert Sizes(0.0, 0.0).typical(system) == (1.0, 1.0)
-    for wrong in (-1.0, np.nan, "1", True):
-        with pytest.raises(OptionError, match="noise is"):
-            Sizes(noise=wrong)
 
 
 def test_sizes_that_do_not_fit_are_named(four):
-    ones = np.ones((3, 4))
+    four, ones = four[0], np.ones((3, 4))
     for asked, error, words in (
+        (lambda: Sizes(noise=-1.0), OptionError, "noise is"),
         (lambda: four.entering(-1.0), OptionError, "disturbances is -1"),
         (lambda: four.entering(np.ones((3, 2))), ShapeError, r"vectors \(T, 4\)"),
         (lambda: four.entering(ones, np.ones((4, 2))), ShapeError, "3 samples, and .* 4"),
         (lambda: four.entering(box(-1.0, 1.0)), ShapeError, "dimension 1"),
-        (lambda: four.entering(0.1, qpmhe.Box([-1.0, -np.inf], [1.0, 1.0])), SetError, "unbounded"),
+        (lambda: four.entering(0.1, box([-1.0, -np.inf], [1.0, 1.0])), SetError, "unbounded"),
         (lambda: four.radii(4, 1.0, ones), ShapeError, "3 samples; expected 4"),
         (lambda: four.limit(ones), OptionError, "sample by sample"),
         (lambda: four.initial([1.0, 2.0]), ShapeError, "initial_error has shape"),
         (lambda: four.initial(ones), ShapeError, "several samples"),
-        (lambda: four.initial(-1.0), OptionError, "initial_error"),
         (lambda: four.initial(np.nan), InvalidInputError, "initial_error"),
     ):
         with pytest.raises(error, match=words):
@@ -220,18 +192,17 @@ def random_bound(rng, n, unit=1.0):
         rho, V, gain, evidence = 0.9, np.eye(1), np.ones((n, 1)), Evidence.PROVED
         P = (root @ root.T + 0.05 * np.eye(n)) / unit**2
 
-    system = qpmhe.System(lambda x: x, lambda x: x[..., :1], n=n, p=1)
-    whole = bounded_region(system, qpmhe.Box(-1e9 * np.ones(n), 1e9 * np.ones(n)))
+    whole = bounded_region(linear(np.eye(n), np.eye(n)), box(-1e9 * np.ones(n), 1e9 * np.ones(n)))
     return ObserverBound(Stability(), whole, Sizes(1.0, 1.0))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.parametrize("n", [1, 2, 6])
 def test_no_point_of_the_set_is_farther(n):
     rng = np.random.default_rng(n)
-    for _ in range(40):
+    for _ in range(20):
         bound, b = random_bound(rng, n), 10.0 ** rng.uniform(-3.0, 3.0)
-        offset, e = 10.0 ** rng.uniform(-3.0, 3.0) * rng.standard_normal(n), np.eye(n)
-        e = np.vstack((e, rng.standard_normal((60, n))))
+        offset = 10.0 ** rng.uniform(-3.0, 3.0) * rng.standard_normal(n)
+        e = np.vstack((np.eye(n), rng.standard_normal((60, n))))
         for _ in range(50):  # to the next point that maximises the linearised distance
             direction = np.linalg.solve(bound.metric, (e - offset).T).T
             e = b * direction / plain(direction, bound.metric)[:, None]
@@ -240,7 +211,6 @@ def test_no_point_of_the_set_is_farther(n):
         assert true <= found <= (np.linalg.norm(offset) + reach) * (1.0 + 1e-5)
         assert float(bound.farthest(b, np.zeros(n))) == pytest.approx(reach, rel=1e-5)
         assert float(bound.farthest(0.0, offset)) == pytest.approx(np.linalg.norm(offset))
-    assert np.isnan(bound.farthest(np.nan, np.ones(n)))
     for unit in (1e-9, 1e9):
         one, other = (random_bound(np.random.default_rng(7), n, each) for each in (1.0, unit))
         found = float(other.farthest(0.3, unit * np.ones(n)))
@@ -248,12 +218,10 @@ def test_no_point_of_the_set_is_farther(n):
 
 
 def test_what_is_beyond_the_region_does_not_count(four):
-    z, far = np.array([0.4, -0.4, 0.0, 0.0]), 1e6
-    lower, upper = four.around(far, z)
-    np.testing.assert_array_equal((lower, upper), (-0.5 * np.ones(4), 0.5 * np.ones(4)))
+    four, z, far = four[0], np.array([0.4, -0.4, 0.0, 0.0]), 1e6
+    np.testing.assert_array_equal(four.around(far, z), (-0.5 * np.ones(4), 0.5 * np.ones(4)))
     assert float(four.farthest(far, np.zeros(4), z)) == pytest.approx(np.sqrt(2 * 0.9**2 + 0.5))
-    lower, upper = four.around(1e-3, z)
-    np.testing.assert_allclose(upper - z, 1e-3 * four.slopes, rtol=1e-9)
+    np.testing.assert_allclose(four.around(1e-3, z)[1] - z, 1e-3 * four.slopes, rtol=1e-9)
 
 
 # What the headline rests on
@@ -261,23 +229,19 @@ def test_what_is_beyond_the_region_does_not_count(four):
 
 def scalar_certificate(slope, w=0.01):
     return certify(
-        helpers.scalar(lambda x: slope * x), qpmhe.Luenberger([[max(slope - 0.5, 0.1)]]),
-        unit_cost(), horizon=3, region=helpers.unit_box(1), sizes=Sizes(box(-w, w), 0.01),
+        linear(slope, 1.0), qpmhe.Luenberger([[max(slope - 0.5, 0.1)]]),
+        unit_cost(), horizon=3, region=unit_box(1), sizes=Sizes(box(-w, w), 0.01),
     )
 
 
-def test_a_region_that_the_state_leaves_is_said_first():
+def test_the_headline_says_whether_the_region_is_kept():
     certificate = scalar_certificate(1.5)
     assert "(proved while x stays in the region)" in certificate.headline
     text = str(certificate)
     assert "not proved that x stays in the region: f and the disturbances reach x1 = " in text
     assert "1.51 through the face" in text
     assert certificate.observer_bound.inner is None
-    written = certificate.to_dict()["observer_bound"]
-    assert written["invariance"]["holds"] is False
-
-
-def test_a_region_that_is_kept_is_said_and_the_observer_with_it():
+    assert certificate.to_dict()["observer_bound"]["invariance"]["holds"] is False
     certificate = scalar_certificate(0.8)
     assert "(proved), on a region 2 wide" in certificate.headline
     bound = certificate.observer_bound
@@ -287,7 +251,6 @@ def test_a_region_that_is_kept_is_said_and_the_observer_with_it():
     assert bound.condition.startswith("x and z stay in the region (proved) from x1 in [-0.9")
     # Where the disturbance just fits, there is no room for the observer's error.
     tight = scalar_certificate(0.8, w=0.199).observer_bound
-    assert tight.invariance.holds
     assert tight.inner is None
     assert tight.condition == "x stays in the region (proved); z is checked at each sample"
 
@@ -299,15 +262,11 @@ def test_time_up_leaves_what_was_reached(monkeypatch):
     monkeypatch.setattr(certification, "certify_detectability", late)
     certificate = scalar_certificate(0.8)
     assert certificate.observer_bound.evidence is Evidence.PROVED
-    assert isinstance(certificate.errors["detectability"], OutOfTimeError)
     assert not certificate.constants
     assert "Not certified: detectability: the time for this search" in str(certificate)
     monkeypatch.setattr(observer_bound, "certify_observer", late)
     with pytest.raises(OutOfTimeError, match="more seconds"):
         scalar_certificate(0.8)
-
-
-def test_what_may_help_is_a_sentence_of_its_own():
     for ending in ("", "."):
         error = NotCertifiedError(f"f may jump there{ending}", ("a smaller region",))
         assert str(error) == "f may jump there. What may help: a smaller region."
