@@ -18,7 +18,6 @@ from qpmhe.errors import (
 )
 
 from . import spoil
-from .same import assert_same
 from .spoil import check
 
 A = np.array([[1.0, 0.1, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.8]])
@@ -56,19 +55,6 @@ def estimator(model=None, observer=None, price=None, **options):
     )
 
 
-def test_the_identity_changes_no_bit():
-    full = np.diag([0.2, 0.1, 0.3])
-    W = qpmhe.Box([-0.3, -np.inf, 0.0], [0.3, 0.5, 0.0])
-    assert system(np.eye(3)).disturbance_matrix is None
-    one, other = (
-        estimator(system(matrix, disturbances=W), kalman(full), cost(full), max_qps=2)
-        for matrix in (None, np.eye(3))
-    )
-    for y in Y:
-        assert_same(one.update(y), other.update(y))
-    np.testing.assert_array_equal(one.covariances(), other.covariances())
-
-
 def test_the_bound_of_the_candidates_cost():
     """c(N) of docs/explanation/guarantees.md, in the norm of typical squares of the states."""
     roots = np.sqrt(np.maximum(P.diagonal(), np.diag(G @ Q @ G.T)))
@@ -86,18 +72,6 @@ def test_the_bound_of_the_candidates_cost():
             v = Y[max(0, t + 1 - N) : t + 1] - h(estimate.candidate[:-1])
             corrections = v @ GAIN.T / roots
             assert estimate.candidate_cost <= c * (np.sum(corrections**2) + np.sum(v**2))
-
-
-def test_a_variance_of_zero_is_a_component_without_disturbance_as_w_of_no_width_says_it():
-    still = qpmhe.Box([-np.inf, 0.0, -np.inf], [np.inf, 0.0, np.inf])
-    gain, found = qpmhe.Luenberger(GAIN * [[1.0], [0.0], [1.0]]), []
-    for W, variance in ((None, 0.0), (still, 0.0), (still, 7.0)):
-        mhe = estimator(system(None, disturbances=W), gain, cost(np.diag([0.2, variance, 0.1])))
-        found.append((mhe.run(Y), mhe.covariances()))
-    for run, covariances in found[:-1]:
-        np.testing.assert_allclose(covariances, found[-1][1], rtol=1e-9)
-        np.testing.assert_allclose(run.states, found[-1][0].states, atol=1e-7)
-        np.testing.assert_allclose(run.costs, found[-1][0].costs, rtol=1e-8)
 
 
 @pytest.mark.parametrize("raises", [False, True])

@@ -26,22 +26,6 @@ def check(system, step, slope=None):
             np.testing.assert_allclose(found.reshape(values.shape), values, rtol=1e-12, atol=1e-14)
 
 
-def test_linear_rates_give_the_truncated_exponential():
-    rate = np.array([[-0.5, 2.0], [-1.0, -0.2]])
-    for (method, degree), dt in itertools.product(
-        ((None, 4), ("euler", 1), ("rk4", 4)), (0.01, 0.3)
-    ):
-        step, term = np.eye(2), np.eye(2)
-        for k in range(1, degree + 1):
-            term = term @ (dt * rate) / k
-            step = step + term
-        system = qpmhe.System.from_ode(
-            lambda x: x @ rate.T, lambda x: x[..., :1], dt=dt, n=2, p=1,
-            **({"method": method} if method else {}),
-        )
-        check(system, lambda x, step=step: step @ x, lambda x, step=step: step)
-
-
 def in_place(x):
     value = np.empty_like(x)
     value[..., 0], value[..., 1] = x[..., 1], -np.sin(x[..., 0])

@@ -94,25 +94,6 @@ def samples(count, seed=0, sets=False, single=True):
 
 
 @every
-def test_what_is_neutral_changes_no_bit(name):
-    mhe, twin = estimator(**OPTIONS[name]), estimator(**OPTIONS[name])
-    neutral = [
-        {"noise_weight": WEIGHTS["noise"]}, {"disturbance_weight": WEIGHTS["disturbance"]},
-        {"parameters": NOMINAL}, {"sensors": [2, 0, 1]}, {"sensors": np.ones(3, np.bool_)},
-    ] + [{"bounds": SETS}, {"bounds": {"states": SETS["states"]}}] * ("sets" in OPTIONS[name])
-    for t, own in enumerate(samples(40, 1, single=False)):
-        given, expected = neutral[t % len(neutral)], twin.update(**own)
-        y = own["y"][given.get("sensors", [0, 1, 2])]
-        assert_same(mhe.update(**own | given | {"y": y}), expected)
-        if t % 9 == 5:
-            late = np.array([0.1, np.nan, 0.2])
-            assert_same(mhe.amend(t - 1, late), twin.amend(t - 1, late))
-        elif t % 9 == 7:
-            given = {k: v for k, v in neutral[t // 9].items() if k != "sensors"}
-            assert_same(mhe.set(**given), expected)
-
-
-@every
 def test_a_late_measurement_finds_the_sample_as_it_was_taken(name):
     options = OPTIONS[name] | {"candidate": "observer"}
     for delay in (1, 3):
