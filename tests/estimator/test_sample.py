@@ -60,12 +60,10 @@ def test_an_observer_is_checked_with_the_system_and_the_initial_state():
     # A copy: a system is never changed by an estimator.
     assert [system is mhe._own_system for system, _ in observer.checked] == [True, True]
     np.testing.assert_array_equal([start for _, start in observer.checked], [START, [2.0, 3.0]])
-    before = mhe.update([1.0, 1.0], [0.0]).state
     check(InvalidInputError, ["starts below 100"], mhe.reset, [200.0, 3.0])
-    np.testing.assert_array_equal(mhe.state, before)
+    np.testing.assert_array_equal(mhe.state, [2.0, 3.0])
     wrong = qpmhe.OutputInjection(lambda z, v: np.ones(3) * v[0])
     check(InvalidInputError, ["(3,)"], wrong.check, SYSTEM, START)
-    check(InvalidInputError, ["(3, 2)"], qpmhe.Luenberger(np.ones((3, 2))).check, SYSTEM, START)
 
 
 @pytest.mark.parametrize("max_qps", [0, 1])
