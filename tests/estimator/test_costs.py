@@ -4,6 +4,7 @@ import gc
 import math
 import pickle
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -66,6 +67,18 @@ def test_few_patterns_of_missing_components_are_kept():
     assert 100 < alive <= kept / cost.stage_weight.nbytes
     assert all(one() is not None for one in matrices[-100:])  # the last ones
     assert len(pickle.dumps(cost)) < 1.5 * kept
+
+
+def test_threads_may_share_a_cost_whose_patterns_are_dropped():
+    cost, masks = QuadraticCost(**weights(1, 12)), np.random.default_rng(9).random((64, 12)) < 0.5
+    cost._kept, expected = 2, [cost._reduced(mask, cost.noise) for mask in masks]
+
+    def work(seed):
+        for k in np.random.default_rng(seed).integers(0, 64, 400):
+            np.testing.assert_array_equal(cost.partial_weight(masks[k]), expected[k])
+
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(work, range(6)))
 
 
 def test_the_bounds_of_the_observer_prior_are_its_constants():

@@ -8,11 +8,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Box, Constraint, Polytope, Status
-from qpmhe.certificates.audit import checked_ingredients
-from qpmhe.codegen.library import uncovered
 from qpmhe.errors import InvalidInputError, ModelError, SetError
-from qpmhe.estimation.settings import Settings
-from qpmhe.studies.ipopt import IpoptEstimator
 
 from .same import assert_same
 
@@ -216,19 +212,6 @@ def test_the_observer_is_not_projected_onto_a_soft_set():
     assert mhe.initial_state.tolist() == [1.5, 0.8]
     outside = Status.OBSERVER_PROJECTED | Status.CANDIDATE_OUTSIDE
     assert not any(mhe.update(y).status & outside for y in record())
-
-
-@pytest.mark.parametrize(("name", "words"), [
-    ("states", "a soft set of states"), ("constraints", "nonlinear constraints"),
-])
-def test_what_does_not_have_them_says_so_by_name(name, words):
-    parts = qpmhe.System(f, h, n=2, p=2, **{name: SOFT[name]}), OBSERVER, COST
-    parts[0].symbolic = object()  # as if it had a CasADi form
-    assert words in uncovered(*parts, Settings(6, "auto", 1))
-    given = {"f": f, "h": h, "horizon": 6, "initial_state": np.zeros(2)}
-    for kind, options in ((checked_ingredients, {}), (IpoptEstimator, given)):
-        with pytest.raises(InvalidInputError, match=words):
-            kind(*parts, **options)
 
 
 WRONG = [
