@@ -66,6 +66,17 @@ def test_the_bound_of_the_candidates_cost():
             assert estimate.candidate_cost <= c * (np.sum(corrections**2) + np.sum(v**2))
 
 
+@pytest.mark.parametrize("fixed", [0.0, 0.02])
+def test_a_component_of_w_may_be_fixed(fixed):
+    W = qpmhe.Box([-np.inf, fixed], [np.inf, fixed])
+    mhe = estimator(system(disturbances=W), qpmhe.Luenberger(G @ [[0.2], [0.0]]))
+    for y in Y:
+        estimate = mhe.update(y)
+        w = estimate.disturbances[:, 1]
+        assert not estimate.improved or np.abs(w - fixed).max() <= 1e-13
+    assert estimate.improved
+
+
 @pytest.mark.parametrize("raises", [False, True])
 def test_a_roll_out_that_fails_is_named(raises):
     def falling(x):

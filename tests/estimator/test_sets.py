@@ -8,7 +8,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Box, Constraint, Polytope, Status
-from qpmhe.errors import InvalidInputError, ModelError, SetError
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
 
 from .same import assert_same
 
@@ -123,6 +123,23 @@ def make(options=None, system=None, **given):
     )
 
 
+def test_a_large_linear_penalty_of_a_ball_is_exact_from_its_centre():
+    rng, compared, ball = np.random.default_rng(19), 0, lambda x: x @ x - 0.1
+    hard, soft = (
+        make({"constraints": [Constraint(ball, **penalty)]}, tolerance=1e-12)
+        for penalty in ({}, {"linear": 1e5})
+    )
+    hard.reset([0.0, 0.0])
+    soft.reset([0.0, 0.0])
+    for y in 0.5 * rng.normal(size=(12, 2)):
+        one, other = hard.update(y), soft.update(y)
+        assert other.qps < 50
+        if one.improved and not one.dropped and np.array_equal(one.candidate, other.candidate):
+            assert other.cost <= one.cost * (1.0 + 1e-5)
+            compared += 1
+    assert compared
+
+
 def test_hard_constraints_hold_or_are_named():
     """Rows on missing outputs do not count."""
     hard, named, kept = {"constraints": [Constraint(ball), Constraint(within, 2)]}, 0, 0
@@ -228,6 +245,9 @@ WRONG = [
      "constraints[0] returned shape (2,)"),
     (lambda: make({"constraints": [Constraint(lambda x: np.log(x[0] - 3.0))]}), ModelError,
      "constraints[0] is [nan] at the initial state"),
+    (lambda: make({"states": SOFT["states"]}, engine="compiled"), OptionError, "soft set of"),
+    (lambda: make({"constraints": [Constraint(ball)]}, engine="compiled"), OptionError,
+     "nonlinear constraints"),
     (lambda: make({"state_residual": qpmhe.angles([0]), "states": SOFT["states"]}), SetError,
      "bounds an angle"),
 ]
