@@ -9,84 +9,64 @@ import qpmhe
 from qpmhe.errors import InvalidInputError
 
 from .plain import Record, differences, spd
+from .systems import swing
+
+RNG = np.random.default_rng(0)
+WEIGHTS, GAIN, START = [spd(RNG, 2), spd(RNG, 2), spd(RNG, 3)], 0.1 * np.ones((2, 3)), np.ones(2)
 
 
-class Case:
-    """An estimator beside the plain record of what it was given."""
+def h(x):
+    return np.stack([x[..., 0], x[..., 1] + 0.2 * x[..., 0] ** 2, x[..., 1]], axis=-1)
 
-    def __init__(
-        self, sizes=(2, 1), horizon=4, discount=1.0, missing=0.0, losses=None, free=(), sets=None,
-        **options,
-    ):
-        n, p = sizes
-        self.n, self.p, self.missing, self.free = n, p, missing, list(free)
-        self.generator = generator = np.random.default_rng(10 * n + p)
-        a, c = 0.6 * generator.standard_normal((n, n)), generator.standard_normal((p, n))
 
-        def f(x):
-            return np.sin(x @ a.T) + 0.3 * x
-
-        def h(x):
-            return x @ c.T + 0.2 * x[..., :1] ** 2
-
-        self.f, gain = f, 0.1 * generator.standard_normal((n, p))
-        gain[self.free] = 0.0
-        weights = [spd(generator, n), spd(generator, n), spd(generator, p)]
-        terms = zip(("prior", "disturbance", "noise"), weights, strict=True)
-        self.cost = (qpmhe.RobustCost if losses else qpmhe.QuadraticCost)(
-            **{name: losses(one) if losses else one for name, one in terms}, discount=discount
+@pytest.mark.parametrize(("horizon", "discount", "missing", "loss", "free"), [
+    (4, 1.0, 0.4, None, []), (1, 0.4, 0.0, None, []), (4, 0.95, 1.0, None, []),
+    (3, 0.8, 0.3, lambda W: qpmhe.Huber(W, 0.3), []), (4, 1.0, 0.3, None, [0]),
+    (4, 1.0, 0.0, None, [0, 1]),
+], ids=["gaps", "one sample", "nothing", "huber", "noise-free", "no noise"])
+def test_they_are_the_blocks_of_the_inverse_hessian(horizon, discount, missing, loss, free):
+    """With noise weights of samples and late measurements; asking for them changes nothing."""
+    generator, gain, upper = np.random.default_rng(1), GAIN.copy(), np.full(2, np.inf)
+    gain[free] = upper[free] = 0.0
+    terms = dict(zip(("prior", "disturbance", "noise"), WEIGHTS, strict=True))
+    cost = qpmhe.QuadraticCost(**terms, discount=discount)
+    if loss:
+        terms = {name: loss(weight) for name, weight in terms.items()}
+        cost = qpmhe.RobustCost(**terms, discount=discount)
+    # Inequalities do not enter.
+    sets = {"states": qpmhe.Box([-9.0] * 2, [9.0] * 2), "disturbances": qpmhe.Box(-upper, upper)}
+    mhe, twin = (
+        qpmhe.MovingHorizonEstimator(
+            qpmhe.System(swing, h, n=2, p=3, **sets), qpmhe.Luenberger(gain), cost,
+            horizon=horizon, initial_state=START,
         )
-        upper = np.full(n, np.inf)
-        upper[self.free] = 0.0
-        if free:
-            sets = {"disturbances": qpmhe.Box(-upper, upper)}
-        start = generator.standard_normal(n)
-        self.mhe = qpmhe.MovingHorizonEstimator(
-            qpmhe.System(f, h, n=n, p=p, **(sets or {})), qpmhe.Luenberger(gain), self.cost,
-            horizon=horizon, initial_state=start, **options,
-        )
-        self.kept = Record(h, gain, start, weights, horizon, discount=discount)
+        for _ in range(2)
+    )
+    kept = Record(h, gain, START, WEIGHTS, horizon, discount=discount)
 
-    def update(self, **own):
-        y = self.generator.standard_normal(self.p)
-        y[self.generator.random(self.p) < self.missing] = np.nan
-        self.kept.push(self.f, y, own.get("noise_weight"))
-        return self.mhe.update(y, **own)
-
-    def check(self, trajectory):
-        """The blocks of the inverse Hessian of the majorising forms, where noise-free rows hold."""
-        hessian, n = self.kept.hessian(trajectory, self.cost), self.n
-        slopes = differences(self.kept.residuals, trajectory)
-        exact = slopes[:, self.free].reshape(-1, trajectory.size)
-        basis = np.linalg.svd(exact)[2][len(exact) :].T if self.free else np.eye(len(hessian))
+    def check(trajectory):
+        hessian = kept.hessian(trajectory, cost)
+        slopes = differences(kept.residuals, trajectory)
+        exact = slopes[:, free].reshape(-1, trajectory.size)
+        basis = np.linalg.svd(exact)[2][len(exact) :].T if free else np.eye(len(hessian))
         inverse = basis @ np.linalg.inv(basis.T @ hessian @ basis) @ basis.T
-        found = self.mhe.covariances()
-        expected = [inverse[k : k + n, k : k + n] for k in range(0, len(inverse), n)]
+        found = mhe.covariances()
+        expected = [inverse[k : k + 2, k : k + 2] for k in range(0, len(inverse), 2)]
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
         found[:] = 0.0  # the user's
 
-
-@pytest.mark.parametrize("options", [
-    {"sizes": (1, 1), "missing": 0.4, "max_qps": 3}, {"sizes": (2, 3), "missing": 1.0},
-    {"discount": 0.4, "horizon": 1}, {"sizes": (3, 2), "discount": 0.95, "missing": 0.4},
-    {"sets": {"states": qpmhe.Box([-9.0, -9.0], [9.0, 9.0])}},  # inequalities do not enter
-    {"sizes": (2, 2), "missing": 0.3, "discount": 0.8, "losses": lambda w: qpmhe.Huber(w, 0.3)},
-    {"sizes": (3, 2), "free": [0, 2], "missing": 0.3}, {"sizes": (3, 2), "free": [0, 1, 2]},
-], ids=lambda one: " ".join(one))
-def test_they_are_the_blocks_of_the_inverse_hessian(options):
-    """With noise weights of samples and late measurements; asking for them changes nothing."""
-    case, twin = Case(**options), Case(**options)
     with pytest.raises(InvalidInputError, match="no estimate yet; call update"):
-        case.mhe.covariances()
-    for t in range(9):
-        own = {"noise_weight": spd(np.random.default_rng(t), case.p)} if t % 2 else {}
-        estimate, other = case.update(**own), twin.update(**own)
-        np.testing.assert_array_equal(estimate.trajectory, other.trajectory)
-        case.check(estimate.trajectory)
-    late, when = np.full(case.p, 0.3), 9 - case.kept.count
-    estimate = case.mhe.amend(when, late)
-    case.kept.amend(when, late)
-    case.check(estimate.trajectory)
+        mhe.covariances()
+    for t in range(8):
+        y, own = generator.standard_normal(3), {"noise_weight": spd(generator, 3)} if t % 2 else {}
+        y[generator.random(3) < missing] = np.nan
+        kept.push(swing, y, **own)
+        estimate = mhe.update(y, **own)
+        np.testing.assert_array_equal(estimate.trajectory, twin.update(y, **own).trajectory)
+        check(estimate.trajectory)
+    late, when = np.full(3, 0.3), 8 - kept.count
+    kept.amend(when, late)
+    check(mhe.amend(when, late).trajectory)
 
 
 def test_there_are_none_without_jacobians_or_along_a_stage_that_failed():

@@ -227,6 +227,7 @@ def test_what_fits_nothing_is_refused():
     mhe, other = (estimator(watching(Gate(reopen=k)), FAR) for k in (3, 9))
     mhe.run(disturbed(7)[:5])
     check(InvalidInputError, ["observer"], other.load_state_dict, mhe.state_dict())
-    state = mhe.state_dict()
-    state["window/rejections"][2, 1] -= 100
-    check(InvalidInputError, ["damaged"], mhe.load_state_dict, state)
+    for change, text in ((1, "another observer"), (-100, "damaged")):
+        state = mhe.state_dict()
+        state["window/rejections"][2, 1] += change
+        check(InvalidInputError, [text], mhe.load_state_dict, state)

@@ -50,20 +50,6 @@ def test_every_way_of_saying_that_something_is_missing(ways, plainly):
     assert found.run(frame).states.tolist() == other.states.tolist()
 
 
-def test_a_missing_component_is_not_judged_against_its_set():
-    """The noise that the state would have is far outside of V where y is not there."""
-    noises = qpmhe.Box([-1.0, -1.0], [1.0, 1.0])
-    mhe = two(cost_of(2, 2, disturbance=100.0 * np.eye(2)), [40.0, 0.0], noises=noises)
-    for t in range(6):
-        estimate = mhe.update([None, mhe.state[1] + 0.2] if t % 2 else None)
-        assert not estimate.status & (Status.CANDIDATE_OUTSIDE | Status.ROWS_DROPPED)
-    # The component that is there is judged.
-    assert estimate.improved
-    estimate = mhe.update([None, mhe.state[1] + 30.0])
-    assert Status.CANDIDATE_OUTSIDE in estimate.status
-    assert estimate.dropped == (("noises", 1, "upper", 6),)
-
-
 DATE, DURATION = np.datetime64("2026-01-01T00:00:05"), np.timedelta64(5, "s")
 TIMES = [
     np.array([DATE]), DURATION, [datetime(2026, 1, 1)], [pd.Timedelta(DURATION)],

@@ -25,7 +25,7 @@ PENALTIES = {"linear": 0.5, "quadratic": 2.0}
 SOFT = {name: one.soften(**PENALTIES) for name, one in SETS.items()}
 NOMINAL = np.array([1.0, 0.1])
 OPTIONS = {
-    "observer alone": {"max_qps": 0, "discount": 0.9},
+    "observer alone": {"sets": SETS, "max_qps": 0, "discount": 0.9},
     "unscented": {"kalman": "UnscentedKalman", "candidate": "reinitialized"},
     "robust": {"robust": True, "max_qps": 2},
     "soft sets": {"sets": SOFT, "max_qps": 2},
@@ -94,25 +94,6 @@ def samples(count, seed=0, sets=False, single=True):
 
 
 @every
-def test_what_is_neutral_changes_no_bit(name):
-    mhe, twin = estimator(**OPTIONS[name]), estimator(**OPTIONS[name])
-    neutral = [
-        {"noise_weight": WEIGHTS["noise"]}, {"disturbance_weight": WEIGHTS["disturbance"]},
-        {"parameters": NOMINAL}, {"sensors": [2, 0, 1]}, {"sensors": np.ones(3, np.bool_)},
-    ] + [{"bounds": SETS}, {"bounds": {"states": SETS["states"]}}] * ("sets" in OPTIONS[name])
-    for t, own in enumerate(samples(40, 1, single=False)):
-        given, expected = neutral[t % len(neutral)], twin.update(**own)
-        y = own["y"][given.get("sensors", [0, 1, 2])]
-        assert_same(mhe.update(**own | given | {"y": y}), expected)
-        if t % 9 == 5:
-            late = np.array([0.1, np.nan, 0.2])
-            assert_same(mhe.amend(t - 1, late), twin.amend(t - 1, late))
-        elif t % 9 == 7:
-            given = {k: v for k, v in neutral[t // 9].items() if k != "sensors"}
-            assert_same(mhe.set(**given), expected)
-
-
-@every
 def test_a_late_measurement_finds_the_sample_as_it_was_taken(name):
     options = OPTIONS[name] | {"candidate": "observer"}
     for delay in (1, 3):
@@ -155,6 +136,16 @@ def test_set_gives_the_estimator_that_was_made_with_the_values(name, when):
             np.testing.assert_allclose(found.trajectory, expected.trajectory, rtol=0, atol=1e-8)
             assert found.candidate_cost == pytest.approx(expected.candidate_cost, rel=1e-9)
             assert found.cost == pytest.approx(expected.cost, rel=1e-7)
+
+
+@every
+def test_parameters_are_the_last_inputs(name):
+    mhe, plain = estimator(**OPTIONS[name]), estimator(**OPTIONS[name], parameters=None)
+    for own in samples(12, 5, "sets" in OPTIONS[name]):
+        inputs = {"u": np.append(own["u"], own.get("parameters", NOMINAL)), "parameters": None}
+        assert_same(mhe.update(**own), plain.update(**own | inputs))
+    expected = plain.run(np.zeros((5, 3)), np.tile([1.0, *NOMINAL], (5, 1)))
+    np.testing.assert_array_equal(mhe.run(np.zeros((5, 3)), np.ones(5)).states, expected.states)
 
 
 # Bad input
