@@ -109,17 +109,6 @@ def test_a_growing_window_and_slides_to_the_front():
         compare([when], when + when % 4, samples(when + 10, missing=0.05), observer=KALMAN)
 
 
-@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
-@pytest.mark.parametrize("sets", [
-    {"noises": qpmhe.Box([-1.0] * 3, [1.5] * 3)}, {"states": qpmhe.Box([-0.6] * 2, [0.6] * 2)},
-])
-def test_late_measurements_with_sets(sets):
-    estimates = compare(
-        [5], 7, samples(12, seed=5), tolerance=1e-5, sets=sets, project_observer=False
-    )
-    assert any(Status.CANDIDATE_OUTSIDE in one.status for one in estimates)
-
-
 def test_nothing_new_changes_nothing():
     """Nor does a measurement that is too large to be squared."""
     for hidden in ([], [0, 1], [0, 1, 2]):

@@ -1,14 +1,12 @@
 """Where the QPs and the candidate start, the prior's mean, and which of the states is asked for."""
 
-import math
 
 import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe import Status
 
-from .plain import Record, huber, is_minimum, quadratic, spd
+from .plain import Record, spd
 from .systems import swing
 
 GENERATOR = np.random.default_rng(1)
@@ -104,37 +102,7 @@ def test_the_numbers_are_those_of_plain_loops(warm_start, candidate, arrival):
             assert estimate.qps == 1
 
 
-@pytest.mark.parametrize("root", [lambda x: np.sqrt(x) - 0.3, lambda x: [math.sqrt(x[0]) - 0.3]],
-                         ids=["NaN", "raises"])
-def test_a_start_that_the_model_does_not_reach(root):
-    """Where the estimate is below zero, it cannot be moved on."""
-    run = qpmhe.MovingHorizonEstimator(
-        qpmhe.System(
-            root, lambda x: x, n=1, p=1, f_jacobian=lambda x: 0.5 / np.sqrt(x)[..., None]
-        ), qpmhe.Luenberger([0.9]),
-        qpmhe.QuadraticCost(prior=1.0, disturbance=0.01, noise=10.0), horizon=3,
-        initial_state=[1.0], warm_start=True,
-    ).run([0.9, 0.5, -0.3, 0.5, 0.9, 0.9, 1.0, 1.0, 1.0])
-    assert (run.costs <= run.candidate_costs).all()
-    assert any(Status.MODEL_FAILED in status for status in run.statuses)
-    assert (run.states < 0.0).any()
-    assert np.isfinite(run.costs[-1])
-
-
 # The smoothed prior
-
-
-def test_robust_losses_are_taken_at_the_smoothed_prior():
-    cost = qpmhe.RobustCost(prior=qpmhe.Huber(P, 0.05), disturbance=Q, noise=R)
-    mhe = estimator(cost=cost, max_qps=None, tolerance=1e-13, **SMOOTHED)
-    kept = Plain(losses=(huber(0.05), quadratic, quadratic), **SMOOTHED)
-    for y in record(15):
-        estimate = mhe.update(y)
-        kept.take(y)
-        assert estimate.candidate_cost == pytest.approx(kept.cost(kept.candidate), rel=1e-7)
-        assert estimate.cost == pytest.approx(kept.cost(estimate.trajectory), rel=1e-7)
-        assert is_minimum(kept, estimate.trajectory, 1e-4)
-        kept.before = estimate.trajectory
 
 
 def test_ipopt_with_the_prior_update_of_other_toolboxes():
@@ -184,22 +152,3 @@ def test_late_measurements_and_what_is_set_keep_the_windows_prior():
             kept.R, kept.noise_weights = 3.0 * R, [3.0 * R] * len(kept.ys)
             estimate = mhe.set(noise_weight=3.0 * R)
         kept.check(estimate)
-
-
-def test_a_prior_that_the_loss_cannot_weigh_is_not_taken():
-    class Short(qpmhe.Quadratic):
-        """A loss that a prior may have at its own state only."""
-
-        def cost(self, residuals, weights):
-            if np.abs(residuals).max() > 0.0:
-                raise ValueError("too far")
-            return super().cost(residuals, weights)
-
-    mhe = estimator(cost=qpmhe.RobustCost(prior=Short(P), disturbance=Q, noise=R), **SMOOTHED)
-    for y in record(12):
-        estimate = mhe.update(y)
-        assert np.isfinite(estimate.candidate_cost)
-        assert estimate.cost <= estimate.candidate_cost
-        # As if it had been improved: the next window's prior is elsewhere.
-        mhe._engine._trajectory += 0.1
-    assert mhe._engine._window.smoothed_prior is not None

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import qpmhe
 from qpmhe.models.chain import casadi_output, casadi_rate, chain_of_masses
 
 NONE = np.zeros(0)
@@ -70,11 +69,3 @@ def test_the_observer_converges(masses, dimension, method):
     for _ in range(300):
         x, z = system.f(x, NONE), system.f(z, NONE) + observer.gain @ (x - z)[: system.p]
     assert np.linalg.norm(x - z) < 1e-6 * first
-
-
-def test_sizes_that_are_none():
-    for maker in (chain_of_masses, casadi_rate, casadi_output):
-        with pytest.raises(qpmhe.errors.OptionError, match="masses is 0; expected an integer >= 1"):
-            maker(masses=0)
-        with pytest.raises(qpmhe.errors.OptionError, match="dimension is 4; expected 1, 2 or 3"):
-            maker(dimension=4)

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 import qpmhe
@@ -102,30 +101,3 @@ def test_no_update_imports_anything(backend):
         timeout=300,
     )
     assert done.stdout.splitlines()[-2:] == ["[]", "[]"]
-
-
-def test_programs_of_jax_and_casadi_are_made_with_the_estimator():
-    ca, jnp = pytest.importorskip("casadi"), pytest.importorskip("jax.numpy")
-    by_jax = qpmhe.from_jax(
-        lambda x: jnp.array([x[0] + 0.1 * x[1], x[1] - 0.1 * jnp.sin(x[0])]), lambda x: x[:1],
-        n=2, p=1,
-    )
-    by_casadi = qpmhe.from_casadi(
-        lambda x: [x[0] + 0.1 * x[1], x[1] - 0.1 * ca.sin(x[0])], lambda x: x[0], n=2,
-        compiled=False,
-    )
-    for system, programs, horizon in (
-        (by_jax, by_jax.kernel._programs._batches, 40), (by_casadi, by_casadi.kernel._local, 4),
-    ):
-        mhe = qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([[0.3], [0.1]]),
-            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=[[1.0]]),
-            horizon=horizon, initial_state=[0.5, 0.0], max_qps=3,
-        )
-        made = programs if system is by_jax else programs.kept
-        before = set(made)
-        for k in range(horizon + 3):
-            mhe.update([np.cos(0.1 * k)])
-        new = set(made) - before
-        # Those of a window that grows may come later.
-        assert not new if system is by_jax else {count for count, _ in new} <= {2, 3}

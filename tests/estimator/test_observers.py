@@ -64,17 +64,6 @@ def oscillator():
 # Gains and corrections of one's own
 
 
-def test_luenberger():
-    gain = np.random.default_rng(1).standard_normal((3, 2))
-    observer, sample = Luenberger(gain), Sample(linear(np.eye(3), np.ones((2, 3))), NONE)
-    left, values, right = np.linalg.svd(gain)
-    gain[...] = np.nan  # it keeps a copy
-    correction, covariance = observer.correct(np.zeros(3), right[0], sample)
-    np.testing.assert_allclose(correction, values[0] * left[:, 0], rtol=1e-12)
-    assert observer.kappa == pytest.approx(values[0], rel=1e-12)
-    assert covariance is None
-
-
 def test_output_injection():
     system, start = linear(0.5 * np.eye(2), np.eye(2)), [1.0, -2.0]
     listed = estimator(system, OutputInjection(lambda z, v: [0.1 * v[0] - v[1], 0.3 * v[1]]), start)
@@ -180,18 +169,6 @@ def test_poles_are_placed_as_asked():
     assert np.abs(poles - 0.5).min() < 1e-12
 
 
-def test_a_gain_is_for_the_point_and_the_input():
-    def f(x, u):
-        return np.array([x[0] + 0.1 * x[1], x[1] - 0.1 * u[0] * np.sin(x[0])])
-
-    system = qpmhe.System(f, lambda x: x[0], n=2, p=1, m=1)
-    gain = design_luenberger(system, [2.0, 0.5], [3.0], poles=[0.4, 0.6]).gain
-    A = np.array([[1.0, 0.1], [-0.3 * np.cos(2.0), 1.0]])
-    np.testing.assert_allclose(poles_of(A - gain @ np.eye(1, 2)), [0.4, 0.6], atol=1e-9)
-    words = ["u is missing; the system has 1 inputs"]
-    check(InvalidInputError, words, design_luenberger, system, [0.0, 0.0], poles=[0.4, 0.6])
-
-
 def test_a_hidden_mode_is_named_in_any_coordinates():
     # The first state shows the second, and neither shows the others.
     hidden = np.array([
@@ -232,20 +209,6 @@ def test_designs_that_cannot_be():
     rooted = qpmhe.System(lambda x: 0.9 * x, lambda x: np.sqrt(x[:1]), n=1, p=1)
     words = ["h is [nan] at x = [-1.0]", "expected finite"]
     check(ModelError, words, design_luenberger, rooted, [-1.0], poles=[0.5])
-
-
-def test_kalman_type_observers_that_do_not_fit():
-    plant = Plant(9)
-    right = {"prior": plant.P, **plant.covariances}
-    wrong = right | {"disturbance": np.eye(2)}
-    text = ["disturbance covariance", "expected (3, 3)"]
-    check(ShapeError, text, SteadyStateKalman, plant.system, plant.start, **wrong)
-    check(ShapeError, text, estimator, plant.system, UnscentedKalman(**wrong), plant.start)
-    text = ["spread is 0.0; expected a finite number > 0"]
-    check(OptionError, text, UnscentedKalman, **right, spread=0.0)
-    steady = SteadyStateKalman(plant.system, plant.start, **right)
-    text = ["for 3 states and 2 outputs; expected 2 and 1"]
-    check(ShapeError, text, estimator, oscillator(), steady, np.zeros(2))
 
 
 # The high-gain observer

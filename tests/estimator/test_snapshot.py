@@ -12,7 +12,6 @@ from qpmhe.errors import InvalidInputError
 from qpmhe.estimation.snapshot import read, written
 
 from .same import assert_same, leaves
-from .untraced import untraced
 
 OPTIONS = {
     "observer alone": {"max_qps": 0, "delay": 3},
@@ -21,25 +20,10 @@ OPTIONS = {
     "sets": {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9]), "robust": 0.3, "warm_start": True},
 }
 COMPILED = ["compiled"] * (find_compiler() is not None)
-ENGINES = ["untraced", "traced", "other digits", *COMPILED]
-some_engines = pytest.mark.parametrize("engine", ["untraced", *COMPILED])
+engines = pytest.mark.parametrize("engine", ["untraced", *COMPILED])
 WEIGHTS = {"prior": np.eye(2), "disturbance": 10.0 * np.eye(2), "noise": np.eye(1)}
 RECORD = np.random.default_rng(0).normal(0.0, 0.6, (30, 2))
 RECORD[7, 0] = np.nan
-
-
-class Rounding:
-    """A model's fused calls, whose last digits no other way of calling it has."""
-
-    def __init__(self, kernel):
-        self.kernel, self.factor = kernel, 1.0 + 4.0 * np.finfo(float).eps
-        self.prepare = kernel.prepare
-
-    def stage(self, x, u):
-        return tuple(self.factor * value for value in self.kernel.stage(x, u))
-
-    def residuals(self, trajectory, y, u):
-        return self.factor * self.kernel.residuals(trajectory, y, u)
 
 
 class Pendulum:
@@ -59,14 +43,6 @@ class Pendulum:
 
 def system_of(engine, swing=1.0, bend=0.1, **sets):
     options = {"n": 2, "p": 1, "m": 1, "dt": 0.1, "method": "euler", **sets}
-    if engine == "other digits":
-        ca = pytest.importorskip("casadi")
-        system = qpmhe.from_casadi(
-            lambda x, u: [x[1], u[0] - swing * ca.sin(x[0])],
-            lambda x, u: x[0] + bend * x[0] ** 2, **options,
-        )
-        system.kernel = Rounding(system.kernel)
-        return system
     pendulum = Pendulum(swing, bend, engine == "untraced")
     return qpmhe.System.from_ode(pendulum.rate, pendulum.h, **options)
 
@@ -111,14 +87,13 @@ def same(found, expected):
         assert_same(one, other)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", ["untraced", "traced", *COMPILED])
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_restored_estimator_continues_bit_for_bit(name, engine):
     options = OPTIONS[name]
     for stop in (0, 1, 12):
-        whole, others = fed(stop, engine, **options), [made(engine, **options)]
-        if engine != "other digits":
-            others.append(pickle.loads(pickle.dumps(whole)))
+        whole = fed(stop, engine, **options)
+        others = [made(engine, **options), pickle.loads(pickle.dumps(whole))]
         state = whole.state_dict()
         others[0].load_state_dict(state)
         for value in state.values():  # the estimator has taken a copy
@@ -132,7 +107,7 @@ def test_a_restored_estimator_continues_bit_for_bit(name, engine):
     same(feed(whole, 0, 14), feed(made(engine, **options), 0, 14))
 
 
-@some_engines
+@engines
 def test_files_without_pickle_keep_every_bit(engine, tmp_path):
     mhe, others = fed(15, engine, kalman=True), [made(engine, kalman=True) for _ in range(2)]
     np.savez(tmp_path / "state.npz", **mhe.state_dict())
@@ -152,7 +127,7 @@ def injection(gain):
     return qpmhe.OutputInjection(lambda z, v: gain * np.tanh(v[0]) * np.ones(2))
 
 
-@some_engines
+@engines
 def test_the_state_of_another_estimator_is_refused_by_name(engine):
     others = {  # estimators that differ in one thing, with the word that must name it
         "cost.prior": {"weights": {"prior": 1.1 * np.eye(2)}},
@@ -182,15 +157,11 @@ def test_the_state_of_another_estimator_is_refused_by_name(engine):
         described = read(mhe.state_dict())["estimator"]
         with pytest.raises(InvalidInputError, match="another"):
             mhe.load_state_dict(written({**read(state), "estimator": described}))
-    for one, another in (
-        ({"observer": injection(0.3)}, {"observer": injection(0.31)}), ({"kalman": True}, {}),
-        ({"robust": 1.0}, {"robust": 1.5}),
-    ):
-        with pytest.raises(InvalidInputError, match=r"another (observer|cost|weight)"):
-            made(engine, **another).load_state_dict(fed(9, engine, **one).state_dict())
+    with pytest.raises(InvalidInputError, match="another observer"):
+        made(observer=injection(0.31)).load_state_dict(fed(9, observer=injection(0.3)).state_dict())
 
 
-@some_engines
+@engines
 def test_caps_and_policies_may_change(engine):
     """The observer's part is the same then; terms that were not there are computed."""
     for first, second in (
@@ -209,14 +180,6 @@ def test_caps_and_policies_may_change(engine):
 # Damage
 
 
-def paths_of(value, path=()):
-    items = value.items() if isinstance(value, dict) else ()
-    if isinstance(value, (list, tuple)):
-        items = enumerate(value)
-    below = [one for key, item in items for one in paths_of(item, (*path, key))]
-    return [path] * bool(path) + below
-
-
 def replaced(value, path, new):
     if not path:
         return new
@@ -227,62 +190,6 @@ def replaced(value, path, new):
     )
 
 
-JUNK = [
-    None, 3, -1, 2**70, 0.5, np.nan, True, "text", b"bytes", [], {}, [[1, 2], [3]], object(),
-    np.zeros(0), np.zeros((3, 3)), np.array(1.25), np.array(["a"]), np.full(2, np.nan),
-]
-# What no computation confirms: estimates of the past, the covariance at the window's start, and
-# what a model that failed had before.
-UNCONFIRMED = [
-    ("history",), ("trajectory",), ("watched",), ("modes",), ("memory",), ("methods",),
-    ("linearized",), *(("window", name) for name in (
-        "earlier", "earlier_covariance", "time", "covariance", "y", "u", "irregular", "linear",
-        "panel", "gradient", "next_gradient", "smoothed_prior",
-    )),
-]
-
-
-def mutated(state, generator):
-    """A state with some part of it replaced, and where."""
-    paths = paths_of(state)
-    path, old = paths[generator.integers(len(paths))], state
-    for key in path:
-        old = old[key]
-    new = JUNK[generator.integers(len(JUNK))]
-    if isinstance(old, np.ndarray) and old.size and generator.random() < 0.7:
-        new, k = old.copy(), generator.integers(old.size)
-        if new.dtype == np.float64:
-            new.flat[k] = generator.choice([np.nan, np.inf, -7.0, 1.5 * new.flat[k] + 0.1])
-        else:
-            new.flat[k] = ~new.flat[k]
-    return path, replaced(state, path, new)
-
-
-@pytest.mark.parametrize(("engine", "name"), [
-    ("untraced", "kalman"), ("traced", "sets"), ("other digits", "smoothed"),
-    (ENGINES[-1], "smoothed"),
-])
-def test_damaged_states_are_refused_whole_or_harmless(engine, name):
-    options, generator, refused = OPTIONS[name], np.random.default_rng(3), 0
-    mhe, twin = (fed(11, engine, **options) for _ in range(2))
-    state = read(fed(15, engine, **options).state_dict())
-    for _ in range(90):
-        path, damaged = mutated(state, generator)
-        if leaves(damaged) == leaves(state):
-            continue
-        try:
-            mhe._engine.load_state_dict(damaged)
-        except InvalidInputError:
-            refused += 1
-        else:
-            assert path[:1] in UNCONFIRMED or path[:2] in UNCONFIRMED, path
-            mhe.update(np.zeros(1), np.zeros(1))
-            mhe = fed(11, engine, **options)
-        np.testing.assert_array_equal(mhe.state, twin.state)
-    assert refused > 45
-    same(feed(mhe, 11, 16), feed(twin, 11, 16))
-
-
 def test_damage_that_was_seen():
     state, mhe = read(fed().state_dict()), fed(6)
     before, own = leaves(mhe.state_dict()), ("window", "own")
@@ -291,8 +198,6 @@ def test_damage_that_was_seen():
     for path, value in (
         (("modes",), ["batched"]), (own, None), (own, {-3: {"noise_weight": np.eye(1)}}),
         (own, {14: {"noise_weight": -np.eye(1)}}), (own, {14: []}),
-        (own, {14: {"sampled": np.ones(2, np.bool_)}}),
-        (own, {14: {"states": {"lower": np.zeros(2)}}}),
         (("usual",), {"noise_weight": 3.0 * np.eye(1)}), (("window", "time"), -1),
         (("window", "z"), np.zeros((5, 2))), (("watched",), (0, 16)), (("estimator",), {}),
         (("problem",), (2, 1)), (("history",), [[1.0, 2.0, 3.0]]), (("trajectory",), half),
@@ -307,34 +212,3 @@ def test_damage_that_was_seen():
     ):
         with pytest.raises(InvalidInputError, match=words):
             made().load_state_dict(wrong)
-
-
-# The System
-
-
-def test_estimators_of_one_system_do_not_change_each_other():
-    def branching(x):  # decides for a batch by its first state
-        return x[..., :1] * (1.0 if np.ravel(x)[0] < 1.5 else 1.1)
-
-    def bent(x):  # the complex step is right on one side only
-        return np.where(x.real < 50.0, 0.9 * x, np.abs(x))
-
-    def estimator(system, start=(1.0, 1.0)):
-        return made(system=system, initial_state=start, observer=qpmhe.Luenberger([0.3, 0.1]))
-
-    system = qpmhe.System(untraced(bent), branching, n=2, p=1)
-    before = system.call_modes(), system.f_jacobian.method
-    one, other = estimator(system), estimator(system)
-    alone = estimator(qpmhe.System(untraced(bent), branching, n=2, p=1))
-    far = estimator(system, (80.0, 90.0))
-    assert far._own_system.f_jacobian.method == "finite differences" != before[1]
-    state, generator = read(one.state_dict()), np.random.default_rng(0)
-    state["modes"], state["methods"] = ["looped"] * 2, ["finite differences"] * 2
-    for t in range(40):
-        y = generator.uniform(0.0, 4.0, 1)
-        assert_same(other.update(y), alone.update(y))
-        one.update(generator.uniform(0.0, 4.0, 1))
-        if t % 10 == 5:
-            one.load_state_dict(written(state))
-            one.reset([1.4, 1.0])
-        assert (system.call_modes(), system.f_jacobian.method) == before

@@ -4,13 +4,11 @@ Functions are called state by state, with copies, unless a trace on symbols prov
 """
 
 import math
-import sys
 
 import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe import Status
 from qpmhe.errors import ModelError
 from qpmhe.model.functions import BatchedFunction
 
@@ -75,15 +73,6 @@ def test_inputs():
         assert system.f.mode == mode
         check_values(system.f, lambda x, u: A @ x + B @ u + x * u, 2, 2)
         check_values(system.h, lambda x, u: np.array([x[0] * u[0] + u[1]]), 2, 2)
-    for m in (1, 2, 3):
-        for f, plain in (
-            (lambda x, u: x + u[0], None),
-            (lambda x, u: [x[1], u[0]], lambda x, u: np.array([x[1], u[0]])),
-            (lambda x: 2.0 * x, lambda x, u: 2.0 * x),
-            (lambda x, q=0.0: x + q[0], lambda x, u: x + u[0]),
-        ):
-            system = qpmhe.System(f, lambda x, u: x[..., :1], n=2, p=1, m=m)
-            check_values(system.f, plain or f, 2, m)
     alone = qpmhe.System(lambda x, scale=3.0: scale * x, lambda x: x, n=1, p=1)
     assert alone.f(np.ones(1), NONE) == 3.0
 
@@ -149,33 +138,16 @@ def high(x):
     return 0.5 * x
 
 
-def swallowed(x):
-    try:
-        beyond = bool(x[0] > 12.0)
-    except Exception:  # whatever the symbol raises
-        beyond = False
-    return high(x) if beyond else low(x)
-
-
-def looped_over(x):
-    out = []
-    for value in np.asarray(x):
-        out += [0.5 * value if value > 12.0 else 0.95 * value + 0.4]
-    return np.array(out)
-
-
 # Whether a state, or many, is beyond 12: farther than all points that are tried at construction.
 BEYOND = {
     "item": lambda x: x.item(0) > 12.0,
     "array": lambda x: np.array(x, dtype=float).ravel()[0] > 12.0,
-    "tolist": lambda x: np.ravel(x).tolist()[0] > 12.0,
     "math": lambda x: math.floor(np.ravel(x)[0]) > 12,
     "all": lambda x: np.all(x > 12.0),
     "sort": lambda x: np.sort(x.ravel())[-1] > 12.0,
     "mask": lambda x: x[x > 12.0].size,
     "where": lambda x: np.where(x > 12.0)[0].size,
     "searchsorted": lambda x: np.searchsorted([12.0], np.ravel(x)[0]),
-    "comparison": lambda x: list(x.ravel()[:1]) > [12.0],
     "text": lambda x: f"{np.ravel(x)[0]:09.5f}" > "012.0",
     "bytes": lambda x: np.frombuffer(x.tobytes())[0] > 12.0,
 }
@@ -184,7 +156,6 @@ BRANCHES = {
     for name, beyond in BEYOND.items()
 } | {
     "and": lambda x: (x[0] > 12.0 and high(x)) or low(x),
-    "swallowed": swallowed, "loop over values": looped_over,
 }
 
 
@@ -210,99 +181,12 @@ def test_a_function_that_mixes_states_is_no_function_of_many():
         assert function.mode != "batched"
 
 
-# What is written into an argument, and what leaves a model
-
-
-def estimator(system, **options):
-    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=4.0, noise=25.0)
-    observer = options.pop("observer", qpmhe.Luenberger([0.8]))
-    if not isinstance(system, qpmhe.System):
-        system = qpmhe.System(system, lambda x: x, n=1, p=1, states=qpmhe.Box([0.0], [np.inf]))
-    options = {"horizon": 4, "initial_state": [1.0], "max_qps": 2} | options
-    return qpmhe.MovingHorizonEstimator(system, observer, cost, **options)
-
-
-def clipped(x):
-    x[x < 0.0] = 0.0
-    return low(x)
-
-
-def clipped_beyond(x):
-    if x[0] > 12.0:
-        x[0] = 12.0
-    return low(x)
-
-
-def overwritten_input(x, u):
-    if x[0] > 12.0:
-        u[0] = 0.0
-    return low(x) + u
-
-
-def writing(z, v):
-    if z[0] > 5.0:
-        z[0], v[0] = 0.0, 0.0
-    return 0.8 * v
-
-
-def of_rate(f):
-    return estimator(qpmhe.System.from_ode(f, lambda x: x, dt=0.1, n=1, p=1))
-
-
-def of_input(f):
-    return estimator(qpmhe.System(f, lambda x: x, n=1, p=1, m=1))
-
-
-@pytest.mark.parametrize(("function", "make"), [
-    (clipped, lambda f: estimator(f, warm_start=True)),
-    (clipped_beyond, lambda f: estimator(f, candidate="reinitialized")),
-    (clipped_beyond, of_rate), (overwritten_input, of_input),
-    (writing, lambda f: estimator(low, observer=qpmhe.OutputInjection(f))),
-], ids=["clipped", "clipped beyond", "rate", "input", "correction"])
-def test_what_is_written_into_an_argument_changes_nothing(function, make):
-    def copying(*arguments):
-        return function(*(np.array(one) for one in arguments))
-
-    if function is not writing and function is not overwritten_input:
-        right = make(lambda x: copying(x))
-    else:
-        right = make(lambda x, u: copying(x, u))
-    wrong, kept = make(function), []
-    for y in (0.3, -0.6, 0.1, 14.0, 12.5, -0.4, 13.0, 0.2, 0.0, -1.0):
-        given = [y] + [[0.5]] * wrong.system.m
-        own = {"dt": 0.2} if make is of_rate else {}
-        found, expected = wrong.update(*given, **own), right.update(*given, **own)
-        np.testing.assert_array_equal(found.candidate, expected.candidate)
-        assert (found.cost, found.candidate_cost) == (expected.cost, expected.candidate_cost)
-        assert Status.MODEL_FAILED not in found.status
-        kept.append((found.trajectory, expected.trajectory))
-    for one, other in kept:
-        np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("where", ["f", "h"])
-@pytest.mark.parametrize("what", [lambda _: object(), lambda _: sys.exit(7)], ids=["any", "exit"])
-def test_what_a_model_returns_far_out_never_leaves_update(what, where):
-    """What properties/test_bad_luck.py does not try."""
-    def bent(x):
-        return what(x) if x[0] > 12.0 else 1.1 * x
-
-    functions = {"f": lambda x: 1.1 * x, "h": lambda x: 1.0 * x} | {where: bent}
-    system, gain = qpmhe.System(**functions, n=1, p=1), qpmhe.Luenberger([0.3])
-    mhe = estimator(system, observer=gain, initial_state=[9.0], candidate="reinitialized")
-    for t in range(12):
-        estimate = mhe.update(10.0 * 1.1**t)
-        assert estimate.cost <= estimate.candidate_cost
-    assert mhe.time == 12
-    assert estimate.status & (Status.MODEL_FAILED | Status.FAILED_STAGE)
-
-
 def test_a_model_that_wants_arrays_that_it_could_write_to_has_them():
     def wanting(x):
         if not x.flags.writeable:
             raise ValueError("buffer source array is read-only")
         return 0.9 * x
 
-    mhe = estimator(qpmhe.System(wanting, lambda x: x, n=1, p=1))
-    assert not mhe._own_system.f.reads_only
-    assert [mhe.update([y]).improved for y in (2.0, 3.0, 1.5)] == [True] * 3
+    system = qpmhe.System(wanting, lambda x: x, n=1, p=1)
+    assert not system.f.reads_only
+    assert system.f(np.ones(1), NONE) == 0.9
