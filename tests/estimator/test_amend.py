@@ -16,12 +16,11 @@ GAIN = 0.1 * GENERATOR.standard_normal((2, 3))
 C = GENERATOR.standard_normal((3, 2))
 HORIZON, NAN, WHOLE = 4, np.nan, (slice(None),)
 LUENBERGER = qpmhe.Luenberger(GAIN)
-INJECTION = qpmhe.OutputInjection(lambda z, v: np.tanh(GAIN @ v) / (1.0 + z**2))
 KALMAN = qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=0.1 * np.eye(2), noise=np.eye(3))
 QUADRATIC = qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=R, discount=0.8)
 ROBUST = qpmhe.RobustCost(prior=P, disturbance=qpmhe.Power(Q, 1.5), noise=qpmhe.Huber(R))
 OF_OBSERVER = qpmhe.QuadraticCost(prior=qpmhe.ObserverPrior(), disturbance=Q, noise=R)
-PAIRS = [(LUENBERGER, ROBUST), (INJECTION, QUADRATIC), (KALMAN, OF_OBSERVER), (KALMAN, ROBUST)]
+PAIRS = [(LUENBERGER, ROBUST), (LUENBERGER, QUADRATIC), (KALMAN, OF_OBSERVER)]
 
 
 def rate(x, u):
@@ -32,12 +31,10 @@ def seen(x):
     return x @ C.T + 0.1 * x[..., :1] ** 2
 
 
-def estimator(observer=LUENBERGER, cost=QUADRATIC, sets=None, **options):
-    system = qpmhe.System.from_ode(
-        rate, seen, dt=0.2, n=2, p=3, m=1, method="euler", **(sets or {})
-    )
+def estimator(observer=LUENBERGER, cost=QUADRATIC):
+    system = qpmhe.System.from_ode(rate, seen, dt=0.2, n=2, p=3, m=1, method="euler")
     return qpmhe.MovingHorizonEstimator(
-        system, observer, cost, **{"horizon": HORIZON, "initial_state": [0.5, 0.0]} | options
+        system, observer, cost, horizon=HORIZON, initial_state=[0.5, 0.0]
     )
 
 
@@ -54,21 +51,19 @@ def samples(count, missing=0.2, irregular=False, seed=2):
     return result
 
 
-def same(one, other, tolerance=0.0):
+def same(one, other):
     np.testing.assert_array_equal(one.candidate, other.candidate)
-    np.testing.assert_allclose(
-        one.trajectory, other.trajectory, rtol=tolerance, atol=0.1 * tolerance
-    )
-    assert (one.time, one.dropped) == (other.time, other.dropped)
-    assert one.cost == pytest.approx(other.cost, rel=1e-12 + tolerance, abs=1e-14)
+    np.testing.assert_array_equal(one.trajectory, other.trajectory)
+    assert one.time == other.time
+    assert one.cost == pytest.approx(other.cost, rel=1e-12, abs=1e-14)
     assert one.candidate_cost == pytest.approx(other.candidate_cost, rel=1e-12, abs=1e-14)
     np.testing.assert_array_equal(np.isnan(one.noises), np.isnan(other.noises))
 
 
-def compare(times, after, record=None, first=NAN, parts=WHOLE, tolerance=0.0, **options):
+def compare(times, after, record=None, first=NAN, parts=WHOLE, **options):
     """Samples of these times come after another one, in this order, in these parts."""
-    make, record = options.pop("make", estimator), record or samples(after + HORIZON + 2)
-    late, prompt, estimates = make(**options), make(**options), []
+    record = record or samples(after + HORIZON + 2)
+    late, prompt = estimator(**options), estimator(**options)
     for t, (of_time, u, own) in enumerate(record):
         y = of_time.copy()
         for part in parts if t in times else ():
@@ -81,14 +76,12 @@ def compare(times, after, record=None, first=NAN, parts=WHOLE, tolerance=0.0, **
                 one = late.amend(when, y)
                 y[:] = 9.0  # what was given is copied
         if not min(times) <= t < after:
-            same(one, other, tolerance)
-            np.testing.assert_allclose(late.state, prompt.state, rtol=tolerance, atol=tolerance)
-            estimates.append(one)
-    return estimates
+            same(one, other)
+            np.testing.assert_array_equal(late.state, prompt.state)
 
 
 @pytest.mark.parametrize(
-    ("observer", "cost"), PAIRS, ids=["luenberger", "injection", "observer prior", "kalman"]
+    ("observer", "cost"), PAIRS, ids=["robust", "quadratic", "observer prior"]
 )
 def test_a_late_measurement_of_any_age_counts_bit_for_bit(observer, cost):
     parts = {"observer": observer, "cost": cost}
@@ -109,17 +102,6 @@ def test_a_growing_window_and_slides_to_the_front():
         compare([when], when + when % 4, samples(when + 10, missing=0.05), observer=KALMAN)
 
 
-@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
-@pytest.mark.parametrize("sets", [
-    {"noises": qpmhe.Box([-1.0] * 3, [1.5] * 3)}, {"states": qpmhe.Box([-0.6] * 2, [0.6] * 2)},
-])
-def test_late_measurements_with_sets(sets):
-    estimates = compare(
-        [5], 7, samples(12, seed=5), tolerance=1e-5, sets=sets, project_observer=False
-    )
-    assert any(Status.CANDIDATE_OUTSIDE in one.status for one in estimates)
-
-
 def test_nothing_new_changes_nothing():
     """Nor does a measurement that is too large to be squared."""
     for hidden in ([], [0, 1], [0, 1, 2]):
@@ -132,30 +114,3 @@ def test_nothing_new_changes_nothing():
             same(before, after)
             assert Status.MODEL_FAILED not in after.status
             np.testing.assert_array_equal(mhe.state, before.state)
-    # The newest measurement is still missing where an older one came.
-    assert Status.MISSING in mhe.update(None, [0.0]).status
-    assert Status.MISSING in mhe.amend(5, np.ones(3)).status
-    assert Status.MISSING in mhe.amend(6, [1.0, None, 1.0]).status
-    assert Status.MISSING not in mhe.amend(6, [None, 1.0, None]).status
-
-
-def test_the_candidate_is_true_where_a_stage_of_the_window_had_failed():
-    """A wild measurement leads below zero, where f has no value."""
-
-    def failing():
-        system = qpmhe.System(
-            lambda x: 0.9 * np.sqrt(x), lambda x: x, n=1, p=1,
-            f_jacobian=lambda x: 0.45 / np.sqrt(x)[..., None],
-        )
-        cost = qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=0.05)
-        return qpmhe.MovingHorizonEstimator(
-            system, qpmhe.Luenberger([0.8]), cost, horizon=4, initial_state=[1.0], max_qps=2
-        )
-
-    record = [(np.array([y]), None, {}) for y in (1.0, 0.9, -3.0, *[0.8, 0.9, 0.85] * 3)]
-    for age in (0, 1):
-        estimates = compare([5 - age], 5, record, first=0.7, make=failing)
-        # The stage that failed is in the window, and older than the newest.
-        finite = [np.isfinite(one.candidate_cost) for one in estimates[-7:]]
-        assert finite == [False] * 2 + [True] * 5
-        assert estimates[-7].improved

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.errors import ModelError, OptionError
+from qpmhe.errors import ModelError
 
 from .spoil import check
 from .untraced import untraced
@@ -92,19 +92,6 @@ def test_functions_that_break_the_complex_step():
         expected = np.array([jacobian(*x) for x in points])
         size = min(np.abs(expected).max(initial=1.0), 1e3)
         compare(system.f_jacobian, points, expected, rtol=1e-6, atol=1e-6 * size)
-
-
-def test_branches():
-    """Whether NumPy orders complex numbers or not, the derivative is that of the branch taken."""
-    points = np.random.default_rng(3).uniform(-2.0, 2.0, (10, 2))
-    for f, slope in (
-        (lambda x: np.maximum(x, 0.5) * x, lambda s: 2 * s if s > 0.5 else 0.5),
-        (lambda x: np.clip(x, -0.5, 0.5), lambda s: float(-0.5 < s < 0.5)),
-        (lambda x: np.where(x > 0, x**2, x), lambda s: 2 * s if s > 0 else 1),
-        (lambda x: [max(x[0], 0.5), max(x[1], 0.5)], lambda s: float(s > 0.5)),
-    ):
-        expected = [np.diag([slope(s) for s in x]) for x in points]
-        compare(system_of(f).f_jacobian, points, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_functions_that_are_others_at_the_probes_than_where_they_are_used():
@@ -238,43 +225,3 @@ def test_right_jacobians_are_used_as_given():
 
 
 # In any unit
-
-
-def uptake(km, given=None):
-    """Two concentrations, one of which is taken up with the constant Km."""
-
-    def f(x):
-        rate = x[0] / (km + x[0])
-        return np.array([x[0] - 0.1 * km * rate, 0.9 * x[1] + 0.1 * km * rate])
-
-    def jacobian(x):
-        steep = 0.1 * km * km / (km + x[0]) ** 2 if given is None else given
-        return np.array([[1.0 - steep, 0.0], [steep, 0.9]])
-
-    return f, jacobian
-
-
-@pytest.mark.parametrize("km", [5e-9, 5e9])
-def test_given_jacobians_are_compared_in_any_unit(km):
-    system = system_of(*uptake(km))
-    for start in (0.0, 0.3, 2.0):
-        mhe = estimator(system, km, [0.3, 0.1], [start * km, km], 0.01 * km**2)
-        assert np.isfinite(mhe.update([0.5 * km]).state).all()
-    wrong, words = uptake(km, 0.05), ["f_jacobian[0, 0] is 0.95 at ", "leave it out"]
-    check(ModelError, words, estimator, system_of(*wrong), km, [0.3, 0.1], [km, km])
-    check(ModelError, words, system_of, *wrong, scales=[km, km])
-    check(OptionError, ["scales"], system_of, *wrong, scales=[0.0, 1.0])
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1e9])
-def test_a_correction_is_tried_near_the_start_in_any_unit(unit):
-    def correction(z, v):
-        # Defined near 3 units alone, and far from fits it would write into v.
-        assert abs(z[0] / unit - 3.0) < 2.0
-        if abs(v[0]) > 100.0 * unit:
-            v[0] = 0.0
-        return 0.2 * v
-
-    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
-    mhe = estimator(system, unit, qpmhe.OutputInjection(correction), [3.0 * unit], unit**2)
-    assert np.isfinite(mhe.update([3.1 * unit]).state).all()

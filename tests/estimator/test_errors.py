@@ -21,20 +21,15 @@ from qpmhe.errors import (
     ShapeError,
     WeightError,
 )
-from qpmhe.estimation.limits import LENGTHS
 
 from .spoil import A, check, cost_of, estimator, system_of, unharmed, with_input
 from .untraced import untraced
 
 TERMS = ("prior", "disturbance", "noise")
-NO_NUMBERS = ["real numbers"]
 
 
 def ode(rate=lambda x: -x, h=lambda x: x[..., :1], **options):
     return qpmhe.System.from_ode(rate, h, **{"n": 2, "p": 1, "dt": 0.1} | options)
-
-
-# Parts of an estimator
 
 
 def test_parts():
@@ -46,21 +41,12 @@ def test_parts():
         check(InvalidInputError, text, estimator, **{name: value})
     text = ["2 states and 2 outputs", "expected 2 and 1"]
     check(ShapeError, text, estimator, cost=cost_of(2, 2))
-    observer = qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=np.eye(1), noise=np.eye(1))
-    text = ["disturbance covariance has shape (1, 1)", "expected (2, 2)"]
-    check(ShapeError, text, estimator, observer=observer)
+    text = ["gain has shape (1, 2)", "(n, p) = (2, 1)"]
+    check(ShapeError, text, estimator, observer=qpmhe.Luenberger([[0.1, 0.2]]))
     check(
         InvalidInputError, ["Luenberger has no covariance", "qpmhe.ExtendedKalman"],
         estimator, cost=cost_of(prior=qpmhe.ObserverPrior()),
     )
-    for gain, kind, text in (
-        (np.ones((2, 1, 1)), ShapeError, ["gain has shape (2, 1, 1)", "(n, p) = (2, 1)"]),
-        ([[0.1], [math.inf]], InvalidInputError, ["gain is ", "inf", "finite"]),
-        ("high", InvalidInputError, ["gain is 'high'", "numbers"]),
-    ):
-        check(kind, text, lambda gain=gain: estimator(observer=qpmhe.Luenberger(gain)))
-
-
 def test_initial_states():
     system = system_of(h=lambda x: np.sqrt(x[..., :1]))
     mhe = estimator(system)
@@ -69,7 +55,7 @@ def test_initial_states():
     for state, kind, text in (
         ([[1.0, 2.0]], ShapeError, ["initial_state", "shape (1, 2)", "(2,)"]),
         ([math.inf, 1.0], InvalidInputError, ["initial_state", "[inf, 1.0]", "finite"]),
-        ([1.0, 2j], InvalidInputError, ["initial_state", "2j", *NO_NUMBERS]),
+        ([1.0, 2j], InvalidInputError, ["initial_state", "2j", "real numbers"]),
         ([-1.0, 2.0], ModelError, ["h is [nan] at the initial state [-1.0, 2.0]"]),
     ):
         check(kind, text, estimator, system, initial_state=state)
@@ -91,14 +77,10 @@ def test_weights_and_covariances():
     for name, (value, kind, text) in itertools.product(TERMS, BAD_MATRICES):
         check(kind, [f"{name} ", *text], cost_of, 2, 2, **{name: value})
         covariances = dict.fromkeys(TERMS, np.eye(2)) | {name: value}
-        for build in (qpmhe.QuadraticCost.from_covariances, qpmhe.ExtendedKalman):
-            words = text
-            if name == "disturbance" or (name == "prior" and build is qpmhe.ExtendedKalman):
-                words = [word.replace("definite", "semidefinite") for word in text]
-                if value is BAD_MATRICES[0][0]:  # singular ones will do
-                    build(**covariances)
-                    continue
-            check(kind, [f"{name} covariance ", *words], build, **covariances)
+        if name != "noise":  # singular ones will do
+            text = [word.replace("definite", "semidefinite") for word in text]
+        if name == "noise" or value is not BAD_MATRICES[0][0]:
+            check(kind, [f"{name} covariance ", *text], qpmhe.ExtendedKalman, **covariances)
 
 
 def test_sets():
@@ -107,10 +89,8 @@ def test_sets():
     for build, one, other, kind, text in (
         (Box, [0.0, 0.0], [1.0], SetError, ["(2,)", "(1,)", "equal length"]),
         (Box, [0.0, 2.0], [1.0, 1.0], SetError, ["component 1", "lower 2.0", "upper 1.0"]),
-        (Box, [-math.inf], [-math.inf], SetError, ["component 0", "upper -inf"]),
         (Polytope, np.eye(2), [1.0], SetError, ["shape (2, 2)", "bound (1,)", "(r, d) and (r,)"]),
         (Polytope, np.diag([1.0, 0.0]), [1.0] * 2, SetError, ["row 1 of matrix is zero", "leave"]),
-        (Polytope, [[1.0, 0.0]], [math.inf], InvalidInputError, ["bound is [inf]", "finite"]),
         (Polytope, [[1.0], [-1.0]], [0.0, -1.0], SetError, [*empty, "Polytope(", "2 rows"]),
         (and_, quarter, Polytope([[-1.0, 1.0]], [-1.0]), SetError, empty),
         (and_, quarter, Polytope([[1.0] * 3], [1.0]), SetError, ["dimensions 2 and 3", "equal"]),
@@ -120,9 +100,6 @@ def test_sets():
         text = [f"{name} has dimension 3", f"expected {right}"]
         check(SetError, text, system_of, **{name: Box([0.0] * 3, [1.0] * 3)})
     check(SetError, ["noises is (0.0, 1.0)", "qpmhe.Box"], system_of, noises=(0.0, 1.0))
-
-
-# Systems
 
 
 def double(x, u=None):
@@ -147,24 +124,6 @@ def test_systems():
         check(ModelError, text, system_of, **{name: double}, p=2, m=2)
     check(ModelError, ["f needs 2 arguments", "pass m"], system_of, lambda x, u: x)
     check(ModelError, ["rate returned shape (3,)", "expected (2,)"], ode, lambda x: np.ones(3))
-    check(ModelError, ["rate changes its argument in place"], ode, double)
-
-
-def test_functions_without_a_value_at_the_initial_state():
-    def odd(x):
-        if x[0] > 10.0:
-            return np.ones(3)
-        raise ValueError("out of reach")
-
-    for function, text, at in (
-        (lambda x: 1 // 0, ["h raised ZeroDivisionError: ", "[1.0, 2.0]"], 1.0),
-        (lambda x: 1.0 / (x[:1] - 1.0), ["[inf]", "initial state [1.0, 2.0]", "finite"], 1.0),
-        (odd, ["h returned shape (3,)", "expected (1,)"], 12.0),
-    ):
-        check(ModelError, text, estimator, system_of(h=function), initial_state=[at, 2.0])
-
-
-# Options
 
 
 def test_options_out_of_range():
@@ -187,15 +146,6 @@ def test_options_out_of_range():
         check(BackendError, [f"backend {value!r} is not known", *names], estimator, backend=value)
 
 
-def test_a_horizon_beyond_the_memory(monkeypatch):
-    def exhausted(*_):
-        raise MemoryError("Unable to allocate 745. GiB")
-
-    monkeypatch.setattr("qpmhe.estimation.estimator.engine_for", exhausted)
-    words = ["horizon is 10000000", "745. GiB", "take a shorter horizon"]
-    check(OptionError, words, lambda: estimator(horizon=10_000_000))
-
-
 def test_unknown_options_are_refused_with_the_known_ones():
     for make in (estimator, system_of, cost_of, qpmhe.solvers.SolverOptions):
         for kind in (OptionError, TypeError):
@@ -203,9 +153,6 @@ def test_unknown_options_are_refused_with_the_known_ones():
                 make(nonsense=1)
     with pytest.raises(OptionError, match="Did you mean max_qps"):
         estimator(max_qp=2)
-
-
-# Samples
 
 
 def begun():
@@ -254,32 +201,13 @@ def test_samples_that_do_not_fit_leave_the_estimator_as_it_was(build, wrong, sam
 # What a model raises during a step is in the estimate's message
 
 
-class UnprintableError(Exception):
-    def __str__(self):
-        raise RuntimeError("no text")
-
-
-def raising(error, above=2.0):
+def raising(text, above=2.0):
     def g(x):
         if float(np.real(x[0])) > above:
-            raise error
+            raise ValueError(text)
         return x * 1.0
 
     return g
-
-
-def scalar(f=lambda x: 0.9 * x, h=lambda x: x, observer=None, h_jacobian=None, **options):
-    return qpmhe.MovingHorizonEstimator(
-        qpmhe.System(f, h, n=1, p=1, h_jacobian=h_jacobian),
-        observer or qpmhe.Luenberger([0.5]),
-        qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0),
-        **({"horizon": 4, "initial_state": [1.0]} | options),
-    )
-
-
-def staying(h, h_jacobian=lambda x: np.eye(1), **options):
-    """The observer stays at 1, and a measurement of 0 leads every step below it."""
-    return scalar(lambda x: x, h, qpmhe.Luenberger([0.0]), h_jacobian, **options)
 
 
 def correction(z, v):
@@ -288,18 +216,20 @@ def correction(z, v):
     return 0.5 * v
 
 
-def wrong_shape(x):
-    return x if float(np.real(x[0])) < 20.0 else np.ones(3)
+def scalar(f=lambda x: 0.9 * x, h=lambda x: x, gain=0.5, h_jacobian=None, **options):
+    return qpmhe.MovingHorizonEstimator(
+        qpmhe.System(f, h, n=1, p=1, h_jacobian=h_jacobian),
+        options.pop("observer", qpmhe.Luenberger([gain])),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0),
+        **({"horizon": 4, "initial_state": [1.0]} | options),
+    )
 
 
-beyond, no_slope = (raising(ValueError(text)) for text in ("beyond the table", "no slope"))
-
-
-def test_what_fails_at_the_newest_stage():
+def test_what_fails_at_the_newest_stage_is_in_the_message():
+    beyond, no_slope = raising("beyond the table"), raising("no slope")
     for parts, text in (  # the observer is at 50 after a measurement of 100
         ({"f": beyond}, "f raised ValueError: beyond the table at x = [50."),
-        ({"h": raising(UnprintableError())}, "h raised UnprintableError at x = [50."),
-        ({"h": wrong_shape}, "h returned shape (3,)"),
+        ({"h": lambda x: x if x[0].real < 20.0 else np.ones(3)}, "h returned shape (3,)"),
         ({"h": lambda x: np.where(x > 2.0, np.nan, x)}, "not finite at x = [50."),
         ({"h": untraced(lambda x: x), "h_jacobian": lambda x: no_slope(x).reshape(1, 1) / x},
          "the Jacobian of h raised ValueError: no slope at x = [50."),
@@ -317,45 +247,24 @@ def test_what_fails_at_the_newest_stage():
     assert [mhe.update(1.0).message for _ in range(3)] == ["", "", ""]
 
 
-def test_what_a_trial_raises():
-    def below(x):
-        if float(np.real(x[0])) < 1.0:
-            raise ValueError("a negative pressure")
-        return x * 1.0
-
-    estimate = staying(below).update(0.0)
-    assert Status.NO_DECREASE in estimate.status
-    assert estimate.message.startswith("h raised ValueError: a negative pressure at x = [0.")
-    left, armed = [], False  # one error for each call to come that raises
-
-    @untraced
-    def h(x):
-        if left:
-            raise left.pop()
-        return x * 1.0
-
-    def h_jacobian(x):  # the last call before the trials
-        if armed:
-            left.extend([OSError("the table is away")] * (1 + len(LENGTHS)))
-        return np.eye(1)
-
-    mhe = staying(h, h_jacobian)
-    armed = True
+def test_what_a_trial_or_a_jacobian_raises_on_the_way_is_in_the_message():
+    """The observer stays at 1, and a measurement of 0 leads every step below it."""
+    below, slope = (raising(text, -np.inf) for text in ("a negative pressure", "no slope"))
+    given = {"f": lambda x: x, "gain": 0.0, "max_qps": 3}
+    mhe = scalar(
+        h=lambda x: x if x[0] >= 1.0 else below(x), h_jacobian=lambda x: np.eye(1), **given
+    )
     estimate = mhe.update(0.0)
     assert Status.NO_DECREASE in estimate.status
-    assert not left
-    assert estimate.message.startswith("the model or the cost raised OSError: the table is away")
-
-
-def test_where_a_jacobian_fails_on_the_way():
+    assert estimate.message.startswith("h raised ValueError: a negative pressure at x = [0.")
     for fails, text in (
-        (raising(ValueError("no slope"), -np.inf), "the Jacobian of h raised ValueError: no slope"),
+        (slope, "the Jacobian of h raised ValueError: no slope"),
         (lambda x: x * np.nan, "the Jacobian of f or h is not finite along the trajectory"),
     ):
         def h_jacobian(x, fails=fails):
             return fails(x).reshape(1, 1) if x[0] < 0.9 else np.eye(1)
 
-        estimate = staying(untraced(lambda x: x), h_jacobian, max_qps=3).update(0.0)
+        estimate = scalar(h=untraced(lambda x: x), h_jacobian=h_jacobian, **given).update(0.0)
         assert Status.IMPROVED | Status.MODEL_FAILED in estimate.status
         assert estimate.qps == 1
         assert estimate.message.startswith(text)

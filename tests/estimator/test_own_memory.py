@@ -1,6 +1,5 @@
 """What is handed out or in is never memory of the estimator; an interrupted step was not taken."""
 
-import contextlib
 
 import numpy as np
 import pytest
@@ -9,8 +8,7 @@ import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.estimation.settings import Settings
 
-from .same import Interruption, assert_same, interrupted
-from .untraced import untraced
+from .same import assert_same, interrupted
 
 BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
 # Outside of which the candidate is, now and then.
@@ -23,10 +21,6 @@ CASES = {
     "smoothed": {"arrival": "smoothed", "discount": 0.8, "warm_start": True},
     "kalman": {"kalman": True, "robust": True, "candidate": "reinitialized", "max_qps": 2},
     "compiled": {"engine": "compiled", "candidate": "reinitialized", "sets": NARROW},
-}
-BATCHES = {
-    "looped": {"warm_start": True, "max_qps": 2, "delay": 1},
-    "compiled": {"engine": "compiled"},
 }
 NEW = [0.2, 0.1]
 
@@ -205,105 +199,4 @@ def test_an_interrupted_step_was_not_taken(name, stride):
             both(actions[t])
 
 
-@pytest.mark.parametrize("where", ["f", "h", "observer", "solver"])
-def test_an_interrupt_out_of_what_the_user_wrote(where, monkeypatch):
-    fuse = [0]  # calls to the next interrupt
-
-    def ticking(name, function):
-        def call(*arguments):
-            fuse[0] -= name == where
-            if name == where and fuse[0] == 0:
-                raise KeyboardInterrupt
-            return function(*arguments)
-
-        return call
-
-    def made():
-        system = qpmhe.System(
-            untraced(ticking("f", lambda x: 0.9 * x)),
-            untraced(ticking("h", lambda x: x[..., :1] ** 2)), n=2, p=1,
-        )
-        correction = ticking("observer", lambda z, v: np.array([0.1, 0.2]) * v[0])
-        cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=np.eye(2), noise=np.eye(1))
-        mhe = qpmhe.MovingHorizonEstimator(
-            system, qpmhe.OutputInjection(correction), cost, horizon=3, initial_state=[0.5, 0.4],
-            candidate="reinitialized", warm_start=True, max_qps=2,
-        )
-        solver = mhe._engine._solver
-        monkeypatch.setattr(solver, "solve", ticking("solver", solver.solve))
-        return mhe
-
-    mhe, twin, hit = made(), made(), 0
-    for y in np.random.default_rng(2).uniform(0.0, 1.0, (12, 1)):
-        for k in range(1, 30):
-            fuse[0] = k
-            try:
-                mhe.update(y)
-            except KeyboardInterrupt:
-                hit += 1
-            else:
-                break
-        fuse[0] = 0
-        twin.update(y)
-        np.testing.assert_array_equal(mhe.state, twin.state)
-        np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
-        assert mhe.time == twin.time
-    assert hit > 11
-
-
 # Batches
-
-
-@pytest.mark.parametrize("name", BATCHES)
-def test_a_spoilt_and_interrupted_batch_goes_on_as_its_twin(name, stride):
-    if name == "compiled" and find_compiler() is None:
-        pytest.skip("there is no C compiler")
-
-    def made():
-        starts = np.full((3, 2), 0.5)
-        batch = qpmhe.BatchEstimator(
-            system_of(), qpmhe.Luenberger([0.3, 0.4]),
-            qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10.0 * np.eye(2), noise=1.0),
-            members=3, horizon=4, initial_states=starts, **BATCHES[name],
-        )
-        spoil(starts)
-        return batch
-
-    mhe, twin, generator = made(), made(), np.random.default_rng(0)
-    assert mhe.mode == name
-
-    def try_and_interrupt(do):
-        after, before = 1, mhe.time
-        while True:
-            with Interruption(after) as interruption, contextlib.suppress(KeyboardInterrupt):
-                do(mhe)
-            if interruption.count < after or mhe.time != before:
-                break
-            np.testing.assert_array_equal(mhe.states, twin.states)
-            np.testing.assert_array_equal(mhe.initial_states, twin.initial_states)
-            after += int(generator.integers(1, stride))
-        assert interruption.count < after or name == "compiled"  # C has taken the sample, whole
-
-    spoil(mhe.initial_states)
-    for t in range(14):
-        Y, U = generator.normal(0.0, 0.5, (3, 1)), generator.normal(0.0, 1.0, (3, 1))
-        Y[generator.random((3, 1)) < 0.2] = np.nan
-        expected = twin.update(Y.copy(), U.copy()) if t % 3 else None
-        if expected is None:
-            try_and_interrupt(lambda one, Y=Y, U=U: one.update(Y, U))
-            twin.update(Y, U)
-        else:
-            found = mhe.update(Y, U)
-            for field in ("trajectories", "candidates", "costs", "candidate_costs", "flags"):
-                np.testing.assert_array_equal(getattr(found, field), getattr(expected, field))
-            spoil([found, Y, U, mhe.states])
-        if t == 11:
-            try_and_interrupt(lambda one: one.reset(NEW))
-            twin.reset(NEW)
-        np.testing.assert_array_equal(mhe.states, twin.states)
-    Y, U = generator.normal(0.0, 0.5, (3, 9, 1)), np.zeros((3, 9, 1))
-    expected, found = twin.run(Y.copy(), U.copy()), mhe.run(Y, U)
-    np.testing.assert_array_equal(found.states, expected.states)
-    spoil([found, Y, U])
-    np.testing.assert_array_equal(mhe.update(Y[:, 0], U[:, 0]).states, twin.update(
-        Y[:, 0], U[:, 0]).states)

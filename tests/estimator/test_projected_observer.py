@@ -5,12 +5,10 @@ import math
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
-from scipy.optimize import nnls
 
 import qpmhe
 from qpmhe import Status
 from qpmhe.errors import SetError, ShapeError, WeightError
-from qpmhe.estimation.snapshot import read
 from qpmhe.observers.projection import NearestPoint
 
 from .systems import linear
@@ -57,49 +55,33 @@ def random_case(rng, rank):
         return convex_set, 3.0 * rng.standard_normal(n), factor
 
 
-def rows_of(convex_set):
-    """A and b of A x <= b."""
-    eye = np.eye(convex_set.dimension)
-    rows = np.vstack((eye, -eye, convex_set.matrix, -convex_set.matrix))
-    sides = np.concatenate((
-        convex_set.upper, -convex_set.lower, convex_set.row_upper, -convex_set.row_lower
-    ))
-    return rows[np.isfinite(sides)], sides[np.isfinite(sides)]
-
-
-def optimality_gap(convex_set, point, factor, found):
-    """How far the found point is from z - P A' lambda with lambda >= 0 on active rows only."""
-    rows, sides = rows_of(convex_set)
-    active, moved = rows[rows @ found > sides - 1e-8], point - found
-    if not active.size:
-        return np.linalg.norm(moved)
-    return nnls(factor @ factor.T @ active.T, moved)[1] / max(1.0, np.linalg.norm(moved))
-
-
 @pytest.mark.parametrize("rank", [None, 1, 2, 3])
-def test_projections_satisfy_the_conditions_of_optimality_and_are_those_of_cvxpy(rank):
+def test_projections_are_those_of_cvxpy(rank):
     cvxpy = pytest.importorskip("cvxpy")
     rng, reached, moved = np.random.default_rng(5), 0, 0
-    for k in range(200):
+    for _ in range(60):
         convex_set, point, factor = random_case(rng, rank)
         found = NearestPoint(convex_set)(point, factor @ factor.T)
         assert convex_set.violation(found.point) <= 1e-9
+        step = cvxpy.Variable(factor.shape[1])
+        target, inside = point + factor @ step, []
+        for rows, low, high in (
+            (np.eye(point.size), convex_set.lower, convex_set.upper),
+            (convex_set.matrix, convex_set.row_lower, convex_set.row_upper),
+        ):
+            for row, below, above in zip(rows, low, high, strict=True):
+                inside += [row @ target >= below] if np.isfinite(below) else []
+                inside += [row @ target <= above] if np.isfinite(above) else []
+        program = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(step)), inside)
+        program.solve(solver="CLARABEL")
+        assert found.reached == (program.status in ("optimal", "optimal_inaccurate"))
         if found.reached:
-            assert optimality_gap(convex_set, point, factor, found.point) < 1e-7
+            size = 1 + abs(point).max()
+            np.testing.assert_allclose(found.point, target.value, atol=1e-5 * size)
             moved += not np.array_equal(found.point, point)
         reached += found.reached
-        if k < 15:
-            rows, sides = rows_of(convex_set)
-            step = cvxpy.Variable(factor.shape[1])
-            inside = [rows @ (point + factor @ step) <= sides] if sides.size else []
-            program = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(step)), inside)
-            program.solve(solver="CLARABEL")
-            assert found.reached == (program.status in ("optimal", "optimal_inaccurate"))
-        if found.reached and k < 15:
-            expected, size = point + factor @ step.value, 1 + abs(point).max()
-            np.testing.assert_allclose(found.point, expected, atol=1e-5 * size)
-    assert reached == 200 if rank is None else 60 < reached < 200
-    assert moved > 30
+    assert reached == 60 if rank is None else 15 < reached < 60
+    assert moved > 9
 
 
 @pytest.mark.parametrize("far", [1e3, 1e17, 1e45])
@@ -114,103 +96,56 @@ def test_projections_of_far_points_are_on_their_bounds(far):
 # What is proved
 
 
-def certified(rng, n):
-    """A stable observer F = A - K C with C, K, and a metric M in which it contracts by rho."""
+def worst_excess(rng, steps, is_own):
+    """The largest excess over the one-step bound that an adversary finds.
+
+    The observer F = A - K C contracts by rho in a metric M. The adversary knows the observer's
+    next state before the true one goes on: to the corner of X that violates the bound most, if
+    any does.
+    """
+    n = int(rng.integers(2, 4))
     closed = rng.standard_normal((n, n))
     closed *= rng.uniform(0.3, 0.95) / np.abs(np.linalg.eigvals(closed)).max()
     gain, c = rng.standard_normal((n, 1)), rng.standard_normal((1, n))
     rho = 0.5 * (1.0 + np.abs(np.linalg.eigvals(closed)).max())
     metric = solve_discrete_lyapunov(closed.T / rho, np.eye(n))
-    return closed, gain, c, metric, rho
-
-
-def worst_excess(rng, steps, observer_of, bound_of):
-    """The largest excess over the one-step bound that an adversary finds.
-
-    The adversary knows the observer's next state before the true one goes on: to the corner of X
-    that violates the bound most, if any does.
-    """
-    n = int(rng.integers(2, 4))
-    closed, gain, c, metric, rho = certified(rng, n)
     a = closed + gain @ c
     lower, upper = -rng.exponential(size=n), rng.exponential(size=n)
     lower[0] = 0.0
     corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(n, -1).T
+    observer = qpmhe.Luenberger(gain, metric=metric if is_own else np.eye(n))
     mhe = estimator(
-        linear(a, c, states=qpmhe.Box(lower, upper)), observer_of(gain, metric),
+        linear(a, c, states=qpmhe.Box(lower, upper)), observer,
         start=corners[rng.integers(len(corners))],
     )
+    root = np.linalg.cholesky(metric).T
     x, z, worst, projected = corners[rng.integers(len(corners))], mhe.state, -INF, 0
-    bound = bound_of(a, c, metric, rho, gain)
+
+    def size(e):
+        return np.linalg.norm(root @ np.asarray(e).T, axis=0)
+
     for _ in range(steps):
         v = rng.standard_normal(1) * rng.choice([0.0, 0.01, 1.0])
         estimate = mhe.update(c @ x + v)
         projected += Status.OBSERVER_PROJECTED in estimate.status
         following = estimate.candidate[-1]
         nexts = np.vstack((corners, rng.uniform(lower, upper, (4, n))))
-        sizes, allowed = bound(x - z, nexts - following, nexts - a @ x, v)
-        excesses = (sizes - allowed) / (1e-12 + allowed)
+        allowed = rho * size(x - z) + size(nexts - a @ x) + size(gain @ v)
+        excesses = (size(nexts - following) - allowed) / (1e-12 + allowed)
         worst = max(worst, excesses.max())
         x, z = nexts[excesses.argmax()], following
     return worst, projected
 
 
-def lyapunov_bound(a, c, metric, rho, gain):
-    root = np.linalg.cholesky(metric).T
-
-    def size(e):
-        return np.linalg.norm(root @ np.asarray(e).T, axis=0)
-
-    return lambda e, nexts, w, v: (size(nexts), rho * size(e) + size(w) + size(gain @ v))
-
-
-Q, R = 0.3, 0.5
-
-
-def kalman_bound(a, c, metric, rho, gain):
-    """In P(t)^-1, with rho^2 = 1 - q / p and noise terms in Q^-1 and R^-1."""
-    covariance = [np.eye(len(a))]
-
-    def size(e, p):
-        return np.sqrt(np.einsum("...i,ij,...j->...", e, np.linalg.inv(p), e))
-
-    def bound(e, nexts, w, v):
-        p = covariance[0]
-        k = a @ p @ c.T / (c @ p @ c.T + R)
-        f = a - k @ c
-        covariance[0] = after = f @ p @ f.T + Q * np.eye(len(a)) + R * k @ k.T
-        contraction = np.sqrt(1.0 - Q / np.linalg.eigvalsh(after)[-1])
-        noise = np.linalg.norm(w, axis=1) / np.sqrt(Q) + abs(v) / np.sqrt(R)
-        return size(nexts, after), contraction * size(e, p) + noise
-
-    return bound
-
-
-def kalman_of(gain, metric):
-    eye = np.eye(len(gain))
-    return qpmhe.ExtendedKalman(prior=eye, disturbance=Q * eye, noise=[[R]])
-
-
-def in_own_metric(gain, metric):
-    return qpmhe.Luenberger(gain, metric=metric)
-
-
-def in_euclidean_metric(gain, metric):
-    return qpmhe.Luenberger(gain, metric=np.eye(len(gain)))
-
-
 @pytest.mark.parametrize(
-    ("runs", "steps"), [(12, 20), pytest.param(1_000, 5, marks=pytest.mark.slow)]
+    ("runs", "steps"), [(12, 20), pytest.param(60, 5, marks=pytest.mark.slow)]
 )
 def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
-    for observer_of, bound_of in (
-        (in_own_metric, lyapunov_bound), (kalman_of, kalman_bound),
-        (in_euclidean_metric, lyapunov_bound),  # which the adversary beats
-    ):
+    for is_own in (True, False):  # the adversary beats another metric
         rng = np.random.default_rng(1)
-        found = [worst_excess(rng, steps, observer_of, bound_of) for _ in range(runs)]
+        found = [worst_excess(rng, steps, is_own) for _ in range(runs)]
         worst = max(worst for worst, _ in found)
-        assert worst > 1e-2 if observer_of is in_euclidean_metric else worst < 1e-9
+        assert worst < 1e-9 if is_own else worst > 1e-2
         assert sum(projected for _, projected in found) > 0.09 * runs * steps
 
 
@@ -228,58 +163,23 @@ def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilise
     own, lyapunov = sizes(None), sizes(solve_discrete_lyapunov(CLOSED.T, np.eye(2)))
     assert own[-1] < 1e-12
     np.testing.assert_allclose(own, lyapunov, rtol=1e-6, atol=1e-30)
-
-
-def test_metrics_are_checked():
-    system = linear(CLOSED, C, states=qpmhe.Box([0.0, 0.0], [INF, INF]))
-    for kind in (
-        lambda metric: qpmhe.Luenberger(K, metric=metric),
-        lambda metric: qpmhe.OutputInjection(lambda z, v: K @ v, metric=metric),
-    ):
-        with pytest.raises(WeightError, match="metric"):
-            kind([[1.0, 2.0], [2.0, 1.0]])
-        with pytest.raises(ShapeError, match="metric has shape"):
-            estimator(system, kind(np.eye(3)), start=[0.0, 0.0])
-
-
-# The paper's observer
-
-
-def reaction(x):
-    """2A -> B; runs away from negative pressures."""
-    rate = 0.016 * x[..., 0] ** 2
-    return np.stack([x[..., 0] - 2.0 * rate, x[..., 1] + rate], axis=-1)
-
-
-def reactor(bounded=True):
-    states = qpmhe.Box([0.0, 0.0], [INF, INF]) if bounded else None
-    return qpmhe.System(reaction, lambda x: x.sum(axis=-1), n=2, p=1, states=states)
-
-
-def pressures(steps=30):
-    rng, x, found = np.random.default_rng(3), np.array([3.0, 1.0]), []
-    for _ in range(steps):
-        found.append([x.sum() + 0.1 * rng.standard_normal()])
-        x = reaction(x)
-    return np.array(found)
-
-
-# First guesses, noise-free components, degenerate sets
+    with pytest.raises(WeightError, match="metric"):
+        sizes([[1.0, 2.0], [2.0, 1.0]])
+    with pytest.raises(ShapeError, match="metric has shape"):
+        sizes(np.eye(3))
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_first_guess_outside_is_projected_with_a_warning():
-    metric = np.array([[2.0, 1.0], [1.0, 1.0]])
-    filtering = qpmhe.ExtendedKalman(
-        prior=np.linalg.inv(metric), disturbance=np.eye(2), noise=[[1.0]]
-    )
+    metric, positive = np.array([[2.0, 1.0], [1.0, 1.0]]), qpmhe.Box([0.0, 0.0], [INF, INF])
+    system = linear(0.9 * np.eye(2), np.ones((1, 2)), states=positive)
     for observer, prior in (
         (qpmhe.Luenberger([0.1, 0.1], metric=metric), np.eye(2)),
-        (qpmhe.Luenberger([0.1, 0.1]), metric), (filtering, qpmhe.ObserverPrior()),
+        (qpmhe.Luenberger([0.1, 0.1]), metric),
     ):
         cost = qpmhe.QuadraticCost(prior=prior, disturbance=np.eye(2), noise=[[1.0]])
         with pytest.warns(qpmhe.ObserverWarning, match=r"initial_state is \[-1\.0, 1\.0\]"):
-            mhe = estimator(reactor(), observer, start=[-1.0, 1.0], cost=cost)
+            mhe = estimator(system, observer, start=[-1.0, 1.0], cost=cost)
         # min 2 + 2 s + s^2 over xi = (0, 1 + s) is at s = -1.
         np.testing.assert_allclose(mhe.initial_state, [0.0, 0.0], atol=1e-12)
         np.testing.assert_array_equal(mhe.state, mhe.initial_state)
@@ -287,85 +187,5 @@ def test_a_first_guess_outside_is_projected_with_a_warning():
     with pytest.raises(qpmhe.ObserverWarning, match="outside of the state set"):
         mhe.reset([1.0, -2.0])
     assert mhe.time == 1  # as it was
-    with pytest.warns(qpmhe.ObserverWarning, match="outside of the state set"):
-        mhe.reset([1.0, -2.0])
-    assert mhe.state.min() >= 0.0
     mhe.reset([0.0, 1.0])  # on the boundary
     np.testing.assert_array_equal(mhe.state, [0.0, 1.0])
-
-
-def test_the_roll_out_restores_a_moved_noise_free_component():
-    """The level of a tank falls with an outflow; it has no noise, and cannot fall below 0."""
-    system = qpmhe.System(
-        lambda x: np.stack([x[..., 0] - 0.1 * x[..., 1], 0.9 * x[..., 1]], axis=-1),
-        lambda x: x[..., 0], n=2, p=1, states=qpmhe.Box([0.0, -1.0], [5.0, 1.0]),
-        disturbances=qpmhe.Box([0.0, -INF], [0.0, INF]),
-    )
-    cost = qpmhe.QuadraticCost.from_covariances(
-        prior=np.eye(2), disturbance=0.1 * np.eye(2), noise=[[0.01]]
-    )
-    for max_qps in (0, 1, 5):
-        mhe = estimator(
-            system, qpmhe.Luenberger([0.0, -0.3]), start=[0.2, 1.0], cost=cost, max_qps=max_qps
-        )
-        for estimate in [mhe.update([0.1]) for _ in range(6)][3:]:
-            size = np.abs(estimate.disturbances[:, 0]).max()
-            assert (estimate.candidate[:, 0] >= 0.0).all()
-            if max_qps:
-                assert size < 1e-15
-                assert Status.IMPROVED in estimate.status
-                assert estimate.dropped == ()
-            else:
-                assert size > 0.01
-                assert Status.OBSERVER_PROJECTED | Status.CANDIDATE_OUTSIDE in estimate.status
-
-
-# A prediction that says nothing
-
-
-def test_a_prediction_beyond_the_sets_width_does_not_drown_the_correction():
-    """f blows up on a part of X; where it does, the output shows the way back."""
-    box = qpmhe.Box([0.0], [3.0])
-    system = qpmhe.System(
-        lambda x: np.where(x > 2.0, 1e30, 0.9 * x), lambda x: x, n=1, p=1, states=box
-    )
-    mhe = estimator(system, qpmhe.Luenberger([0.5]), start=[2.5])
-    estimate = mhe.update([0.5])
-    assert Status.PREDICTION_OUTSIDE in estimate.status
-    np.testing.assert_allclose(estimate.state, [2.0])  # 3, the nearest to 1e30, and K v
-    # Outside but near, f(z) = 5, it is projected once: 5 - 3 is inside, and stays.
-    doubling = linear([[2.0]], np.eye(1), states=box)
-    near = estimator(doubling, qpmhe.Luenberger([1.5]), start=[2.5])
-    np.testing.assert_allclose(near.update([0.5]).state, [2.0])
-
-
-def test_a_snapshot_is_read_while_states_of_another_metric_are_in_the_window():
-    """The error is not stable at first: the metric settles while the observer is projected."""
-
-    def f(x):
-        own = 0.9 * x[..., 0] + 0.3
-        return np.stack([own, (1.5 - 0.5 * x[..., 0]) * x[..., 1] + 0.3 * x[..., 0]], axis=-1)
-
-    def made():
-        system = qpmhe.System(
-            f, lambda x: x[..., :1], n=2, p=1, states=qpmhe.Box([0.0, 0.0], [INF, 1.0])
-        )
-        cost = qpmhe.QuadraticCost(
-            prior=[[2.0, 0.9], [0.9, 1.0]], disturbance=np.eye(2), noise=np.eye(1)
-        )
-        return estimator(
-            system, qpmhe.Luenberger([0.2, 0.5]), start=[0.2, 0.9], max_qps=1, horizon=8, cost=cost,
-            engine="python",
-        )
-
-    rng, x, ys = np.random.default_rng(0), np.array([0.3, 0.9]), []
-    for _ in range(12):
-        ys.append(x[:1] + 0.3 * rng.standard_normal(1))
-        x = f(x)
-    mhe = made()
-    for y in ys:
-        estimate, again = mhe.update(y), made()
-        again.load_state_dict(mhe.state_dict())
-        np.testing.assert_array_equal(again.state, mhe.state)
-        assert Status.OBSERVER_PROJECTED in estimate.status
-    assert read(mhe.state_dict())["window"]["metric"][1]

@@ -12,32 +12,18 @@ from qpmhe.errors import InvalidInputError
 from qpmhe.estimation.snapshot import read, written
 
 from .same import assert_same, leaves
-from .untraced import untraced
 
-BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
 OPTIONS = {
-    "plain": {}, "observer alone": {"max_qps": 0}, "converged": {"max_qps": None},
-    "warm start": {"warm_start": True, "max_qps": 2}, "smoothed": {"arrival": "smoothed"},
-    "reinitialized": {"candidate": "reinitialized"}, "delayed": {"delay": 3},
-    "kalman": {"kalman": True, "candidate": "reinitialized"}, "robust": {"robust": 0.3},
-    "sets": {"sets": BOX}, "smoothed anew": {"arrival": "smoothed", "candidate": "reinitialized"},
+    "observer alone": {"max_qps": 0, "delay": 3},
+    "smoothed": {"arrival": "smoothed", "candidate": "reinitialized"},
+    "kalman": {"kalman": True, "candidate": "reinitialized"},
+    "sets": {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9]), "robust": 0.3, "warm_start": True},
 }
-ENGINES = ["untraced", "traced", "other digits"] + ["compiled"] * (find_compiler() is not None)
-engines = pytest.mark.parametrize("engine", ENGINES)
-
-
-class Rounding:
-    """A model's fused calls, whose last digits no other way of calling it has."""
-
-    def __init__(self, kernel):
-        self.kernel, self.factor = kernel, 1.0 + 4.0 * np.finfo(float).eps
-        self.prepare = kernel.prepare
-
-    def stage(self, x, u):
-        return tuple(self.factor * value for value in self.kernel.stage(x, u))
-
-    def residuals(self, trajectory, y, u):
-        return self.factor * self.kernel.residuals(trajectory, y, u)
+COMPILED = ["compiled"] * (find_compiler() is not None)
+engines = pytest.mark.parametrize("engine", ["untraced", *COMPILED])
+WEIGHTS = {"prior": np.eye(2), "disturbance": 10.0 * np.eye(2), "noise": np.eye(1)}
+RECORD = np.random.default_rng(0).normal(0.0, 0.6, (30, 2))
+RECORD[7, 0] = np.nan
 
 
 class Pendulum:
@@ -57,24 +43,13 @@ class Pendulum:
 
 def system_of(engine, swing=1.0, bend=0.1, **sets):
     options = {"n": 2, "p": 1, "m": 1, "dt": 0.1, "method": "euler", **sets}
-    if engine == "other digits":
-        ca = pytest.importorskip("casadi")
-        system = qpmhe.from_casadi(
-            lambda x, u: [x[1], u[0] - swing * ca.sin(x[0])],
-            lambda x, u: x[0] + bend * x[0] ** 2, **options,
-        )
-        system.kernel = Rounding(system.kernel)
-        return system
     pendulum = Pendulum(swing, bend, engine == "untraced")
     return qpmhe.System.from_ode(pendulum.rate, pendulum.h, **options)
 
 
-WEIGHTS = {"prior": np.eye(2), "disturbance": 10.0 * np.eye(2), "noise": np.eye(1)}
-
-
 def made(
-    engine="untraced", sets=None, kalman=False, robust=0.0, system=None, observer=None,
-    weights=None, **options,
+    engine="untraced", kalman=False, robust=0.0, system=None, observer=None, weights=None,
+    states=None, **options,
 ):
     weights = WEIGHTS | (weights or {})
     if robust:
@@ -83,15 +58,11 @@ def made(
         observer = qpmhe.ExtendedKalman(**WEIGHTS)
         weights["prior"] = qpmhe.ObserverPrior()
     return qpmhe.MovingHorizonEstimator(
-        system or system_of(engine, **(sets or {})), observer or qpmhe.Luenberger([0.3, 0.4]),
+        system or system_of(engine, states=states), observer or qpmhe.Luenberger([0.3, 0.4]),
         (qpmhe.RobustCost if robust else qpmhe.QuadraticCost)(**weights),
         **{"horizon": 4, "initial_state": [0.5, 0.0],
            "engine": engine if engine == "compiled" else "python"} | options,
     )
-
-
-RECORD = np.random.default_rng(0).normal(0.0, 0.6, (30, 2))
-RECORD[7, 0] = np.nan
 
 
 def feed(mhe, first, last):
@@ -116,17 +87,15 @@ def same(found, expected):
         assert_same(one, other)
 
 
-@engines
+@pytest.mark.parametrize("engine", ["untraced", "traced", *COMPILED])
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_restored_estimator_continues_bit_for_bit(name, engine):
     options = OPTIONS[name]
-    for stop in (0, 1, 8, 12):
-        whole, loaded = fed(stop, engine, **options), made(engine, **options)
-        others = [loaded]
-        if engine != "other digits":
-            others.append(pickle.loads(pickle.dumps(whole)))
+    for stop in (0, 1, 12):
+        whole = fed(stop, engine, **options)
+        others = [made(engine, **options), pickle.loads(pickle.dumps(whole))]
         state = whole.state_dict()
-        loaded.load_state_dict(state)
+        others[0].load_state_dict(state)
         for value in state.values():  # the estimator has taken a copy
             if isinstance(value, np.ndarray) and value.dtype == np.float64:
                 value[...] = np.nan
@@ -134,15 +103,11 @@ def test_a_restored_estimator_continues_bit_for_bit(name, engine):
         for mhe in others:
             same(feed(mhe, stop, 20), expected)
             np.testing.assert_array_equal(mhe.covariances(), covariances)
-    new = made(engine, **options)
-    for mhe in (whole, loaded, new):
-        mhe.reset()
-    expected = feed(new, 0, 14)
-    same(feed(whole, 0, 14), expected)
-    same(feed(loaded, 0, 14), expected)
+    whole.reset()
+    same(feed(whole, 0, 14), feed(made(engine, **options), 0, 14))
 
 
-@pytest.mark.parametrize("engine", [name for name in ENGINES if name in ("untraced", "compiled")])
+@engines
 def test_files_without_pickle_keep_every_bit(engine, tmp_path):
     mhe, others = fed(15, engine, kalman=True), [made(engine, kalman=True) for _ in range(2)]
     np.savez(tmp_path / "state.npz", **mhe.state_dict())
@@ -158,56 +123,42 @@ def test_files_without_pickle_keep_every_bit(engine, tmp_path):
 # States of other estimators
 
 
-def others(engine):
-    """Estimators that differ in one thing, with the word that must name it."""
-    name = "disturbances" if engine == "compiled" else "states"
-    return {
+def injection(gain):
+    return qpmhe.OutputInjection(lambda z, v: gain * np.tanh(v[0]) * np.ones(2))
+
+
+@engines
+def test_the_state_of_another_estimator_is_refused_by_name(engine):
+    others = {  # estimators that differ in one thing, with the word that must name it
         "cost.prior": {"weights": {"prior": 1.1 * np.eye(2)}},
         "cost.disturbance": {"weights": {"disturbance": 9.0 * np.eye(2)}},
         "cost.noise": {"weights": {"noise": 1.001 * np.eye(1)}},
         "cost.discount": {"weights": {"discount": 0.9}},
         "observer.gain": {"observer": qpmhe.Luenberger([0.3, 0.41])},
-        "another observer": {"kalman": True},
-        "another cost": {"robust": 1.0},
-        f"set of {name}": {"sets": {name: qpmhe.Box([-5.0, -5.0], [5.0, 5.0])}},
+        "another observer": {"kalman": True}, "another cost": {"robust": 1.0},
+        "set of states": {"states": qpmhe.Box([-5.0, -5.0], [5.0, 5.0])},
         "model": {"system": system_of(engine, swing=1.001)},
         "(h)": {"system": system_of(engine, bend=0.1001)},
         "candidate": {"candidate": "reinitialized"},
         "expected": {"horizon": 5}, "another arrival": {"arrival": "smoothed"},
     }
-
-
-@engines
-@pytest.mark.parametrize("count", [0, 1, 15])
-def test_the_state_of_another_estimator_is_refused_by_name(engine, count):
-    state = fed(count, engine).state_dict()
-    for name, options in others(engine).items():
-        mhe = fed(3, engine, **options)
-        before = leaves(mhe.state_dict())
-        with pytest.raises(InvalidInputError) as error:
-            mhe.load_state_dict(state)
-        assert name in str(error.value), (name, str(error.value))
-        assert leaves(mhe.state_dict()) == before
+    for count in (0, 15):
+        state = fed(count, engine).state_dict()
+        for name, options in others.items():
+            mhe = fed(3, engine, **options)
+            before = leaves(mhe.state_dict())
+            with pytest.raises(InvalidInputError) as error:
+                mhe.load_state_dict(state)
+            assert name in str(error.value), (name, str(error.value))
+            assert leaves(mhe.state_dict()) == before
     # With the description taken away, the second computation of the stages shows it.
     for name in ("cost.disturbance", "cost.noise", "observer.gain", "model", "(h)"):
-        mhe = made(engine, **others(engine)[name])
+        mhe = made(engine, **others[name])
         described = read(mhe.state_dict())["estimator"]
-        if count == 15:
-            with pytest.raises(InvalidInputError, match="another"):
-                mhe.load_state_dict(written({**read(state), "estimator": described}))
-
-
-def test_functions_of_other_observers_and_losses_are_refused():
-    def injection(gain):
-        return qpmhe.OutputInjection(lambda z, v: gain * np.tanh(v[0]) * np.ones(2))
-
-    for one, another in (
-        ({"observer": injection(0.3)}, {"observer": injection(0.31)}),
-        ({"observer": injection(0.3)}, {}), ({"kalman": True}, {}),
-        ({"robust": 1.0}, {"robust": 1.5}), ({"robust": 1.0}, {}),
-    ):
-        with pytest.raises(InvalidInputError, match=r"another (observer|cost|weight)"):
-            made(**another).load_state_dict(fed(9, **one).state_dict())
+        with pytest.raises(InvalidInputError, match="another"):
+            mhe.load_state_dict(written({**read(state), "estimator": described}))
+    with pytest.raises(InvalidInputError, match="another observer"):
+        made(observer=injection(0.31)).load_state_dict(fed(9, observer=injection(0.3)).state_dict())
 
 
 @engines
@@ -215,8 +166,7 @@ def test_caps_and_policies_may_change(engine):
     """The observer's part is the same then; terms that were not there are computed."""
     for first, second in (
         ({"max_qps": 0}, {"max_qps": 2}), ({"max_qps": 3}, {"max_qps": 0}),
-        ({}, {"max_qps": None, "tolerance": 1e-6, "solver_tolerance": 1e-5, "delay": 1}),
-        ({}, {"warm_start": True, "max_qps": None, "max_solver_iterations": 70}),
+        ({}, {"warm_start": True, "max_qps": None, "tolerance": 1e-6, "delay": 1}),
         ({"infeasible": "keep_candidate"}, {"infeasible": "drop_rows"}),
     ):
         other, fresh = made(engine, **second), fed(12, engine, **second)
@@ -230,16 +180,6 @@ def test_caps_and_policies_may_change(engine):
 # Damage
 
 
-def leaf_paths(value, path=()):
-    items = (
-        value.items() if isinstance(value, dict)
-        else enumerate(value) if isinstance(value, (list, tuple)) else ()
-    )
-    return [path] * bool(path) + [
-        one for key, item in items for one in leaf_paths(item, (*path, key))
-    ]
-
-
 def replaced(value, path, new):
     if not path:
         return new
@@ -250,154 +190,25 @@ def replaced(value, path, new):
     )
 
 
-JUNK = [
-    None, 3, -1, 2**70, 0.5, np.nan, True, "text", b"bytes", [], {}, [[1, 2], [3]], object(),
-    np.zeros(0), np.zeros((3, 3)), np.array(1.25), np.array(["a"]), np.full(2, np.nan),
-]
-# What no computation confirms: estimates of the past, the covariance at the window's start, and
-# what a model that failed had before.
-UNCONFIRMED = [
-    ("history",), ("trajectory",), ("watched",), ("modes",), ("memory",), ("methods",),
-    ("linearized",), *(("window", name) for name in (
-        "earlier", "earlier_covariance", "time", "covariance", "y", "u", "irregular", "linear",
-        "panel", "gradient", "next_gradient",
-    )),
-]
-
-
-def mutated(state, generator):
-    """A state with some part of it replaced, and where."""
-    paths = leaf_paths(state)
-    path, old = paths[generator.integers(len(paths))], state
-    for key in path:
-        old = old[key]
-    kind, new = generator.integers(5), JUNK[generator.integers(len(JUNK))]
-    if isinstance(old, np.ndarray) and kind:
-        new = old.copy()
-        if kind == 1 and old.ndim:
-            new = new[:-1] if old.shape[0] else np.zeros((1, *old.shape[1:]), old.dtype)
-        elif kind == 2:
-            new = new.astype(np.float32 if old.dtype == np.float64 else np.int64)
-        elif new.size and new.dtype == np.float64:
-            k = generator.integers(new.size)
-            new.flat[k] = generator.choice([np.nan, np.inf, -7.0, 1.5 * new.flat[k] + 0.1])
-        elif new.size:
-            k = generator.integers(new.size)
-            new.flat[k] = ~new.flat[k]
-    elif isinstance(old, (list, tuple)) and kind == 1 and old:
-        new = old[:-1]
-    elif isinstance(old, int) and kind == 1:
-        new = old + int(generator.integers(1, 50)) * (1 if generator.random() < 0.5 else -1)
-    return path, replaced(state, path, new)
-
-
-@pytest.mark.parametrize(
-    ("engine", "name"),
-    [(engine, name) for engine in ENGINES
-     for name in ("plain", "reinitialized", "kalman", "robust", "smoothed")
-     if engine != "compiled" or name in ("plain", "reinitialized")],
-)
-def test_damaged_states_are_refused_whole_or_harmless(engine, name):
-    options, generator, refused = OPTIONS[name], np.random.default_rng(3), 0
-    mhe, twin = (fed(11, engine, **options) for _ in range(2))
-    state = read(fed(15, engine, **options).state_dict())
-    for _ in range(90):
-        path, damaged = mutated(state, generator)
-        if leaves(damaged) == leaves(state):
-            continue
-        try:
-            mhe._engine.load_state_dict(damaged)
-        except InvalidInputError:
-            refused += 1
-        else:
-            assert path[:1] in UNCONFIRMED or path[:2] in UNCONFIRMED, path
-            mhe.update(np.zeros(1), np.zeros(1))
-            mhe = fed(11, engine, **options)
-        np.testing.assert_array_equal(mhe.state, twin.state)
-    assert refused > 55
-    same(feed(mhe, 11, 16), feed(twin, 11, 16))
-
-
 def test_damage_that_was_seen():
     state, mhe = read(fed().state_dict()), fed(6)
     before, own = leaves(mhe.state_dict()), ("window", "own")
     half = state["trajectory"].copy()
     half[0] = np.nan
     for path, value in (
-        (("modes",), [[1, 2], [3]]), (("modes",), ["batched", "mixed"]), (("modes",), ["batched"]),
-        (("methods",), ["given", "given"]), (own, None), (own, {-3: {"noise_weight": np.eye(1)}}),
-        (own, {14: {"noise_weight": -np.eye(1)}}), (own, {14: {"noise_weight": 3.0}}),
-        (own, {14: []}), (own, {14: {"sampled": np.ones(2, np.bool_)}}),
-        (own, {14: {"colour": np.zeros(2)}}), (own, {14: {"states": {"lower": np.zeros(2)}}}),
+        (("modes",), ["batched"]), (own, None), (own, {-3: {"noise_weight": np.eye(1)}}),
+        (own, {14: {"noise_weight": -np.eye(1)}}), (own, {14: []}),
         (("usual",), {"noise_weight": 3.0 * np.eye(1)}), (("window", "time"), -1),
         (("window", "z"), np.zeros((5, 2))), (("watched",), (0, 16)), (("estimator",), {}),
-        (("engine",), "compiled"), (("problem",), (2, 1)), (("history",), [[1.0, 2.0, 3.0]]),
-        (("history",), []), (("trajectory",), np.zeros((5, 2))), (("trajectory",), half),
-        (("window", "covariance"), np.zeros((5, 2, 2))),
+        (("problem",), (2, 1)), (("history",), [[1.0, 2.0, 3.0]]), (("trajectory",), half),
     ):
         with pytest.raises(InvalidInputError, match="the state is"):
             mhe._engine.load_state_dict(replaced(state, path, value))
         assert leaves(mhe.state_dict()) == before
-
-
-def test_what_is_no_state_is_refused_with_what_is_missing():
-    state = fed(8).state_dict()
-    del state["trajectory"]
     for wrong, words in (
         (3, "the state is a int; expected the dict that state_dict returned"),
         ({}, r"the state has no 'structure' \(it is empty\); expected the whole dict"),
-        ({"z": 1}, r"the state has no 'structure' \(only 'z'\)"),
-        (state, "the state has no 'trajectory'"), (written({}), "None"),
         (written({"problem": (2, 1, 1, 7)}), r"2, 1, 1, 7.; expected .2, 1, 1, 4"),
     ):
         with pytest.raises(InvalidInputError, match=words):
             made().load_state_dict(wrong)
-
-
-# The System
-
-
-def test_estimators_of_one_system_do_not_change_each_other():
-    def branching(x):  # decides for a batch by its first state
-        return x[..., :1] * (1.0 if np.ravel(x)[0] < 1.5 else 1.1)
-
-    def bent(x):  # the complex step is right on one side only
-        return np.where(x.real < 50.0, 0.9 * x, np.abs(x))
-
-    def estimator(system, start=(1.0, 1.0)):
-        return made(system=system, initial_state=start, observer=qpmhe.Luenberger([0.3, 0.1]))
-
-    system = qpmhe.System(untraced(bent), branching, n=2, p=1)
-    before = system.call_modes(), system.f_jacobian.method
-    one, other = estimator(system), estimator(system)
-    alone = estimator(qpmhe.System(untraced(bent), branching, n=2, p=1))
-    far = estimator(system, (80.0, 90.0))
-    assert far._own_system.f_jacobian.method == "finite differences" != before[1]
-    state, generator = read(one.state_dict()), np.random.default_rng(0)
-    state["modes"], state["methods"] = ["looped"] * 2, ["finite differences"] * 2
-    for t in range(40):
-        y = generator.uniform(0.0, 4.0, 1)
-        assert_same(other.update(y), alone.update(y))
-        one.update(generator.uniform(0.0, 4.0, 1))
-        if t % 10 == 5:
-            one.load_state_dict(written(state))
-            one.reset([1.4, 1.0])
-        assert (system.call_modes(), system.f_jacobian.method) == before
-
-
-def test_how_models_of_other_steps_are_called_goes_along():
-    def rate(x):
-        x = np.asarray(x.tolist())  # loses the batch axis
-        return -x * (1.0 if x[..., 0].max() < 8.5 else 1.001)
-
-    def estimator():
-        system = qpmhe.System.from_ode(rate, lambda x: x[..., :1], dt=0.1, n=2, p=1)
-        return made(system=system)
-
-    one, other = estimator(), estimator()
-    for y in np.random.default_rng(0).uniform(0.0, 10.0, 40):
-        one.update(y, dt=0.11)
-    one._own_system.timed.f.mode = "looped"
-    other.load_state_dict(one.state_dict())
-    assert other._own_system.timed.f.mode == "looped"
-    assert other.system.timed.f.mode == "batched"

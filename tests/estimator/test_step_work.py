@@ -1,4 +1,4 @@
-"""How much work a step does, counted and not timed."""
+"""How much work a step does, counted and not timed, and which rows its QP has."""
 
 import sys
 import tracemalloc
@@ -55,9 +55,8 @@ def test_the_model_is_evaluated_once_at_each_new_observer_state(max_qps):
     assert many.get("A", 0) == max(0, max_qps - 1) * 20
 
 
-@pytest.mark.parametrize("options", [{}, {"max_qps": 2, "warm_start": True}], ids=["one", "two"])
-def test_memory_does_not_grow(options):
-    mhe = estimator(**options)
+def test_memory_does_not_grow():
+    mhe = estimator(max_qps=2, warm_start=True)
 
     def steps(count):
         for _ in range(count):
@@ -66,24 +65,20 @@ def test_memory_does_not_grow(options):
 
     steps(10)
     tracemalloc.start()
-    steps(5)
+    steps(3)
     before = tracemalloc.get_traced_memory()[0]
-    steps(20)
+    steps(12)
     after = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    assert after - before < 16_000  # bytes: less than one object a step
+    assert after - before < 10_000  # bytes: less than one object a step
 
 
 # What the steps take now, and a tenth of slack: a guard against creeping growth that no
 # clock has to see.
-@pytest.mark.parametrize(
-    ("options", "most"),
-    [
-        ({"max_qps": 0}, 96), ({"max_qps": 1}, 132), ({"max_qps": 2}, 222),
-        ({"engine": "compiled", "backend": "auto"}, 12),
-    ],
-    ids=["no QP", "one QP", "two QPs", "compiled"],
-)
+@pytest.mark.parametrize(("options", "most"), [
+    ({"max_qps": 0}, 96), ({"max_qps": 1}, 132), ({"max_qps": 2}, 222),
+    ({"engine": "compiled", "backend": "auto"}, 12),
+], ids=["no QP", "one QP", "two QPs", "compiled"])
 def test_a_step_takes_no_more_calls_than_it_did(options, most):
     mhe, counts = estimator(**options), []
     if mhe.engine != options.get("engine", "python"):
