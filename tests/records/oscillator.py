@@ -16,42 +16,24 @@ def output(x):
     return x[..., :1] + 0.1 * x[..., :1] ** 3
 
 
-def _rest():
-    observer = qpmhe.Luenberger([[0.3], [0.1]])
+def continuous():
+    """Steps of any length; bounds that bind."""
+    states = qpmhe.Box([-0.5, -1.0], [0.7, 1.0])
+    system = qpmhe.System.from_ode(rate, output, dt=DT, n=2, p=1, m=1, states=states)
     cost = qpmhe.QuadraticCost.from_covariances(
         prior=np.eye(2), disturbance=1e-4 * np.eye(2), noise=[[0.01]]
     )
-    options = {
+    return system, qpmhe.Luenberger([[0.3], [0.1]]), cost, {
         "horizon": 6, "initial_state": [0.5, 0.0], "states": ["position", "speed"], "max_qps": 2,
     }
-    return observer, cost, options
 
 
-def continuous(bounded=True):
-    """Steps of any length; bounds that bind."""
-    states = qpmhe.Box([-0.5, -1.0], [0.7, 1.0]) if bounded else None
-    system = qpmhe.System.from_ode(rate, output, dt=DT, n=2, p=1, m=1, states=states)
-    return system, *_rest()
-
-
-def fused():
-    """A model that is evaluated over a whole window in one call."""
-    import casadi as ca
-
-    system = qpmhe.from_casadi(
-        lambda x, u: ca.vertcat(x[1], -x[0] - 0.5 * x[1] + u[0]), lambda x: x[0] + 0.1 * x[0] ** 3,
-        n=2, m=1, dt=DT,
-    )
-    return system, *_rest()
-
-
-def discrete(dt=None):
+def discrete():
     """Equal steps, two outputs, no inputs, nothing optional but what is needed."""
     system = qpmhe.System(lambda x: x @ A.T, lambda x: x, n=2, p=2)
-    observer = qpmhe.Luenberger(0.3 * np.eye(2))
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=100 * np.eye(2), noise=np.eye(2))
     options = {"horizon": 5, "initial_state": [0.0, 0.0]}
-    return system, observer, cost, options if dt is None else {**options, "dt": dt}
+    return system, qpmhe.Luenberger(0.3 * np.eye(2)), cost, options
 
 
 def lines(samples, seed=0, irregular=True, gaps=0.03):

@@ -1,4 +1,4 @@
-"""What is written is what the estimator gives, sample by sample."""
+"""What is written is what the estimator gives; and the options of the command."""
 
 import csv
 from pathlib import Path
@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.errors import OptionError
+from qpmhe.errors import InvalidInputError, OptionError
+from qpmhe.records import CheckpointError
 
 from .oscillator import DT, continuous, discrete, lines
-from .tools import CONTINUOUS, DISCRETE, estimate, put
+from .tools import CONTINUOUS, DISCRETE, command, cut_off, estimate, get, put
 
 pd = pytest.importorskip("pandas")
 
@@ -31,35 +32,11 @@ def values(frame, prefix):
     return frame[[name for name in frame if name.startswith(prefix)]].to_numpy()
 
 
-def test_a_zoo_model_gives_what_run_gives(here):
-    system, observer, cost, scenario = qpmhe.models.battery_cell()
-    _, Y, U = scenario.simulate(seed=3, steps=70)
-    frame = pd.DataFrame({"Time (s)": 5.0 * np.arange(70), "Y": Y[:, 0], "u [A]": U[:, 0]})
-    frame.to_csv("record.csv", index=False)
-    summary = estimate("battery_cell", max_qps=2, horizon=20, step_time=True)
-    run = qpmhe.MovingHorizonEstimator(
-        system, observer, cost, horizon=20, initial_state=scenario.initial_estimate, max_qps=2
-    ).run(Y, U)
-    out = read("out.csv")
-    for name, expected in (
-        ("filtered_", run.filtered), ("predicted_", run.states[1:]), ("cost", run.costs[:, None]),
-        ("candidate_cost", run.candidate_costs[:, None]), ("qps", run.qps[:, None]),
-        ("time", 5.0 * np.arange(70)[:, None]),
-    ):
-        np.testing.assert_array_equal(values(out, name), expected)
-    assert out["status"].tolist() == [str(s).removeprefix("Status.") for s in run.statuses]
-    assert (out["step_time"] > 0).all()
-    assert list(out)[1:4] == [f"filtered_{label}" for label in scenario.labels]
-    assert (summary.samples, summary.before, summary.inserted, summary.held) == (70, 0, 0, 0)
-    assert summary.improved == sum(qpmhe.Status.IMPROVED in s for s in run.statuses)
-    assert estimate("battery_cell", out="observer.csv", max_qps=0).improved == 0
-
-
 def by_hand(text):
     """The same record by single updates, written down independently."""
-    system, observer, cost, options = continuous()
+    *parts, options = continuous()
     assert options.pop("states") == ["position", "speed"]
-    mhe = qpmhe.MovingHorizonEstimator(system, observer, cost, **options)
+    mhe = qpmhe.MovingHorizonEstimator(*parts, **options)
     table = list(csv.DictReader(text))
     held, filtered, deviations, inserted, extra = None, [], [], [], 0
     for row, following in zip(table, [*table[1:], None], strict=True):
@@ -90,7 +67,7 @@ def test_irregular_steps_gaps_and_blanks_are_single_updates(here):
     assert summary.incomplete == sum(",," in line for line in text) > 0
 
 
-def test_a_gap_of_a_discrete_model_is_missing_samples(here):
+def test_a_discrete_record_gives_what_run_gives_and_gaps_are_missing_samples(here):
     generator = np.random.default_rng(0)
     Y = generator.standard_normal((20, 2))
     kept = [t for t in range(20) if t not in (7, 8, 12)]
@@ -100,26 +77,31 @@ def test_a_gap_of_a_discrete_model_is_missing_samples(here):
         "y1": Y[kept, 0], "y2": Y[kept, 1],
     })
     frame.to_csv("record.csv", index=False)
-    estimate(DISCRETE, dt=DT, covariances="full")
-    system, observer, cost, options = discrete()
-    mhe = qpmhe.MovingHorizonEstimator(system, observer, cost, **options)
-    gappy = Y.copy()
-    gappy[[7, 8, 12]] = np.nan
-    run, out = mhe.run(gappy, covariances=True), read("out.csv")
-    upper = run.covariances[kept][:, [0, 0, 1], [0, 1, 1]]
-    np.testing.assert_array_equal(values(out, "filtered_"), run.filtered[kept])
-    np.testing.assert_array_equal(values(out, "predicted_"), run.states[1:][kept])
-    np.testing.assert_array_equal(values(out, "cov_predicted_"), upper)
+    summary = estimate(DISCRETE, dt=DT, covariances="full", step_time=True)
+    *parts, options = discrete()
+    mhe = qpmhe.MovingHorizonEstimator(*parts, **options)
+    Y[[7, 8, 12]] = np.nan
+    run, out = mhe.run(Y, covariances=True), read("out.csv")
+    for name, expected in (
+        ("filtered_", run.filtered), ("predicted_", run.states[1:]), ("cost", run.costs[:, None]),
+        ("cov_predicted_", run.covariances[:, [0, 0, 1], [0, 1, 1]]),
+        ("candidate_cost", run.candidate_costs[:, None]), ("qps", run.qps[:, None]),
+    ):
+        np.testing.assert_array_equal(values(out, name), expected[kept])
+    assert out["status"].tolist() == [
+        str(run.statuses[k]).removeprefix("Status.") for k in kept]
+    assert (out["step_time"] > 0).all()
     assert out["inserted"].tolist() == [{9: 2, 13: 1}.get(t, 0) for t in kept]
+    assert (summary.samples, summary.inserted, summary.held) == (17, 3, 0)
+    assert summary.improved == sum(qpmhe.Status.IMPROVED in run.statuses[k] for k in kept)
     # An output that the record lacks is missing throughout.
     estimate(DISCRETE, out="half.csv", dt=DT, outputs="y1=y1,y2=")
     mhe.reset()
-    gappy[:, 1] = np.nan
-    filtered = mhe.run(gappy).filtered[kept]
-    np.testing.assert_array_equal(values(read("half.csv"), "filtered_"), filtered)
+    Y[:, 1] = np.nan
+    np.testing.assert_array_equal(values(read("half.csv"), "filtered_"), mhe.run(Y).filtered[kept])
 
 
-def test_parquet_in_and_out_is_the_same_as_csv_and_dates_count_in_seconds(here):
+def test_parquet_in_and_out_is_the_same_as_csv(here):
     pytest.importorskip("pyarrow")
     put("record.csv", lines(40))
     frame = read("record.csv")
@@ -127,43 +109,68 @@ def test_parquet_in_and_out_is_the_same_as_csv_and_dates_count_in_seconds(here):
     estimate(CONTINUOUS, covariances="full")
     estimate(CONTINUOUS, "record.parquet", "deeper/out.parquet", covariances="full")
     found, expected = pd.read_parquet("deeper/out.parquet"), read("out.csv")
-    assert list(found) == list(expected)
-    assert len(found) == 40
-    for name in found:
-        assert found[name].tolist() == expected[name].tolist(), name
+    pd.testing.assert_frame_equal(found, expected, check_exact=True, check_dtype=False)
     assert [item.name for item in Path("deeper").iterdir()] == ["out.parquet"]
-    frame["time"] = pd.to_datetime(frame["time"], unit="s", origin="2026-03-01", utc=True)
-    frame["time"] = frame["time"].dt.round("us")
-    frame.to_parquet("dated.parquet")
-    frame.to_csv("dated.csv", index=False)
-    for name in ("dated.csv", "dated.parquet"):
-        estimate(CONTINUOUS, name, "dated.out.parquet", overwrite=True)
-        dated = pd.read_parquet("dated.out.parquet")
-        np.testing.assert_allclose(
-            values(dated, "filtered_"), values(expected, "filtered_"), rtol=1e-12, atol=1e-14
-        )
-        assert dated["time"].tolist() == frame["time"].tolist()
-
-
-MISFITS = [
-    ({"covariances": "some"}, "none, std, full"),
-    ({"outputs": "y3=y1"}, "y1, y2"), ({"outputs": "y1=y1,y1=y2"}, "twice"),
-    ({"outputs": "y1=,y2="}, "all outputs"),
-    ({"outputs": "y1=time"}, "'time' is both the time and"),
-    ({"inputs": "u1=y1"}, "no inputs"),
-    ({"separator": "ab"}, "separator"), ({"encoding": "klingon"}, "klingon"),
-    ({"time_scale": 0.0}, "time-scale"), ({"max_gap": -1}, "max-gap"), ({"dt": "x"}, "dt"),
-    ({"checkpoint_every": 0}, "checkpoint-every"), ({"horizon": 0}, "horizon"),
-    ({"backend": "none"}, "none"),
-]
 
 
 def test_options_that_do_not_fit(here):
     put("record.csv", ["time,y1,y2", "0,1,2"])
-    for options, words in MISFITS:
-        with pytest.raises(qpmhe.errors.InvalidInputError, match=words):
-            estimate(DISCRETE, **options)
+    for options, words in (
+        ({"covariances": "some"}, "none, std, full"),
+        ({"outputs": "y3=y1"}, "y1, y2"), ({"inputs": "u1=y1"}, "no inputs"),
+        ({"outputs": "y1=time"}, "'time' is both the time and"),
+        ({"separator": "ab"}, "separator"), ({"encoding": "klingon"}, "klingon"),
+        ({"time_scale": 0.0}, "time-scale"), ({"max_gap": -1}, "max-gap"), ({"dt": "x"}, "dt"),
+        ({"checkpoint_every": 0}, "checkpoint-every"), ({"missing": [" "]}, "--missing"),
+        ({"model": CONTINUOUS, "dt": 0.2}, "model's step is"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            estimate(**{"model": DISCRETE} | options)
         assert not Path("out.csv").exists(), options
-    put("record.csv", lines(3))
-    with pytest.raises(OptionError, match="model's step is"):
-        estimate(CONTINUOUS, dt=0.2)
+    for option, value, words in (("--max-qps", "many", "'none'"), ("--engine", "steam", "steam"),
+                                 ("--initial-state", "0;1", "separated by commas")):
+        answer = command(DISCRETE, "record.csv", option, value)
+        assert isinstance(answer.exception, OptionError)
+        assert (words in str(answer.exception), answer.stdout) == (True, "")
+
+
+@pytest.mark.parametrize(("arguments", "options"), [
+    ("--horizon 3 --backend osqp --max-qps none --max-solver-iterations 7 --missing n/a",
+     {"horizon": 3, "backend": "osqp", "max_qps": None, "max_solver_iterations": 7,
+      "missing": ["n/a"]}),
+    ("--max-qps 0 --max-solver-iterations none --initial-state -0.1,0.25 --time-format %S.%f",
+     {"max_qps": 0, "max_solver_iterations": None, "initial_state": [-0.1, 0.25],
+      "time_format": "%S.%f"}),
+    ("--covariances full --time TIME --outputs y=u --inputs u1=u --skip-repeated --skip-lines 0",
+     {"covariances": "full", "time": "TIME", "outputs": "y=u", "inputs": "u1=u",
+      "skip_repeated": True, "skip_lines": 0}),
+    ("--separator comma --decimal . --encoding latin-1 --checkpoint-every 7 --time-scale 0.5",
+     {"separator": ",", "decimal": ".", "encoding": "latin-1", "checkpoint_every": 7,
+      "time_scale": 0.5}),
+    ("--max-gap 0 --equal-steps --dt 0.1", {"max_gap": 0, "equal_steps": True, "dt": 0.1}),
+])
+def test_options_are_handed_on(here, arguments, options):
+    put("record.csv", lines(12))
+    expected = ""
+    try:
+        estimate(CONTINUOUS, out="expected.csv", **options)
+    except InvalidInputError as error:
+        expected = str(error).replace("expected.csv", "out.csv")
+    answer = command(
+        CONTINUOUS, "record.csv", "--out", "out.csv", "--no-step-time", *arguments.split()
+    )
+    assert str(answer.exception or "") == expected
+    assert get("out.csv") == get("expected.csv") != b""
+
+
+def test_standard_output_is_the_default_and_files_are_resumed_or_replaced(here):
+    cut_off(lines(30), 20, checkpoint_every=5)
+    options = ("--checkpoint-every", "5", "--no-step-time")
+    again = (CONTINUOUS, "record.csv", "--out", "out.csv", *options)
+    assert isinstance(command(*again).exception, CheckpointError)
+    assert "15 samples after 15 before" in command(*again, "--resume").stderr
+    whole = get("out.csv")
+    assert "30 samples" in command(*again, "--overwrite").stderr
+    assert get("out.csv") == whole
+    piped = command(CONTINUOUS, "-", *options, "--quiet", text=get("record.csv"))
+    assert (piped.stdout_bytes, piped.stderr) == (whole, "")

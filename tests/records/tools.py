@@ -3,16 +3,20 @@
 import io
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from qpmhe.cli.app import app
 from qpmhe.records import RecordError, estimate_record
 
 _MODELS = Path(__file__).with_name("oscillator.py")
-CONTINUOUS, DISCRETE, FUSED = (f"{_MODELS}:{name}" for name in ("continuous", "discrete", "fused"))
+CONTINUOUS, DISCRETE = f"{_MODELS}:continuous", f"{_MODELS}:discrete"
 #: A record of the discrete model.
 STEPS = ["time,y1,y2", *(f"{t},{t % 7},{t % 3}" for t in range(200))]
+OPTIONS = {"checkpoint_every": 20, "checkpoint_seconds": 0.0}
 
 _CODE = """
 import signal, sys
@@ -33,6 +37,11 @@ def estimate(model, record="record.csv", out="out.csv", **options):
     return estimate_record(model, record, out, **{"step_time": False} | options)
 
 
+def command(*words, text=None):
+    """The answer of `qpmhe estimate`."""
+    return CliRunner().invoke(app, ["estimate", *words], input=text)
+
+
 def put(name, text, end="\n"):
     Path(name).write_text("\n".join(text) + end)
 
@@ -41,7 +50,7 @@ def get(name):
     return Path(name).read_bytes()
 
 
-def rows(path):
+def rows(path="out.csv"):
     return Path(path).read_bytes().count(b"\n") if Path(path).exists() else 0
 
 
@@ -58,17 +67,20 @@ def cut_off(text, cut, model=CONTINUOUS, **options):
     put("record.csv", text)
 
 
-def start(model, record, out, **options):
+def start(model, out, **options):
+    """A process that reads a pipe."""
     return subprocess.Popen(
-        [sys.executable, "-c", _CODE, model, str(record), str(out), repr(options)],
+        [sys.executable, "-c", _CODE, model, "-", out, repr({"step_time": False} | options)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )
 
 
-def talk(running, *text):
-    """Without closing its input: it waits for more."""
+def talk(running, *text, until=0):
+    """Without closing its input, wait for a number of lines in its results."""
     running.stdin.write("\n".join([*text, ""]).encode())
     running.stdin.flush()
+    while running.poll() is None and rows() < until:
+        time.sleep(0.01)
 
 
 def finish(running, text=""):
