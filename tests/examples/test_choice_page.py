@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import qpmhe
 from qpmhe.studies import Store
 
 pytest.importorskip("matplotlib")
@@ -64,38 +63,6 @@ def test_the_page_is_filled_from_cells_that_are_run_once(tmp_path):
     (row,), (base,) = (figures.cells("batch_reactor", caps).values() for caps in (0, None))
     ratios = np.array(row.rmse_states) / base.rmse_states
     assert figures.error("batch_reactor", 0) == pytest.approx(np.sqrt(ratios.prod()), rel=1e-12)
-
-
-def test_the_models_of_the_studies():
-    from choice_models import SHARE, SIZE, observed, one_sided, outlying, without_states
-
-    # One QP about a Kalman filter with its prior is that filter.
-    system, observer, cost, scenario = observed("batch_reactor", "extended", "observer")
-    y = scenario.simulate(0, 60).measurements
-    alone, one = (
-        qpmhe.MovingHorizonEstimator(
-            system, observer, cost, horizon=40, initial_state=scenario.initial_estimate,
-            max_qps=max_qps,
-        ).run(y).states
-        for max_qps in (0, 1)
-    )
-    np.testing.assert_allclose(one, alone, rtol=1e-8)
-    # Outliers are in the measurements alone.
-    states, clean = qpmhe.models.batch_reactor().scenario.simulate(3, 4000)
-    again, measurements = outlying("batch_reactor").scenario.simulate(3, 4000)
-    np.testing.assert_array_equal(again, states)
-    moved = np.abs(measurements - clean)
-    np.testing.assert_allclose(moved[moved > 0.0], SIZE * 0.2, rtol=1e-9)
-    assert abs((moved > 0.0).mean() - SHARE) < 0.01
-    # An estimator that knows the set that bounds the disturbances, or not.
-    for known in (True, False):
-        parts = one_sided("batch_reactor", known)
-        states, _ = parts.scenario.simulate(0, 20)
-        assert (states[1:] - parts.system.f(states[:-1], np.empty((20, 0))) > -1e-12).all()
-        assert (parts.system.disturbances is not None) is known
-    free = without_states("cstr")
-    assert free.system.states is None
-    assert free.scenario.system.states is not None
 
 
 def test_the_backends_are_those_of_the_comparison():

@@ -1,12 +1,8 @@
 """The programs run and draw, and what they print is what they say it is."""
 
-import contextlib
 import importlib
-import io
-import re
 import subprocess
 import sys
-import warnings
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,11 +11,9 @@ import pytest
 
 import qpmhe
 
-ROOT = Path(__file__).parents[2]
-EXAMPLES = ROOT / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 pytest.importorskip("casadi")
-with_do_mpc = pytest.mark.skipif(find_spec("do_mpc") is None, reason="do-mpc is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -98,36 +92,6 @@ def test_two_qps_find_speeds_and_inertia_of_the_masses(load, monkeypatch, capsys
     with pytest.raises(SystemExit, match="2"):
         example.main()
     assert "--steps is 20; expected more than 20" in " ".join(capsys.readouterr().err.split())
-
-
-@with_do_mpc
-def test_do_mpc_estimates_the_same_and_its_code_of_the_page_runs(load):
-    example = load("do_mpc_masses")
-    record = example.simulate(seed=4, steps=60)
-    ours, theirs = example.with_qpmhe(record, None), example.with_do_mpc(record)
-    errors = [
-        np.sqrt(np.mean((one - record.states[1:])[20:, 3:6] ** 2))
-        for one in (ours.states, theirs.states)
-    ]
-    assert errors[0] < 1.1 * errors[1]
-    # Each differs from the truth by 0.07 rad/s, and the two by their priors only.
-    apart = np.sqrt(np.mean((ours.states - theirs.states)[20:, 3:6] ** 2))
-    assert apart < 0.5 * min(errors)
-    text = (ROOT / "docs" / "do-mpc.md").read_text(encoding="utf-8")
-    fences = re.findall(r"^```(.*?)\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
-    blocks = [(info, code) for info, code in fences if "python" in info]
-    last = next(k for k, (info, _) in enumerate(blocks) if "do-mpc" in info)
-    told = next(body for info, body in fences if info.startswith('text title="Output, with'))
-    printed, names = io.StringIO(), {}
-    with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
-        warnings.simplefilter("ignore")
-        for _, code in blocks[: last + 1]:
-            exec(code, names)
-    found, expected = (
-        [float(number) for number in re.findall(r"\d+\.\d+", words)]
-        for words in (printed.getvalue(), told)
-    )
-    assert found == pytest.approx(expected, rel=0.05)
 
 
 def test_slopes_of_the_learnt_noise_are_the_derivatives_of_the_estimates(load, monkeypatch):
