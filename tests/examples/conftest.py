@@ -10,9 +10,8 @@ EXAMPLES = str(Path(__file__).parents[2] / "examples")
 
 @pytest.fixture(scope="session")
 def gallery():
-    pytest.importorskip("matplotlib")
-    pytest.importorskip("pandas")
-    pytest.importorskip("rich")
+    for package in ("matplotlib", "pandas", "rich"):
+        pytest.importorskip(package)
     sys.path.insert(0, EXAMPLES)
     try:
         import gallery

@@ -1,6 +1,7 @@
-"""The gallery's harness: what is compared, how errors are counted, what is written."""
+"""The gallery's harness, the motor, the reactors and the robot indoors."""
 
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,74 +20,57 @@ def parts(gallery):
     return {name: import_module(f"gallery.{name}") for name in names}
 
 
-def linear(parts, records, **options):
+def linear(parts, noise=0.1, steps=40, tunes=0, **options):
+    """A problem with one record, whose error is the noise's."""
     system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1)
-    return parts["problem"].Problem(
-        "linear", "Linear", system, records, qpmhe.tuning.Weights(**WEIGHTS),
-        lambda x, real: np.abs(x[:, 0] - real[:, 0]), "m", 1.0, **options,
-    )
-
-
-def simulated(parts, noise=0.1, steps=40, tunes=0):
-    """A record whose error is the noise's."""
     rng, states = np.random.default_rng(1), [np.array([1.0, -0.5])]
     for _ in range(steps - 1):
         states.append(A @ states[-1])
     truth = np.array(states)
     y = truth[:, :1] + noise * rng.standard_normal((steps, 1))
-    return parts["problem"].Record("made", y, None, truth, [np.zeros(2), np.ones(2)], tunes)
+    starts = [np.zeros(2), np.ones(2)]
+    return parts["problem"].Problem(
+        "linear", "Linear", system,
+        [parts["problem"].Record("made", y, None, truth, starts, tunes)],
+        qpmhe.tuning.Weights(**WEIGHTS), lambda x, real: np.abs(x[:, 0] - real[:, 0]), "m", 1.0,
+        **options,
+    )
 
 
-def test_an_iterated_filter_of_a_linear_system_is_the_kalman_filter(parts):
-    record = simulated(parts)
-    record.measurements[7] = np.nan
-    problem = linear(parts, [record])
+def test_an_iterated_filter_is_the_kalman_filter_and_minimises_its_update(parts):
+    problem, kind = linear(parts), parts["baselines"].IteratedKalman
+    y = problem.records[0].measurements
+    y[7] = np.nan
     runs = [
-        problem.estimator(np.ones(2), problem.weights, kind, max_qps=0).run(record.measurements)
-        for kind in (parts["baselines"].IteratedKalman, qpmhe.ExtendedKalman)
+        problem.estimator(np.ones(2), problem.weights, one, max_qps=0).run(y)
+        for one in (kind, qpmhe.ExtendedKalman)
     ]
     np.testing.assert_allclose(runs[0].filtered, runs[1].filtered, atol=1e-12)
     np.testing.assert_allclose(runs[0].states, runs[1].states, atol=1e-12)
+    # Of an exponential output: the minimum of the squares of prior and measurement.
+    system, one = qpmhe.System(lambda x: x, lambda x: np.exp(x), n=1, p=1), np.eye(1)
+    observer = kind(prior=one, disturbance=one, noise=0.01 * one)
+    z, y, nothing = np.array([0.0]), np.array([3.0]), np.zeros(0)
+    sample = qpmhe.Sample(system, nothing, one, system.h_jacobian(z, nothing), covariance=one)
+    found, _ = observer.filter(z, y - system.h(z, nothing), sample)
+    assert abs(found - np.exp(found) * (y - np.exp(found)) / 0.01) < 1e-4
 
 
-def test_an_iterated_filter_solves_one_update_of_a_nonlinear_output(parts):
-    """Its update is the minimum of the squares of prior and measurement."""
-    system = qpmhe.System(lambda x: x, lambda x: np.exp(x), n=1, p=1)
-    observer = parts["baselines"].IteratedKalman(
-        prior=np.array([[1.0]]), disturbance=np.array([[1.0]]), noise=np.array([[0.01]])
-    )
-    z, y = np.array([0.0]), np.array([3.0])
-    sample = qpmhe.Sample(
-        system, np.zeros(0), np.eye(1), system.h_jacobian(z, np.zeros(0)), covariance=np.eye(1)
-    )
-    found, _ = observer.filter(z, y - system.h(z, np.zeros(0)), sample)
-    slope = found - np.exp(found) * (y - np.exp(found)) / 0.01
-    assert abs(slope) < 1e-4
-    assert np.array_equal(observer.correct(z, np.zeros(1), sample)[0], np.zeros(1))
-
-
-@pytest.mark.parametrize("lag", [0, 3])
-def test_estimates_with_a_lag_are_compared_with_their_own_times(parts, lag):
-    record = simulated(parts, noise=0.0)
-    problem = linear(parts, [record])
-    delay = {"delay": lag + 1} if lag else {}
-    mhe = problem.estimator(record.truth[0], problem.weights, max_qps=1, **delay)
-    found = parts["problem"].causal(mhe.run(record.measurements), mhe)
-    until = len(found) - lag
-    np.testing.assert_allclose(found[:until], record.truth[:until], atol=1e-9)
-    assert np.isnan(found[until:]).all()
-
-
-def test_errors_count_the_part_that_judges_and_lost_runs(parts):
-    judge, record = parts["problem"].judge, simulated(parts, tunes=10)
-    problem = linear(parts, [record])
-    found = judge(
-        problem, "by hand", "still", lambda start: Still(start), [record], compiled=False
-    )
+def test_errors_are_those_of_the_samples_own_times_and_lost_runs_count(parts):
+    problem = linear(parts, noise=0.0, tunes=10)
+    (record,) = problem.records
+    for lag, delay in ((0, {}), (3, {"delay": 4})):
+        mhe = problem.estimator(record.truth[0], problem.weights, max_qps=1, **delay)
+        found = parts["problem"].causal(mhe.run(record.measurements), mhe)
+        until = len(found) - lag
+        np.testing.assert_allclose(found[:until], record.truth[:until], atol=1e-9)
+        assert np.isnan(found[until:]).all()
+    record.starts.append(np.full(2, np.inf))
+    judged = parts["problem"].judge(problem, "by hand", "still", Still, [record], compiled=False)
     offsets = [np.abs(start[0] - record.truth[:, 0]) for start in record.starts]
-    np.testing.assert_allclose(found.errors, [np.sqrt(np.mean(e[10:] ** 2)) for e in offsets])
-    np.testing.assert_allclose(found.whole, [np.sqrt(np.mean(e**2)) for e in offsets])
-    assert found.lost == np.mean(found.errors > 1.0)
+    np.testing.assert_allclose(judged.errors, [np.sqrt(np.mean(e[10:] ** 2)) for e in offsets])
+    np.testing.assert_allclose(judged.whole, [np.sqrt(np.mean(e**2)) for e in offsets])
+    assert judged.lost == np.mean(judged.errors > 1.0) >= 1 / 3
 
 
 class Still:
@@ -103,109 +87,102 @@ class Still:
         return type("Run", (), {"filtered": filtered, "times": np.zeros(len(y))})
 
 
-def test_an_estimate_that_is_not_finite_is_lost(parts):
-    record = simulated(parts)
-    record.starts[0][:] = np.inf
-    found = parts["problem"].judge(
-        linear(parts, [record]), "by hand", "still", Still, [record], compiled=False
-    )
-    assert found.lost >= 0.5
-
-
-def test_a_baseline_that_wins_is_called_one(parts):
-    rows = pd.DataFrame({"estimator": ["EKF", "MHE"], "median": [1.0, 2.0], "worst": [3.0, 2.0]})
-    words = parts["report"].verdict(linear(parts, []), rows, ["EKF"])
-    assert "Lowest median error: EKF, 1.00 m (a baseline: it wins)." in words
-    assert "Lowest worst error: MHE, 2.00 m (of the baselines EKF, 3.00)." in words
-
-
 def test_a_problem_is_tuned_judged_and_written(parts, tmp_path, capsys):
-    record = simulated(parts, steps=200, tunes=100)
-    problem = linear(parts, [record], tuning={"objective": "likelihood"}, note="A note.")
-    code = parts["command"].main(
+    problem = linear(parts, steps=200, tunes=100, tuning={"objective": "likelihood"}, note="Note.")
+    truth, main = problem.records[0].truth, parts["command"].main
+    assert main(
         "linear", "Made.", lambda folder, quick: [problem],
-        lambda problems, results: parts["report"].tracks(
-            record.truth, {"EKF": results[0][0].middle}
-        ).figure,
+        lambda _, results: parts["report"].tracks(truth, {"EKF": results[0][0].middle}).figure,
         arguments=["--quick", "--out", str(tmp_path)],
-    )
-    assert code == 0
+    ) == 0
     table = pd.read_csv(tmp_path / "linear.csv")
     assert set(table["weights"]) == {"by hand", "tuned"}
-    names = {"EKF", "EKF, gated", "EKF, iterated", "UKF", "MHE, 1 QP", "MHE, converged"}
-    assert names <= set(table["estimator"])
     # On a linear system they are one filter.
-    mine = table[(table["weights"] == "by hand") & table["estimator"].isin(names - {"EKF, gated"})]
+    names = {"EKF", "EKF, iterated", "UKF", "MHE, 1 QP", "MHE, converged"}
+    assert names | {"EKF, gated"} <= set(table["estimator"])
+    mine = table[(table["weights"] == "by hand") & table["estimator"].isin(names)]
     np.testing.assert_allclose(mine["median"], mine["median"].iloc[0], rtol=1e-6)
-    text = (tmp_path / "linear.md").read_text()
-    assert "Lowest median error" in text
-    assert text.rstrip().endswith("A note.")
+    assert (tmp_path / "linear.md").read_text().rstrip().endswith("Note.")
     assert (tmp_path / "linear.png").read_bytes().startswith(b"\x89PNG")
     assert "Lowest median error" in capsys.readouterr().out
+    rows = pd.DataFrame({"estimator": ["EKF", "MHE"], "median": [1.0, 2.0], "worst": [3.0, 2.0]})
+    words = parts["report"].verdict(problem, rows, ["EKF"])
+    assert "Lowest median error: EKF, 1.00 m (a baseline: it wins)." in words
+    assert main("it", "Made.", None, None, "They are there.", ["--data", str(tmp_path / "no")]) == 0
+    assert "They are there." in capsys.readouterr().out
 
 
-def test_without_data_a_problem_says_where_they_are(parts, tmp_path, capsys):
-    missing = str(tmp_path / "none")
-    for given in ([], ["--data", missing]):
-        assert parts["command"].main("it", "Made.", None, None, "They are there.", given) == 0
-        assert "They are there." in capsys.readouterr().out
+def test_only_the_held_estimate_of_the_motors_inertia_neither_drifts_nor_gets_stiff(parts):
+    motor = import_module("gallery.weak_excitation.motor")
+    (problem,) = motor.problems(Path(), True)
+    ways, errors = parts["baselines"].estimators(problem, problem.weights), {}
+    for name in ("EKF", *motor.SHOWN):
+        errors[name] = [
+            np.median(parts["problem"].judge(problem, "by hand", name, ways[name], [
+                one for one in problem.records if one.name == part
+            ], False).errors)
+            for part in ("unseen", "again")
+        ]
+    for name in ("EKF", "MHE, 2 QPs"):
+        assert errors[name][0] > 30.0, name
+    assert errors[motor.STIFFER][1] > 30.0
+    assert max(errors[motor.HELD]) < 12.0
 
 
-def write(folder, ranges, wheels, points):
-    lines = [f"range2 {t} {d} 0.01 {x} {y} 105 0" for t, d, x, y in ranges]
-    lines += [f"odom2diff {t} {r} {left} 0 0.0785 1 1 1" for t, r, left in wheels]
-    (folder / "input.txt").write_text("\n".join(lines) + "\n")
-    truth = [f"point2 {t} {x} {y} 0 0 0 0" for t, x, y in points]
-    (folder / "ground_truth.txt").write_text("\n".join(truth) + "\n")
+@pytest.mark.parametrize(("which", "most"), [(0, 0.04), (1, 0.005)])
+def test_projected_filters_and_mhe_of_the_reactors_settle_on_the_truth(parts, which, most):
+    reactors = import_module("gallery.reactors.reactors")
+    problem = reactors.problem(reactors.REACTORS[which], 4)
+    ways = parts["baselines"].estimators(problem, problem.weights)
 
+    def judged(name):
+        return parts["problem"].judge(
+            problem, "by hand", name, ways[name], problem.records, False)
 
-def drive(count=120, dt=0.1):
-    """A circle within five anchors, and wheels' speeds in columns of the data set's order."""
-    anchors = np.array([[0, 0], [3, 0], [3, 2], [0, 2], [1.5, 2.5]])
-    at = [np.array([1.0, 0.5, 0.2])]
-    speed, turn = 0.4, 0.5
-    for _ in range(count - 1):
-        x, y, heading = at[-1]
-        middle = heading + 0.5 * turn * dt
-        at.append(np.array([
-            x + speed * dt * np.cos(middle), y + speed * dt * np.sin(middle), heading + turn * dt
-        ]))
-    times = dt * (1.0 + np.arange(count))
-    path = np.array(at)
-    turns = anchors[np.arange(count) % 5]
-    distances = np.hypot(*(path[:, :2] - turns).T)
-    half = turn * 0.0785
-    return (
-        np.column_stack((times, distances, turns)),
-        np.column_stack((times, np.full(count, speed - half), np.full(count, speed + half))),
-        np.column_stack((times, path[:, :2])), path,
+    for name in ("EKF, projected", "MHE, 1 QP", "MHE, 5 QPs", "MHE, UKF, 2 QPs"):
+        found = judged(name)
+        assert np.median(found.errors) < most
+        assert found.outside == found.lost == 0.0
+    if which == 1:
+        plain = judged("EKF")
+        assert np.median(plain.errors) > 0.1
+        assert plain.outside > 0.5
+    alone, two = (
+        np.median(judged(name).errors)
+        for name in ("gain 0.01, projected", "MHE, gain 0.01, 2 QPs")
     )
+    assert two < alone / 1.5
 
 
-def test_an_indoor_record_with_any_anchors_is_read_and_estimated(gallery, tmp_path):
+def test_a_robot_indoors_is_read_and_estimated_or_refused(parts, tmp_path, capsys):
+    """A circle within five anchors, and wheels' speeds in columns of the data set's order."""
     robot = import_module("gallery.indoor_uwb.robot")
-    *files, path = drive()
-    write(tmp_path, *files)
-    y, u, truth = robot.read(tmp_path)
-    np.testing.assert_allclose(truth, path[:, :2])
+    count, dt, speed, turn = 120, 0.1, 0.4, 0.5
+    anchors = np.array([[0, 0], [3, 0], [3, 2], [0, 2], [1.5, 2.5]])
+    headings = 0.2 + turn * dt * (np.arange(count - 1) + 0.5)
+    moves = speed * dt * np.stack((np.cos(headings), np.sin(headings)), axis=1)
+    path = np.array([1.0, 0.5]) + np.vstack((np.zeros(2), np.cumsum(moves, axis=0)))
+    times, turns, half = dt * (1.0 + np.arange(count)), anchors[np.arange(count) % 5], turn * 0.0785
+    distances = np.hypot(*(path - turns).T)
+    lines = [
+        *(f"range2 {t} {d} 0.01 {x} {y} 105 0"
+          for t, d, (x, y) in zip(times, distances, turns, strict=True)),
+        *(f"odom2diff {t} {speed - half} {speed + half} 0 0.0785 1 1 1" for t in times),
+    ]
+    truth = [f"point2 {t} {x} {y} 0 0 0 0" for t, (x, y) in zip(times, path, strict=True)]
+    (tmp_path / "input.txt").write_text("\n".join(lines) + "\n")
+    (tmp_path / "ground_truth.txt").write_text("\n".join(truth) + "\n")
+    y, u, found = robot.read(tmp_path)
+    np.testing.assert_allclose(found, path)
     np.testing.assert_allclose(u[:, 1], 0.5, rtol=1e-6)
     problem = robot.problems(tmp_path, quick=True)[0]
     low, high = problem.system.states.lower[:2], problem.system.states.upper[:2]
     np.testing.assert_allclose([low, high], [[-0.75, -0.625], [3.75, 3.125]])
-    np.testing.assert_allclose(problem.records[0].starts[0][:2], [1.5, 1.25])
     way = robot.own(problem, problem.weights)[robot.ROBUST]
-    found = way(problem.records[0].starts[0]).run(y, u).filtered
-    assert problem.error(found, truth)[60:].max() < 0.02
-
-
-@pytest.mark.parametrize("damage", ["short", "words", "order"])
-def test_an_indoor_record_that_is_none_is_refused(gallery, tmp_path, capsys, damage):
-    robot, command = (import_module(f"gallery.{one}") for one in ("indoor_uwb.robot", "command"))
-    ranges, wheels, points, _ = drive(120 if damage == "order" else 60)
-    write(tmp_path, ranges[::-1] if damage == "order" else ranges, wheels, points)
-    if damage == "words":
-        (tmp_path / "input.txt").write_text("range2 one two\n")
-    assert command.main(
-        "indoor_uwb", "It.", robot.problems, None, robot.SOURCE, ["--data", str(tmp_path)]
-    ) == 2
-    assert str(tmp_path) in capsys.readouterr().err
+    filtered = way(problem.records[0].starts[0]).run(y, u).filtered
+    assert problem.error(filtered, path)[60:].max() < 0.02
+    for damaged in (["range2 one two"], lines[count - 1 :: -1] + lines[count:]):
+        (tmp_path / "input.txt").write_text("\n".join(damaged) + "\n")
+        given = ["--data", str(tmp_path)]
+        assert parts["command"].main("it", "It.", robot.problems, None, "X", given) == 2
+        assert str(tmp_path) in capsys.readouterr().err
