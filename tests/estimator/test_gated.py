@@ -143,10 +143,13 @@ def test_the_gated_filter_is_the_plain_one(groups):
         assert rejected.any()
 
 
+A = np.array([[1.0, DT], [0.0, 1.0]])
+
+
 @each_filter
 @pytest.mark.parametrize("reopen", [1, 7])
 def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make, reopen):
-    system = qpmhe.System(lambda x: [x[0] + DT * x[1], x[1]], lambda x: x[:1], n=2, p=1)
+    system = qpmhe.System(lambda x: A @ x, lambda x: x[:1], n=2, p=1)
     covariances = {"disturbance": np.diag([1e-6, 1e-4]), "noise": [[0.01]]}
     gate = watching(qpmhe.Gate(reopen=reopen), make, prior=0.01 * np.eye(2), **covariances)
     truth, begins = 50.0 * (np.arange(140) >= 40), 40  # the only sensor jumps for good
@@ -160,6 +163,19 @@ def test_a_gate_that_shuts_on_the_truth_opens_after_the_stated_number(make, reop
     assert errors[reopen + 1] < 15.0
     assert errors[reopen + 40 :].max() < 0.5
     assert shut[reopen + 40 :].mean() < 0.05
+
+
+def test_sensors_that_pass_keep_a_faulty_one_shut():
+    """At most ten times as long; and not where they are in the minority."""
+    for outputs, faulty, shut in ((2, 1, 30), (3, 2, 3)):
+        C, covariances = np.eye(2)[:1].repeat(outputs, 0), {"noise": 0.01 * np.eye(outputs)}
+        system = qpmhe.System(lambda x: A @ x, lambda x, C=C: C @ x, n=2, p=outputs)
+        covariances |= {"prior": 0.01 * np.eye(2), "disturbance": np.diag([1e-6, 1e-4])}
+        Y = 0.1 * np.random.default_rng(5).standard_normal((75, outputs))
+        Y[40:, :faulty] += 20.0
+        run = estimator(watching(qpmhe.Gate(reopen=3), **covariances), [0.0, 0.0], system).run(Y)
+        assert np.flatnonzero(~run.rejected_sensors[40:, 0])[0] == shut
+        assert np.abs(run.observer_states[: 41 + shut, 0]).max() < 0.3
 
 
 @each_filter

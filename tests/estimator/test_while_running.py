@@ -16,8 +16,9 @@ from .spoil import check
 WEIGHTS = {"prior": np.diag([2.0, 1.0]), "disturbance": np.diag([9.0, 4.0]),
            "noise": np.array([[3.0, 0.5, 0.0], [0.5, 2.0, 0.2], [0.0, 0.2, 4.0]])}
 ROW = Polytope([[1.0, 1.0]], [2.0])
+WIDE = Box([-0.5, -2.0], [1.5, np.inf])
 SETS = {
-    "states": Box([-1.5, -2.0], [1.5, np.inf]) & ROW,
+    "states": WIDE & ROW,
     "disturbances": Box([-0.4, -0.5], [0.4, 0.5]),
     "noises": Box([-1.0, -np.inf, -1.0], [1.0, np.inf, 1.0]),
 }
@@ -117,20 +118,27 @@ def test_set_gives_the_estimator_that_was_made_with_the_values(name, when):
     """While the window grows, so that both have seen all of the record with these values."""
     options = OPTIONS[name] | {"horizon": 8, "candidate": "observer"}
     weights = {"noise": 2.0 * WEIGHTS["noise"], "disturbance": np.array([[5.0, 1.0], [1.0, 2.0]])}
-    changes = {"parameters": [0.5, 0.2]} | {f"{k}_weight": one for k, one in weights.items()}
-    other = {"weights": WEIGHTS | weights, "parameters": [0.5, 0.2]}
+    changes, other = {f"{k}_weight": one for k, one in weights.items()}, {}
+    if name != "observer alone":  # whose metric is of the first sample, and its parameters
+        changes["parameters"] = other["parameters"] = [0.5, 0.2]
+    other["weights"] = WEIGHTS | weights
     if "sets" in options:
-        changes["bounds"] = {"states": Box([-0.3, -0.5], [0.6, np.inf]),
+        # Bounds leave the rows as they are, and rows the bounds.
+        states = Polytope([[1.0, 1.0]], [0.6]) if when else Box([-0.3, -0.5], [0.6, np.inf])
+        changes["bounds"] = {"states": states,
                              "noises": Box([-0.4, -np.inf, -5.0], [0.4, np.inf, 5.0])}
-        sets = changes["bounds"] | {"states": changes["bounds"]["states"] & ROW}
+        sets = changes["bounds"] | {"states": states & (WIDE if when else ROW)}
         if options["sets"] is SOFT:
             sets = {k: one.soften(**PENALTIES) for k, one in sets.items()}
         other["sets"] = options["sets"] | sets
     mhe, made = estimator(**options), estimator(**options | other)
-    for t, own in enumerate(samples(12, 6, single=False)):
+    for t, own in enumerate(samples(12, 6, "sets" in options)):
         if t == when:
             assert (mhe.set(**changes) is None) == (when == 0)
-        found, expected = mhe.update(**own), made.update(**own)
+        kept = {k: v for k, v in own.items() if t >= when or k not in changes}
+        if t < when and "bounds" in own:
+            kept["bounds"] = {"disturbances": own["bounds"]["disturbances"]}
+        found, expected = mhe.update(**own), made.update(**kept)
         if t >= when:
             np.testing.assert_allclose(found.candidate, expected.candidate, rtol=0, atol=1e-11)
             np.testing.assert_allclose(found.trajectory, expected.trajectory, rtol=0, atol=1e-8)
