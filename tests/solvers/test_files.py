@@ -19,7 +19,7 @@ from qpmhe_solvers import (
     SolveStatus,
     create,
 )
-from qpmhe_solvers.files import dump, load, qp_files
+from qpmhe_solvers.files import dump, load
 from qpmhe_solvers.qp import ARRAYS
 
 from .problems import CASES, TIGHT, make
@@ -123,14 +123,10 @@ def test_numpy_alone_reads_it_by_what_it_says_of_itself(stored):
 def test_damage_is_reported_or_does_not_matter(stored):
     path, qp, solution = stored
     whole, rng, reported = path.read_bytes(), np.random.default_rng(0), 0
-    for length in np.linspace(0, len(whole) - 1, 15).astype(int):
-        path.write_bytes(whole[:length])
-        with pytest.raises(InvalidInputError, match=r"one.npz is (damaged|not a QP file)"):
-            load(path)
     for place in rng.integers(0, len(whole), 100):
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << rng.integers(0, 8)
-        path.write_bytes(spoilt)
+        path.write_bytes(spoilt if place % 4 else whole[:place])
         try:
             found = load(path)
         except InvalidInputError as error:
@@ -219,15 +215,3 @@ def test_what_cannot_be_dumped_leaves_nothing_behind(tmp_path, monkeypatch):
             dump(QP(4, 2), path)
     assert load(path).qp.stages == 2
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_files_and_folders_are_listed(tmp_path):
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    for missing, words in ((folder, "folder holds no .npz file"), (tmp_path / "no", "no file")):
-        with pytest.raises(InvalidInputError, match=words):
-            qp_files([missing])
-    paths = [dump(QP(1, 1), folder / name) for name in ("b.npz", "a.npz")]
-    single = dump(QP(1, 1), tmp_path / "single")
-    (folder / "notes.txt").write_text("")
-    assert qp_files([single, str(folder)]) == [single, *paths[::-1]]
