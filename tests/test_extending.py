@@ -96,16 +96,6 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def installed(folder):
-    """The four files as an installed package, whose entry point offers the backend."""
-    info = folder / "outside-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: outside\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[qpmhe.backends]\noutside = outside_backend:entry\n")
-    return folder
-
-
-@pytest.fixture
 def outside(folder, monkeypatch):
     """The four modules, with the backend registered."""
     monkeypatch.syspath_prepend(folder)
@@ -147,39 +137,30 @@ def test_an_estimator_of_them(outside):
     assert outside["backend"].Dense.solved >= improved > 20
 
 
-def command(folder, *arguments):
-    """Run ``qpmhe`` in a process that finds the folder as it finds installed packages."""
-    path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [sys.executable, "-c", "from qpmhe.cli import main; main()", *arguments],
-        cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True,
-        timeout=120, check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_the_command_line_finds_model_and_backend(installed):
-    assert "outside" in command(installed, "solvers")
-    command(
-        installed, "compare", "--model", "outside_model.py:make", "--backend", "outside",
-        "--qps", "0,2", "--solver-iterations", "none", "--seeds", "2", "--steps", "15",
-        "--jobs", "1", "--store", "store.sqlite", "--out", "report",
-    )
-    frame = Store(installed / "store.sqlite").frame()
-    assert set(frame["backend"]) == {"observer", "outside"}
-    assert set(frame["outcome"]) == {"done"}
-
-
-def test_a_record_is_estimated_with_them(installed):
-    (installed / "record.csv").write_text(
+def test_the_command_line_finds_them_in_an_installed_package(folder):
+    info = folder / "outside-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: outside\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[qpmhe.backends]\noutside = outside_backend:entry\n")
+    (folder / "record.csv").write_text(
         "t,y\n" + "".join(f"{k / 10},{0.5 * math.cos(0.1 * k):.6f}\n" for k in range(20))
     )
-    command(
-        installed, "estimate", "outside_model.py:make", "record.csv", "--out", "estimates.csv",
-        "--backend", "outside", "--max-qps", "2",
-    )
-    with (installed / "estimates.csv").open(newline="") as file:
+    path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    for command in (
+        "compare --model outside_model.py:make --backend outside --qps 0,2 --seeds 2 --steps 15 "
+        "--solver-iterations none --jobs 1 --store store.sqlite --out report",
+        "estimate outside_model.py:make record.csv --out estimates.csv --backend outside",
+    ):
+        done = subprocess.run(
+            [sys.executable, "-c", "from qpmhe.cli import main; main()", *command.split()],
+            cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True,
+            timeout=120, check=False,
+        )
+        assert done.returncode == 0, done.stderr
+    frame = Store(folder / "store.sqlite").frame()
+    assert set(frame["backend"]) == {"observer", "outside"}
+    assert set(frame["outcome"]) == {"done"}
+    with (folder / "estimates.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 20
     assert all(math.isfinite(float(row["filtered_angle"])) for row in rows)

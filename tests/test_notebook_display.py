@@ -11,38 +11,20 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError
 
-SPD = {"prior": np.eye(2), "disturbance": 0.5 * np.eye(2), "noise": 0.25}
+SETUP = """
+import sys, numpy as np, qpmhe
+system, observer, cost, scenario = qpmhe.models.batch_reactor()
+mhe = qpmhe.MovingHorizonEstimator(
+    system, observer, cost, horizon=4, initial_state=scenario.initial_estimate, max_qps=1)
+run = mhe.run(scenario.simulate(0).measurements[:20], covariances=True)
+"""
 
 
-def run_of(steps=20, max_qps=1, **options):
-    system, observer, cost, scenario = qpmhe.models.batch_reactor()
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, observer, cost, horizon=4, initial_state=scenario.initial_estimate,
-        max_qps=max_qps,
-    )
-    return mhe.run(scenario.simulate(0).measurements[:steps], **options)
-
-
-@pytest.mark.parametrize(
-    ("thing", "words"),
-    [
-        (qpmhe.Luenberger([0.3, 0.1]), "Luenberger(gain=[[0.3], [0.1]])"),
-        (qpmhe.ExtendedKalman(**SPD),
-         "ExtendedKalman(prior=[[1., 0.], [0., 1.]], disturbance=[[0.5, 0. ], [0. , 0.5]], "
-         "noise=[[0.25]])"),
-        (qpmhe.QuadraticCost(prior=np.eye(4), disturbance=np.eye(4), noise=1.0, discount=0.9),
-         "QuadraticCost(prior=<4 x 4>, disturbance=<4 x 4>, noise=[[1.]], discount=0.9)"),
-        (qpmhe.RobustCost(prior=1.0, disturbance=qpmhe.Huber(2.0, 3.0), noise=1.0),
-         "RobustCost(prior=Quadratic(weight=[[1.]]), disturbance=Huber(weight=[[2.]], "
-         "threshold=3), noise=Quadratic(weight=[[1.]]))"),
-        (qpmhe.Cauchy(1.0, 2.0, per_component=True), "per_component=True"),
-        (qpmhe.Box([0.0], [1.0]), "Box(lower=[0.0], upper=[1.0])"),
-        (qpmhe.HighGain(2, epsilon=0.5, dt=0.1), "HighGain(epsilon=0.5, dt=0.1)"),
-    ],
-    ids=lambda value: type(value).__name__,
-)
-def test_objects_say_what_they_hold(thing, words):
-    assert words in repr(thing)
+@pytest.fixture(scope="module")
+def made():
+    names = {}
+    exec(SETUP, names)
+    return names
 
 
 class Mine(qpmhe.Observer):
@@ -56,36 +38,33 @@ class Mine(qpmhe.Observer):
         return 0.0 * z, None
 
 
-def test_an_observer_of_a_users_class_shows_its_arguments():
-    assert repr(Mine(2.0)) == "Mine(stiffness=2)"
-
-
-def test_an_estimator_shows_what_it_was_made_of_and_where_it_is():
-    system, observer, cost, _ = qpmhe.models.batch_reactor()
-    mhe = qpmhe.MovingHorizonEstimator(
-        system, observer, cost, horizon=4, initial_state=[3.0, 0.0], max_qps=2, engine="python"
-    )
-    mhe.update([1.0])
-    for words in ("System(n=2", "Luenberger(", "horizon=4", "max_qps=2", "engine='python'",
-                  "time=1"):
-        assert words in repr(mhe)
+def test_objects_and_runs_say_what_they_hold(made):
+    run, mhe = made["run"], made["mhe"]
+    for thing, *words in (
+        (qpmhe.Luenberger([0.3, 0.1]), "Luenberger(gain=[[0.3], [0.1]])"),
+        (qpmhe.QuadraticCost(prior=np.eye(4), disturbance=np.eye(4), noise=1.0, discount=0.9),
+         "QuadraticCost(prior=<4 x 4>, disturbance=<4 x 4>, noise=[[1.]], discount=0.9)"),
+        (qpmhe.RobustCost(prior=1.0, disturbance=qpmhe.Huber(2.0, 3.0), noise=1.0),
+         "disturbance=Huber(weight=[[2.]], threshold=3), noise=Quadratic(weight=[[1.]]))"),
+        (Mine(2.0), "Mine(stiffness=2)"),
+        (mhe, "System(n=2", "Luenberger(", "horizon=4", "time=20"),
+        (run, "steps: 20", f"mean J: {run.costs.mean():.6g}"),
+    ):
+        for one in words:
+            assert one in repr(thing)
     assert "backend" not in repr(mhe)
-
-
-def test_a_run_shows_facts_and_a_picture():
-    run = run_of()
-    assert "steps: 20" in repr(run)
-    assert f"mean J: {run.costs.mean():.6g}" in repr(run)
     page = run._repr_html_()
     assert "<td style='text-align:left'>20</td>" in page
     assert "data:image/png;base64,iVBOR" in page
-    assert "img" not in run_of(0)._repr_html_()
-    assert "steps: 0" in repr(run_of(0))
+    mhe.reset()
+    empty = mhe.run(np.empty((0, 1)))
+    assert "img" not in empty._repr_html_()
+    assert "steps: 0" in repr(empty)
 
 
-def test_a_run_is_a_table():
+def test_a_run_is_a_table(made):
     pytest.importorskip("pandas")
-    run = run_of(covariances=True)
+    run = made["run"]
     table = run.to_frame()
     np.testing.assert_array_equal(table[["x1", "x2"]], run.states[1:])
     np.testing.assert_array_equal(table["J"], run.costs)
@@ -94,11 +73,10 @@ def test_a_run_is_a_table():
     assert table["status"].iloc[-1] == str(run.statuses[-1]).removeprefix("Status.")
 
 
-@pytest.mark.parametrize("covariances", [False, True])
-def test_a_run_in_a_file_is_the_same_run(tmp_path, covariances):
-    run = run_of(covariances=covariances)
-    run.save(tmp_path / "run.npz")
-    other = qpmhe.load_run(tmp_path / "run.npz")
+def test_a_run_in_a_file_is_the_same_run_and_anything_else_is_refused(made, tmp_path):
+    path, run = tmp_path / "run.npz", made["run"]
+    run.save(path)
+    other = qpmhe.load_run(path)
     assert other.statuses == run.statuses
     kept = pickle.loads(pickle.dumps(run))
     for name in ("statuses", "source"):
@@ -106,35 +84,24 @@ def test_a_run_in_a_file_is_the_same_run(tmp_path, covariances):
     assert vars(kept).keys() == vars(other).keys()
     for name, value in vars(kept).items():
         np.testing.assert_array_equal(vars(other)[name], value, err_msg=name)
-
-
-@pytest.mark.parametrize("damage", ["text", "other", "short", "missing", "pickle"])
-def test_what_is_no_run_is_refused(tmp_path, damage):
-    path = tmp_path / "run.npz"
-    run_of().save(path)
     with np.load(path) as file:
         arrays = dict(file)
-    if damage == "text":
-        path.write_text("time,y\n0,1\n")
-    elif damage == "other":
-        np.savez(path, a=1)
-    elif damage == "short":
-        np.savez(path, **arrays | {"costs": arrays["costs"][:-1]})
-    elif damage == "pickle":
-        np.savez(path, **arrays | {"costs": np.array([None] * 20)})
-    else:
-        path.unlink()
-    with pytest.raises(InvalidInputError, match=r"run\.npz cannot be read as a run"):
-        qpmhe.load_run(path)
+    for damage in (
+        {"a": 1}, arrays | {"costs": arrays["costs"][:-1]},
+        arrays | {"costs": np.array([None] * 20)}, "time,y\n0,1\n", None,
+    ):
+        if isinstance(damage, dict):
+            np.savez(path, **damage)
+        elif damage is None:
+            path.unlink()
+        else:
+            path.write_text(damage)
+        with pytest.raises(InvalidInputError, match=r"run\.npz cannot be read as a run"):
+            qpmhe.load_run(path)
 
 
 def test_figures_are_pyplots_where_it_is_imported():
-    code = """
-import sys, numpy as np, qpmhe
-system, observer, cost, scenario = qpmhe.models.batch_reactor()
-mhe = qpmhe.MovingHorizonEstimator(
-    system, observer, cost, horizon=4, initial_state=scenario.initial_estimate)
-run = mhe.run(scenario.simulate(0).measurements[:9])
+    code = SETUP + """
 qpmhe.plots.costs(run)
 assert "matplotlib.pyplot" not in sys.modules
 import matplotlib
@@ -153,20 +120,12 @@ def test_a_cell_shows_its_figure(tmp_path):
     nbformat = pytest.importorskip("nbformat", reason=reason)
     nbclient = pytest.importorskip("nbclient", reason=reason)
     pytest.importorskip("ipykernel", reason=reason)
-    first = """
-import qpmhe
-system, observer, cost, scenario = qpmhe.models.batch_reactor()
-mhe = qpmhe.MovingHorizonEstimator(
-    system, observer, cost, horizon=4, initial_state=scenario.initial_estimate)
-run = mhe.run(scenario.simulate(0).measurements[:9])
-run"""
-    cells = [first, "qpmhe.plots.costs(run);", "print(1)\nqpmhe.plots.states(run);"]
+    cells = [f"{SETUP}run", "qpmhe.plots.costs(run);", "print(1)\nqpmhe.plots.states(run);"]
     notebook = nbformat.v4.new_notebook(cells=list(map(nbformat.v4.new_code_cell, cells)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the client's event loop and sockets
         nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute(cwd=tmp_path)
     shown = [output["data"] for cell in notebook.cells for output in cell["outputs"]
              if "data" in output]
-    assert "text/html" in shown[0]
-    assert "image/png" in shown[1]
-    assert "image/png" in shown[2]
+    for data, kind in zip(shown, ("text/html", "image/png", "image/png"), strict=True):
+        assert kind in data

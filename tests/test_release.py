@@ -1,4 +1,4 @@
-"""What is told in several places is told alike: versions, lowest versions, the citation."""
+"""What several places state they state alike: versions, lowest versions, the citation."""
 
 import re
 import tarfile
@@ -7,7 +7,6 @@ import zipfile
 from pathlib import Path
 
 import check_dist
-import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 
@@ -19,75 +18,50 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 TOOLS = {"test", "docs", "dev"}
 
 
-def promised():
-    """Lowest version of each package that a user may install."""
+def test_minimal_versions_are_those_promised():
     extras = PROJECT["project"]["optional-dependencies"]
     lines = [*PROJECT["project"]["dependencies"]]
     lines += [line for name, more in extras.items() if name not in TOOLS for line in more]
-    lowest = {}
+    promised = {}
     for requirement in map(Requirement, lines):
         if requirement.name != "qpmhe":
             (bound,) = [part for part in requirement.specifier if part.operator == ">="]
-            lowest[requirement.name.lower()] = Version(bound.version)
-    return lowest
-
-
-def test_minimal_versions_are_those_promised():
+            promised[requirement.name.lower()] = Version(bound.version)
     lines = (ROOT / "tests" / "minimal-versions.txt").read_text(encoding="utf-8").splitlines()
     pins = [Requirement(line) for line in lines if line and not line.startswith("#")]
-    held = {pin.name: Version(str(pin.specifier).removeprefix("==")) for pin in pins}
-    assert held == promised()
-
-
-def test_the_version_is_told_once():
-    assert PROJECT["project"]["dynamic"] == ["version"]
-    assert "version" not in PROJECT["project"]
-    assert check_dist.version() == qpmhe.__version__
+    assert {pin.name: Version(str(pin.specifier).removeprefix("==")) for pin in pins} == promised
 
 
 def test_citation_and_changelog_are_of_this_version():
+    assert PROJECT["project"]["dynamic"] == ["version"]
+    assert check_dist.version() == qpmhe.__version__
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert re.findall(r"^version: (.+)$", citation, flags=re.MULTILINE) == [qpmhe.__version__]
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (\S+)", changelog, flags=re.MULTILINE)[0] == qpmhe.__version__
 
 
-@pytest.fixture
-def made(tmp_path):
-    """A wheel as it should be."""
+def test_what_a_wheel_or_an_sdist_lacks_or_has_too_much_is_found(tmp_path):
     version = check_dist.version()
-    path = tmp_path / f"qpmhe-{version}-py3-none-any.whl"
-    info = f"qpmhe-{version}.dist-info"
-    with zipfile.ZipFile(path, "w") as wheel:
-        for name in check_dist.files_of(check_dist.PACKAGES):
-            wheel.writestr(name, "")
-        wheel.writestr(f"{info}/METADATA", f"Name: qpmhe\nVersion: {version}\n")
-        wheel.writestr(f"{info}/entry_points.txt", "[console_scripts]\nqpmhe = qpmhe.cli:main\n")
-        wheel.writestr(f"{info}/licenses/LICENSE", "")
-    return path
-
-
-def test_a_good_wheel_is_good(made):
-    assert check_dist.complaints_of_wheel(made, check_dist.version()) == []
-
-
-def test_what_a_wheel_lacks_or_has_too_much_is_told(made, tmp_path):
-    other = tmp_path / made.name.replace("py3", "py4")
-    with zipfile.ZipFile(made) as good, zipfile.ZipFile(other, "w") as bad:
-        for name in good.namelist():
-            if name != "qpmhe/py.typed":
-                bad.writestr(name, good.read(name))
-        bad.writestr("tests/test_docs.py", "")
-    assert check_dist.complaints_of_wheel(other, check_dist.version()) == [
-        "is missing: qpmhe/py.typed", "does not belong: tests/test_docs.py",
-    ]
-
-
-def test_what_an_sdist_has_too_much_is_told(tmp_path):
+    info, files = f"qpmhe-{version}.dist-info", check_dist.files_of(check_dist.PACKAGES)
+    for names, complaints in (
+        (files, []),
+        (files - {"qpmhe/py.typed"} | {"tests/test_docs.py"},
+         ["is missing: qpmhe/py.typed", "does not belong: tests/test_docs.py"]),
+    ):
+        path = tmp_path / f"qpmhe-{version}-py3-none-any.whl"
+        with zipfile.ZipFile(path, "w") as wheel:
+            for name in names:
+                wheel.writestr(name, "")
+            wheel.writestr(f"{info}/METADATA", f"Name: qpmhe\nVersion: {version}\n")
+            commands = "[console_scripts]\nqpmhe = qpmhe.cli:main\n"
+            wheel.writestr(f"{info}/entry_points.txt", commands)
+            wheel.writestr(f"{info}/licenses/LICENSE", "")
+        assert check_dist.complaints_of_wheel(path, version) == complaints
     path, data = tmp_path / "sdist.tar.gz", tmp_path / "cell.mat"
     data.write_bytes(b"0")
     with tarfile.open(path, "w:gz") as sdist:
-        sdist.add(data, f"qpmhe-{check_dist.version()}/examples/cell.mat")
-    found = check_dist.complaints_of_sdist(path, check_dist.version())
+        sdist.add(data, f"qpmhe-{version}/examples/cell.mat")
+    found = check_dist.complaints_of_sdist(path, version)
     assert "does not belong: examples/cell.mat" in found
     assert "is missing: README.md" in found

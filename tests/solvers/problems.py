@@ -7,14 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from qpmhe_solvers import (
-    QP,
-    SolverOptions,
-    available,
-    backend,
-    register,
-    unregister,
-)
+from qpmhe_solvers import QP, SolverOptions, available, backend, register, unregister
 from qpmhe_solvers.qp import ARRAYS
 from qpmhe_solvers.scaling import Scaling
 
@@ -189,9 +182,7 @@ CASES = {
     "unused rows": {"stages": 5, "n": 2, "rows": 2, "bounds": "all"},
     "only unused rows": {"stages": 3, "n": 2, "rows": 2},
     "all kinds": {"stages": 7, "n": 3, "rows": 2, "bounds": "part", "sides": "mixed"},
-    "badly scaled": {
-        "stages": 6, "n": 2, "rows": 1, "bounds": "part", "sides": "two", "decades": 4.0,
-    },
+    "badly scaled": {"stages": 6, "n": 2, "rows": 1, "sides": "two", "decades": 4.0},
     "single stage": {"stages": 1, "n": 3, "rows": 2, "bounds": "part", "sides": "two"},
     "n=1": {"stages": 8, "n": 1, "rows": 1, "bounds": "part", "sides": "one"},
     "one unknown": {"stages": 1, "n": 1, "bounds": "all"},

@@ -22,14 +22,13 @@ def replace_natives(monkeypatch, factory):
         monkeypatch.setitem(NATIVE, name, Backend(name, factory, "-", iterate_at_cap=True))
 
 
-@pytest.mark.parametrize("case", ["no inequality", "only unused rows"])
-def test_it_is_banded_where_no_inequality_binds(case, monkeypatch):
+def test_it_is_banded_where_no_inequality_binds(monkeypatch):
     replace_natives(monkeypatch, lambda options: pytest.fail("a solver was made"))
-    qp, dense = make(**CASES[case])
-    solution = create("auto").solve(qp)
-    assert solution.status is SolveStatus.SOLVED
-    np.testing.assert_array_equal(solution.d, create("banded").solve(qp).d)
-    np.testing.assert_allclose(solution.d.ravel(), dense.minimiser(), rtol=1e-9, atol=1e-9)
+    for case in ("no inequality", "only unused rows"):
+        qp, _ = make(**CASES[case])
+        solution = create("auto").solve(qp)
+        assert solution.status is SolveStatus.SOLVED
+        np.testing.assert_array_equal(solution.d, create("banded").solve(qp).d)
 
 
 def test_it_chooses_by_size_cap_and_clock(monkeypatch):
@@ -111,22 +110,21 @@ class Overriding(Scene):
     shift = forget = prepare
 
 
-class Unmakeable(Scene):
-    def __init__(self, options):
-        raise ImportError("broken package")
+def unmakeable(options):
+    raise ImportError("broken package")
 
 
-@pytest.mark.parametrize("kind", [Overriding, Unmakeable, None])
-def test_it_contains_broken_packages_and_needs_none(kind, monkeypatch):
-    if kind is None:
-        for name, native in NATIVE.items():
-            monkeypatch.setitem(NATIVE, name, replace(native, module="not_installed_here"))
-    else:
-        replace_natives(monkeypatch, kind)
-    solver = create("auto")
-    solver.prepare(12)
-    solver.shift()
-    solution = solver.solve(BOXED)
-    assert solution.status is UNCONSTRAINED
-    np.testing.assert_array_equal(solution.d, create("banded").solve(BOXED).d)
-    solver.forget()
+def test_it_contains_broken_packages_and_needs_none(monkeypatch):
+    natives = dict(NATIVE)
+    for factory in (Overriding, unmakeable, None):
+        replace_natives(monkeypatch, factory or Scene)
+        if factory is None:
+            for name, native in natives.items():
+                monkeypatch.setitem(NATIVE, name, replace(native, module="not_installed_here"))
+        solver = create("auto")
+        solver.prepare(12)
+        solver.shift()
+        solution = solver.solve(BOXED)
+        assert solution.status is UNCONSTRAINED
+        np.testing.assert_array_equal(solution.d, create("banded").solve(BOXED).d)
+        solver.forget()

@@ -11,7 +11,6 @@ from qpmhe_solvers import (
     Backend,
     InvalidInputError,
     RawSolution,
-    Recording,
     Residuals,
     Solution,
     Solver,
@@ -90,14 +89,13 @@ def test_the_honest_are_believed_in_any_form():
     assert (solution.status, solution.iterations, solution.message) == (SOLVED, 7, "well done")
     assert DENSE.violation(solution.d) < 1e-9
     assert max(solution.residuals.primal, solution.residuals.dual, solution.residuals.gap) < 1e-9
-    for claimed in (False, np.array([True, False]), np.array([]), "yes", None, 1j):
+    for claimed in (False, np.array([True, False]), "yes", None):
         assert ask(raw(claimed=claimed)).status is STOPPED
     for d in (BEST.d.ravel(), BEST.d.tolist(), np.asfortranarray(BEST.d), BEST.d.astype(object)):
         for solution in (ask(raw(d=d)), contained(Solution(d, SOLVED, 5))):
             assert solution.status is SOLVED
             np.testing.assert_array_equal(solution.d, BEST.d)
-    kept = Residuals(0.0, 0.0, 0.0)
-    assert contained(Solution(BEST.d, SOLVED, 2, kept)).residuals is kept
+            assert not np.shares_memory(solution.d, np.asarray(d))  # solvers reuse their buffers
 
 
 class Panic(BaseException):
@@ -130,26 +128,11 @@ def test_an_exception_is_a_failure_with_its_words_and_only_the_user_interrupts()
             method(*arguments)
 
 
-def test_a_claim_is_not_judged_by_what_the_solver_left_of_the_problem():
-    for name in ARRAYS:
-        def scale(lent, name=name):
-            getattr(lent, name)[...] *= 1e-12
-            lent.gradient *= 1e-12  # at zero, without multipliers, there is now nothing left to do
-            return RawSolution(np.zeros(21), True, 1, np.zeros(21), np.zeros(14))
-
-        solution = ask(scale)
-        assert solution.status is INACCURATE
-        assert solution.residuals.dual == np.abs(QP.gradient).max()
-        assert solution.message.startswith("it wrote into ")
-        assert name in solution.message
-        assert "read-only" in solution.message
-
-
 def test_whoever_writes_has_a_copy_and_is_named_unless_right():
     def scribbling(found):
         def scribble(lent):
             for name in ARRAYS:
-                getattr(lent, name)[...] = 1e-12
+                getattr(lent, name)[...] *= 1e-12
             lent.bounded = False
             warnings.warn("ill-conditioned", UserWarning, stacklevel=1)  # an error if it leaks
             np.float64(1.0) / np.float64(0.0)
@@ -169,28 +152,13 @@ def test_whoever_writes_has_a_copy_and_is_named_unless_right():
     assert stopped.status is STOPPED
     assert stopped.message.startswith("gave up; it wrote into band, gradient, ")
     assert ask(raw(claimed=False)).message == ""  # who only reads is not accused
+    # At zero, without multipliers, nothing is left to do in what it made of the QP.
+    idle = ask(scribbling(RawSolution(np.zeros(21), True, 1, np.zeros(21), np.zeros(14))))
+    assert (idle.status, idle.residuals.dual) == (INACCURATE, np.abs(QP.gradient).max())
     assert QP.bounded
     assert warnings.filters == filters
     for array, values in before.items():
         np.testing.assert_array_equal(getattr(QP, array), values)
-
-
-def test_no_buffer_of_a_solver_is_kept():
-    names = "d", "bound_duals", "row_duals"
-    for answered, kind in ((ask, RawSolution), (contained, Solution)):
-        buffers = {name: getattr(BEST, name).copy() for name in names}
-        verdict = {"claimed": True} if kind is RawSolution else {"status": SOLVED}
-        solution = answered(kind(**buffers, **verdict))
-        for name, buffer in buffers.items():
-            buffer[...] = np.nan
-            assert np.isfinite(getattr(solution, name)).all()
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_what_is_no_qp_is_refused(name):
-    for solver in (create(name), Scripted(raw())):
-        with pytest.raises(InvalidInputError, match=r"qp is 'a QP'; expected a qpmhe.solvers.QP"):
-            solver.solve("a QP")
 
 
 def test_what_is_no_answer():
@@ -212,8 +180,7 @@ def test_what_is_no_answer():
             assert (solution.d, solution.status, solution.residuals) == (None, FAILED, None)
             assert solution.message.startswith(message)
     assert ask(raw(d=None, claimed=False, message="gave up")).message == "gave up"
-    solution = contained(Solution(BEST.d, "solved"))
-    assert solution.message.startswith("the status of the backend's Solution is str")
+    assert "status of the backend's Solution is str" in contained(Solution(BEST.d, "yes")).message
     # The iterate is there and feasible; only its optimality is unknown.
     for duals in (np.zeros(20), np.full(21, np.nan), "none", [[0.0], [0.0, 1.0]], [1j] * 21):
         for which in ("bound_duals", "row_duals"):
@@ -238,16 +205,12 @@ def test_success_that_is_none(options):
     qp, dense = of_order_one(make(6, 2, bounds="all", seed=3)[0])
     d, zeros = (qp.lower + qp.upper) / 2, np.zeros(12)
     gradient = dense.hessian @ d.ravel() + dense.gradient
-    residuals = asked(d, zeros)
-    assert residuals.primal == 0.0
-    assert residuals.dual == pytest.approx(np.abs(gradient).max())
+    assert asked(d, zeros).dual == pytest.approx(np.abs(gradient).max())
     # Every point is stationary with these; that they push from no bound shows in the gap.
     assert asked(d, -gradient).gap > 0.01
     # At zero, with multipliers zero, there is no gap and no violation, only a gradient.
     qp.lower[...], qp.upper[...] = -0.1, 0.1
-    residuals = asked(zeros, zeros)
-    assert (residuals.primal, residuals.gap) == (0.0, 0.0)
-    assert residuals.dual == np.abs(qp.gradient).max()
+    assert asked(zeros, zeros) == Residuals(0.0, np.abs(qp.gradient).max(), 0.0)
     d = np.full(12, 100.0)  # far outside
     assert asked(d, -(dense.hessian @ d + dense.gradient)).primal > 1.0
     for changes in (  # the squares of the large ones overflow
@@ -258,25 +221,27 @@ def test_success_that_is_none(options):
 
 
 def test_what_reaches_a_solver():
+    for one in (Scripted(raw()), *(create(name) for name in EVERY)):
+        with pytest.raises(InvalidInputError, match=r"qp is 'a QP'; expected a qpmhe.solvers.QP"):
+            one.solve("a QP")
     spoilt, ones = QP.copy(), np.ones((7, 3))
     spoilt.row_own[1, 0, 0] = np.nan
     solver = Scripted(raw())
     assert solver.solve(spoilt).message == "the QP's data are not finite"
-    assert solver.starts == []
     # osqp reads as many numbers as there are unknowns, whatever the length of the start.
     for start in (None, np.zeros(3), np.nan * ones, np.inf * ones):
         solver.solve(QP, start)
         assert solver.starts.pop() is None
-    solver.solve(QP, ones)
-    lent = solver.starts.pop()
+    cold = Scripted(raw(), SolverOptions(warm_start=False))
+    for one in (solver, cold):
+        one.solve(QP, ones)
+    assert cold.starts == [None]
+    (lent,) = solver.starts
     assert (lent == 1.0).all()
     assert lent is not ones
-    cold = Scripted(raw(), SolverOptions(warm_start=False))
-    cold.solve(QP, ones)
-    assert cold.starts == [None]
 
 
-def test_only_our_own_solve_is_trusted_and_each_call_sets_the_time_limit(tmp_path):
+def test_only_our_own_solve_is_trusted_and_each_call_sets_the_time_limit():
     solver = create("banded")
     qp = make(6, 2)[0]
     solution = ContainedSolver(solver).solve(qp, None, 0.25)
@@ -284,10 +249,6 @@ def test_only_our_own_solve_is_trusted_and_each_call_sets_the_time_limit(tmp_pat
     assert solver.time_limit == 0.25
     solver.solve = lambda qp, start=None: "no Solution"
     assert ContainedSolver(solver).solve(qp).status is FAILED
-    entry = Backend("hostile", lambda options: Overriding("no Solution"), "-")
-    with registered(entry), Recording(tmp_path, "hostile") as recording:
-        solution = ContainedSolver(create(recording.backend)).solve(QP)
-    assert solution.message == "the backend's solve returned str, not a Solution"
 
 
 rubbish = st.one_of(

@@ -9,17 +9,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from qpmhe.cli import solve_qp
-from qpmhe_solvers import (
-    QP,
-    InvalidInputError,
-    Residuals,
-    Solution,
-    SolverOptions,
-    SolveStatus,
-    create,
-)
-from qpmhe_solvers.files import dump, load, qp_files
+from qpmhe_solvers import QP, InvalidInputError, Solution, SolverOptions, SolveStatus, create
+from qpmhe_solvers.files import dump, load
 from qpmhe_solvers.qp import ARRAYS
 
 from .problems import CASES, TIGHT, make
@@ -71,7 +62,6 @@ def test_everything_comes_back(stored):
     same_answer(found.solution, solution)
     assert (found.path, found.backend, found.options) == (path, "quadprog", OPTIONS)
     assert found.start.tolist() == np.ones((qp.stages, qp.n)).tolist()
-    assert {"python", "numpy", "qpmhe", "qpsolvers", "quadprog"} <= set(found.versions)
     assert found.versions["numpy"] == np.__version__
     found.qp.band[...] = 0.0  # can be overwritten
     for case in CASES.values():
@@ -86,21 +76,18 @@ def test_everything_comes_back(stored):
         assert (found.solution, found.backend, found.options, found.start) == (None, "", None, None)
     for status in SolveStatus:
         d = np.full((qp.stages, qp.n), np.pi) if status.usable else None
-        residuals = Residuals(0.5, np.nan, np.inf) if status.usable else None
-        message = 'said "the" solver: \u2265 \ud800'
-        solution = Solution(d, status, np.int64(3), residuals, message=message)
+        solution = Solution(d, status, np.int64(3), message='said "the" solver: \u2265 \ud800')
         same_answer(load(dump(qp, path, solution=solution)).solution, solution)
 
 
-@pytest.mark.parametrize("limit", [-5.0, np.nan, -np.inf])
-def test_a_promise_that_the_numbers_break_is_not_believed(limit, tmp_path):
+def test_a_promise_that_the_numbers_break_is_not_believed(tmp_path):
     # QPs of earlier versions promised by default that there are no bounds.
-    qp, _ = make(3, 2)
-    qp.upper[1, 1] = limit
-    found = load(rewritten(dump(qp, tmp_path / "qp.npz"), {"bounded": False}))
-    assert found.qp.bounded
-    replayed = solve_qp.replay(found, "auto", TIGHT).solution
-    assert (replayed.status is SolveStatus.SOLVED) == (limit == -5.0)
+    for limit in (-5.0, np.nan, -np.inf):
+        qp, _ = make(3, 2)
+        qp.upper[1, 1] = limit
+        found = load(rewritten(dump(qp, tmp_path / "qp.npz"), {"bounded": False})).qp
+        assert found.bounded
+        assert (create("auto", TIGHT).solve(found).status is SolveStatus.SOLVED) == (limit == -5.0)
 
 
 def test_numpy_alone_reads_it_by_what_it_says_of_itself(stored):
@@ -123,14 +110,10 @@ def test_numpy_alone_reads_it_by_what_it_says_of_itself(stored):
 def test_damage_is_reported_or_does_not_matter(stored):
     path, qp, solution = stored
     whole, rng, reported = path.read_bytes(), np.random.default_rng(0), 0
-    for length in np.linspace(0, len(whole) - 1, 15).astype(int):
-        path.write_bytes(whole[:length])
-        with pytest.raises(InvalidInputError, match=r"one.npz is (damaged|not a QP file)"):
-            load(path)
     for place in rng.integers(0, len(whole), 100):
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << rng.integers(0, 8)
-        path.write_bytes(spoilt)
+        path.write_bytes(spoilt if place % 4 else whole[:place])
         try:
             found = load(path)
         except InvalidInputError as error:
@@ -219,15 +202,3 @@ def test_what_cannot_be_dumped_leaves_nothing_behind(tmp_path, monkeypatch):
             dump(QP(4, 2), path)
     assert load(path).qp.stages == 2
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_files_and_folders_are_listed(tmp_path):
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    for missing, words in ((folder, "folder holds no .npz file"), (tmp_path / "no", "no file")):
-        with pytest.raises(InvalidInputError, match=words):
-            qp_files([missing])
-    paths = [dump(QP(1, 1), folder / name) for name in ("b.npz", "a.npz")]
-    single = dump(QP(1, 1), tmp_path / "single")
-    (folder / "notes.txt").write_text("")
-    assert qp_files([single, str(folder)]) == [single, *paths[::-1]]

@@ -3,7 +3,6 @@
 import copy
 import gc
 import os
-import pickle
 import subprocess
 import sys
 import textwrap
@@ -13,28 +12,10 @@ import time
 import numpy as np
 import pytest
 
-import qpmhe
 import qpmhe_solvers.isolated
-from qpmhe_solvers import (
-    QP,
-    Backend,
-    BackendError,
-    InvalidInputError,
-    OptionError,
-    SolverOptions,
-    SolveStatus,
-    create,
-)
+from qpmhe_solvers import QP, Backend, BackendError, OptionError, SolverOptions, SolveStatus, create
 
-from .hostile_backend import (
-    Crashing,
-    Hanging,
-    Hostile,
-    Overriding,
-    Printing,
-    Unmakeable,
-    entry,
-)
+from .hostile_backend import Crashing, Hanging, Hostile, Overriding, Printing, Unmakeable, entry
 from .problems import CASES, EVERY, make, registered
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -77,13 +58,10 @@ def test_the_numbers_are_those_of_the_same_process(name):
         start = np.full((qp.stages, qp.n), 0.1)
         one, two = apart.solve(qp, start), here.solve(qp, start)
         assert (one.status, one.iterations) == (two.status, two.iterations)
-        for what in ("d", "bound_duals", "row_duals"):
-            np.testing.assert_array_equal(getattr(one, what), getattr(two, what))
+        np.testing.assert_array_equal(one.d, two.d)
         assert one.residuals == two.residuals
         for solver in (apart, here):
             solver.shift()
-    with pytest.raises(InvalidInputError, match="expected a qpmhe"):
-        apart.solve(3)
 
 
 @POSIX
@@ -101,10 +79,10 @@ def test_a_crash_is_a_failed_qp_and_the_next_one_is_solved():
         solution = solver.solve(small())  # by another process, prepared as the first one
         assert (solution.status, solution.iterations) == (SOLVED, 7001)
         np.testing.assert_array_equal(solution.d, np.ones((2, 1)))
-    for copied in (copy.deepcopy(solver), pickle.loads(pickle.dumps(solver))):
-        assert copied.options == solver.options
-        assert copied._child._process.pid != solver._child._process.pid
-        assert copied.solve(small()).status is SOLVED
+    copied = copy.deepcopy(solver)
+    assert copied.options == solver.options
+    assert copied._child._process.pid != solver._child._process.pid
+    assert copied.solve(small()).status is SOLVED
 
 
 def test_the_time_limit_ends_a_solver_that_hangs():
@@ -216,37 +194,3 @@ def test_what_cannot_be_made_or_sent_is_refused_at_construction():
     pytest.importorskip("joblib")
     ended = program(MAIN)
     assert (ended.returncode, ended.stdout) == (0, "SOLVED\n"), ended.stderr
-
-
-def estimator(**options):
-    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
-    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0)
-    return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.3]), cost, horizon=4, initial_state=[0.0], **options
-    )
-
-
-@POSIX
-def test_update_falls_back_where_the_backend_crashes_and_goes_on():
-    with registered(entry(Crashing)):
-        mhe, plain = estimator(backend="crashing", isolated=True), estimator(backend="banded")
-        seen = set()
-        for y in [1.0, 1.0, -2.0, 3.0, -1.0, -1.0, 4.0, 0.5, 0.1, -3.0]:
-            estimate, other = mhe.update([y]), plain.update([y])
-            assert estimate.cost <= estimate.candidate_cost
-            assert estimate.candidate_cost == pytest.approx(other.candidate_cost)
-            failed = bool(estimate.status & qpmhe.Status.SOLVER_FAILED)
-            seen.add(failed)
-            assert failed == ("SIGSEGV" in estimate.message)
-            assert estimate.improved != failed
-        assert seen == {True, False}
-        mhe.reset()
-        assert mhe.update([1.0]).time == 0
-    mhe = estimator(backend="osqp", isolated=True)
-    for y in (1.0, 0.5, 0.2, 0.8, 0.3, 0.4):
-        mhe.update([y])
-    twin = copy.deepcopy(mhe)
-    assert twin.settings.isolated
-    np.testing.assert_array_equal(mhe.update([0.1]).state, twin.update([0.1]).state)
-    with pytest.raises(OptionError, match=r"isolated is True, but engine='compiled' .*python"):
-        estimator(engine="compiled", isolated=True)

@@ -1,13 +1,11 @@
 """Recording the QPs that a backend meets: it sees all of them, and changes nothing."""
 
-import warnings
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from qpmhe_solvers import (
-    QP,
     Backend,
     BackendError,
     InvalidInputError,
@@ -37,22 +35,16 @@ class Prompted(Solver):
 
     def __init__(self, statuses, options):
         super().__init__(options)
-        self.left, self.work, self.calls = list(statuses), None, []
+        self.left, self.work, self.calls = list(statuses), np.zeros((5, 2)), []
 
     def _solve(self, qp, start):
         raise NotImplementedError
 
     def solve(self, qp, start=None):
-        self.calls += [qp.band.tobytes(), start]
+        self.calls += [self.time_limit, qp.band.tobytes(), start]
         status = self.left.pop(0)
-        if isinstance(status, Solution):
-            return status
-        if not status.usable:
-            return Solution(None, status, message="gave up")
-        if self.work is None:
-            self.work = np.zeros((qp.stages, qp.n))  # used again and again, as banded's is
-        self.work += 1.0
-        return Solution(self.work, status)
+        self.work += 1.0  # used again and again, as banded's is
+        return Solution(self.work if status.usable else None, status, message="as far as I got")
 
     def prepare(self, size):
         self.calls.append(("prepare", size))
@@ -79,11 +71,7 @@ def test_every_backend_is_seen_and_left_alone(name, tmp_path):
             expected, found = plain.solve(qp, start), watched.solve(qp, start)
             stored = load(recording.files[-1])
             assert stored.path.name == f"qp-{number:06d}-{found.status.name.lower()}.npz"
-            for one in ("status", "iterations", "message"):
-                assert getattr(stored.solution, one) == getattr(found, one)
-            for array in ("d", "bound_duals", "row_duals"):
-                one, other = getattr(stored.solution, array), getattr(found, array)
-                np.testing.assert_array_equal(one, other)
+            np.testing.assert_array_equal(stored.solution.d, found.d)
             # proxqp rounds as its memory happens to be aligned.
             np.testing.assert_allclose(found.d, expected.d, rtol=1e-9, atol=1e-12)
             assert found.status is expected.status
@@ -96,24 +84,19 @@ def test_every_backend_is_seen_and_left_alone(name, tmp_path):
 
 
 def test_the_whole_contract_reaches_the_solver(tmp_path):
-    answer = Solution(np.full((5, 2), 3.0), SolveStatus.STOPPED, message="as far as I got")
-    start = np.zeros((5, 2))
-    with recorded(tmp_path, answer) as recording:
+    with recorded(tmp_path, SolveStatus.STOPPED) as recording:
         solver = create(recording.backend, CLOCKED)
-        made = solver._inner.solver
-        assert (made.time_limit, made.options) == (9.0, CLOCKED)
         solver.prepare(12)
         solver.shift()
         solver.time_limit = 2.0
-        found = solver.solve(QPS[0], start)
+        found = solver.solve(QPS[0], QPS[0].gradient)
     assert (found.status, found.message) == (SolveStatus.STOPPED, "as far as I got")
-    assert (found.d == 3.0).all()
-    assert made.time_limit == 2.0
-    assert made.calls[:3] == [("prepare", 12), "shift", QPS[0].band.tobytes()]
-    assert (made.calls[3] == start).all()
+    *calls, start = solver._inner.solver.calls
+    assert calls == [("prepare", 12), "shift", 2.0, QPS[0].band.tobytes()]
+    assert (start == QPS[0].gradient).all()
     public = {name for name in vars(Solver) if not name.startswith("_")}
-    public -= {"time_limit", "solve"}
-    assert public <= set(vars(type(solver)))  # none that a later contract adds is forgotten
+    # None that a later contract adds is forgotten.
+    assert public - {"time_limit", "solve"} <= set(vars(type(solver)))
 
 
 @pytest.mark.parametrize(
@@ -122,7 +105,6 @@ def test_the_whole_contract_reaches_the_solver(tmp_path):
         ("all", {}, {}, set()),
         ("failed", {}, {}, {"SOLVED", "STOPPED", "INACCURATE", "UNCONSTRAINED"}),
         ("suspicious", {}, {}, {"SOLVED"}),
-        ("suspicious", {"max_iterations": 5}, {}, {"SOLVED", "STOPPED"}),
         ("suspicious", {"time_limit": 1.0}, {}, {"SOLVED", "STOPPED"}),
         ("suspicious", {}, {"inequalities": False}, {"SOLVED", "UNCONSTRAINED"}),
     ],
@@ -154,23 +136,22 @@ def test_no_more_than_the_limit_is_written_with_numbers_that_go_on(tmp_path, opt
 
 
 def test_with_a_time_limit_files_wait_for_the_end_and_hold_what_was_then(tmp_path):
-    qp, _ = make(3, 2, bounds="all")
+    qp = QPS[0].copy()
     gradient = qp.gradient.copy()
     with recorded(tmp_path, SOLVED, SOLVED, only="all") as recording:
         solver = create(recording.backend, CLOCKED)
         for _ in range(2):
-            solver.solve(qp, qp.lower)
+            solver.solve(qp, gradient)
             assert not list(tmp_path.iterdir())
             qp.gradient += 1.0
     for k, one in enumerate(map(load, recording.files)):
         assert (one.qp.gradient == gradient + k).all()
         assert (one.solution.d == 1.0 + k).all()
-        assert (one.start == qp.lower).all()
+        assert (one.start == gradient).all()
         assert one.options == CLOCKED
 
 
-@pytest.mark.parametrize("options", [SolverOptions(), CLOCKED])
-def test_a_full_disk_ends_the_recording_with_one_warning(tmp_path, monkeypatch, options):
+def test_a_full_disk_ends_the_recording_with_one_warning(tmp_path, monkeypatch):
     calls = []
 
     def fills(*arguments, **options):
@@ -182,7 +163,7 @@ def test_a_full_disk_ends_the_recording_with_one_warning(tmp_path, monkeypatch, 
     monkeypatch.setattr(module, "dump", fills)
     recording = Recording(tmp_path, "banded", only="all")
     recording.__enter__()
-    solver = create(recording.backend, options)
+    solver = create(recording.backend)
     for _ in range(5):
         assert solver.solve(QPS[0]).status is SOLVED
     with pytest.warns(RecordingWarning, match=r"after 1 files in .*No space left") as caught:
@@ -207,9 +188,6 @@ def test_outside_of_the_block_nothing_is_left_of_it(tmp_path):
     with pytest.raises(ZeroDivisionError), Recording(tmp_path, "banded"):
         _ = 1 / 0
     assert backends() == before
-    with warnings.catch_warnings(action="error"), Recording(tmp_path / "new", "banded") as one:
-        create(one.backend).solve(QP(1, 1))
-    assert one.wanted == 1  # a Hessian of zeros
     (tmp_path / "file").write_text("")
     for arguments, error, words in [
         ({"backend": "nonsense"}, BackendError, "'nonsense' is not known"),

