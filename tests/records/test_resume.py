@@ -3,13 +3,14 @@
 import contextlib
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qpmhe.records import CheckpointError, RecordError
-from qpmhe.records.checkpoints import load
+from qpmhe.records.checkpoints import load, save
 
 from .oscillator import lines
 from .tools import (
@@ -153,7 +154,8 @@ def test_damaged_checkpoints_and_results_that_do_not_belong_to_them(cut):
         refused(words)
     # What stands behind the checkpoint is computed again in any case.
     Path("out.csv").write_bytes(content[: known + 5] + b"#" + content[known + 6 :])
-    resume()
+    save(CHECKPOINT, replace(load(CHECKPOINT), versions={"qpmhe": "0.0"}))
+    assert "0.0" in resume().notes[0]
     assert get("out.csv").startswith(content)
     Path("out.csv").unlink()
     with pytest.raises(CheckpointError, match="is missing"):
