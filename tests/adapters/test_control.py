@@ -68,8 +68,6 @@ def rotating():
         (lambda: control.ss(A, B, C, np.inf), {"dt": 0.1}, InvalidInputError, "D of the system"),
         (lambda: control.ss(A, B, C, D), {}, OptionError, "dt is missing"),
         (lambda: control.ss(A, B, C, D, 0.1), {"dt": 0.2}, OptionError, "leave it out"),
-        (lambda: control.ss(A, B, C, D, 0.1), {"method": "rk4"}, OptionError, "discrete"),
-        (lambda: control.ss(A, B, C, D), {"dt": 0.1, "method": "foo"}, OptionError, "foo"),
     ],
 )
 def test_what_does_not_fit_is_refused(made, options, error, words):

@@ -18,20 +18,14 @@ FUNCTION = sympy.Function("g")(X[0])
 WRONG = [
     ([X[0]], [X[1]], X, "one for each"),
     ([X[0] * sympy.Symbol("k"), X[1]], [X[0]], X, "k, which is neither"),
-    (["(", X[1]], [X[0]], X, "expected SymPy expressions"),
     ([X[0] > 0, X[1]], [X[0]], X, "f contains x1 > 0; expected SymPy expressions"),
-    (X, [], X, "h is empty"),
     ([X[0] * sympy.Symbol("t"), X[1]], [X[0]], X, "f contains t, .*varying quantities inputs"),
     ([X[0], sympy.Symbol("x2", real=True)], [X[0]], X, "x2 has the name .* real=True"),
     ([FUNCTION, X[1]], [X[0]], X, r"f contains g\(.*unknown functions"),
-    ([X[0], X[1]], [X[0] / sympy.Integer(0)], X, "h is .* finite real value"),
     ([sympy.floor(X[0]), X[1]], [X[0]], X, r"f has the derivative .*floor\(x1\)"),
     (X, [sympy.meijerg([[], []], [[0], []], X[0])], X, "h .*contains meijerg.*Python functions"),
-    ([sympy.Derivative(sympy.sin(X[0]), X[0]), X[1]], [X[0]], X, r"f contains \[Derivative"),
     (X, [X[0]], [X[0], X[0]], "x contains x1 2 times"),
-    (X, [X[0]], [], "x is empty"),
     (X, [X[0]], "x1", "x contains 'x1'; expected symbols"),
-    (X, [X[0]], [X[0], X[0] + X[1]], r"x contains x1 \+ x2"),
     (X, [X[0]], [X[0], sympy.Symbol("b", imaginary=True)], "b is declared as not real.*real=True"),
 ]
 
