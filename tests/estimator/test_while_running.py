@@ -146,6 +146,13 @@ def test_set_gives_the_estimator_that_was_made_with_the_values(name, when):
             assert found.cost == pytest.approx(expected.cost, rel=1e-7)
 
 
+def test_set_before_the_first_sample_projects_the_start():
+    for kalman in (None, "ExtendedKalman"):
+        mhe, states = estimator(sets=SETS, kalman=kalman), Box([0.6, -1.0], [1.0, np.inf])
+        assert mhe.set(bounds={"states": states}) is None
+        assert states.violation(mhe.state) == 0.0
+
+
 @every
 def test_parameters_are_the_last_inputs(name):
     mhe, plain = estimator(**OPTIONS[name]), estimator(**OPTIONS[name], parameters=None)
