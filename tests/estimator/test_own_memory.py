@@ -143,15 +143,6 @@ def test_a_spoilt_estimator_goes_on_as_its_twin(name):
         assert_same(feed(spoilt, arguments, True), feed(twin, arguments))
 
 
-def test_state_and_filtered_are_rows_of_the_trajectory():
-    """As documented: changing one changes the other, of this estimate alone."""
-    estimate = estimator(delay=1).update([0.1], [0.0])
-    estimate.state[...] = 7.0
-    assert estimate.trajectory[-1].tolist() == [7.0, 7.0]
-    assert np.shares_memory(estimate.filtered, estimate.trajectory)
-    assert not np.shares_memory(estimate.candidate, estimate.trajectory)
-
-
 # Interrupts
 
 
