@@ -141,7 +141,6 @@ def test_a_hidden_mode_is_named_in_any_coordinates():
 def test_designs_that_cannot_be():
     for options, kind, text in (
         ({}, OptionError, ["given: none of them; expected either the poles, or"]),
-        ({"poles": [0.1, 0.2], "noise": 1.0}, OptionError, ["given: poles, noise; expected"]),
         ({"poles": [0.1, 1.0]}, OptionError, ["poles 1 do not lie inside the unit", "exp(s dt)"]),
         ({"poles": [0.5j, 0.5j]}, OptionError, ["poles is ", "complex poles in conjugate"]),
         ({"poles": [0.5] * 3, "system": Plant(23).system, "at": np.zeros(3)}, OptionError,

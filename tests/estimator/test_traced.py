@@ -18,7 +18,7 @@ from .same import Interruption
 
 ZOO = qpmhe.models.catalogue()
 ENGINES = ["python", "compiled"] if find_compiler() else ["python"]
-YS = np.random.default_rng(0).normal(size=200)
+KEPT, YS = [], np.random.default_rng(0).normal(size=200)
 
 A = np.array([[0.9, 0.2], [-0.1, 0.8]])
 
@@ -38,11 +38,11 @@ STRAIGHT = {
     "dot": lambda x: np.dot(A, x) + x.dot(A),
     "a product over nothing": lambda x: x + x[2:] @ np.zeros((0, 2)),
     "einsum": lambda x: np.einsum("ij,...j->...i", A, x),
-    "outer": lambda x: np.outer(x, x) @ x,
     "cross": lambda x: np.cross(np.array([x[0], x[1], 1.0]), [1.0, 2.0, 3.0]),
     "solve": lambda x: np.linalg.solve(np.array([[2.0 + x[0] ** 2, 1.0], [1.0, 3.0]]), x),
     "inv and det": lambda x: np.linalg.inv(np.diag(2.0 + x**2)) * np.linalg.det(A * x[0]),
     "norm": lambda x: x / (1.0 + np.linalg.norm(x, axis=-1, keepdims=True)),
+    "norms": lambda x: [np.linalg.norm(x, 1), np.linalg.norm(x, np.inf), np.clip(x[0], -1, 2)],
     "sums": lambda x: x + x.sum() + np.mean(x) + x.prod() + np.cumsum(x) + np.std(x),
     "where": lambda x: np.where((x > 0.0) & (x < 9.0), x, 2.0 * x),
     "extrema": lambda x: np.maximum(x, 0.0) + np.minimum(x[::-1], x) + x.max() - np.min(x),
@@ -64,7 +64,7 @@ STRAIGHT = {
     "any": lambda x: np.where(np.any(x > 1.0), x, -x) + np.where(np.all(x > 1.0), 1.0, x),
     "pieces": lambda x: np.concatenate((x[1:], x[:1])) + np.roll(x, 1) + np.stack((x[1], x[0])),
     "math": lambda x: math.atan2(x[0], x[1]) + math.sqrt(x[0] ** 2) + math.log(abs(x[1])),
-    "constants": lambda x: np.linalg.inv(A) @ x + np.zeros(2) + np.linspace(0.0, 1.0, 2),
+    "constants": lambda x: np.linalg.inv(A) @ np.outer(x, x) @ x + np.linspace(0.0, 1.0, 2),
 }
 
 
@@ -101,11 +101,17 @@ def swallowed(x):
     return 0.5 * x if beyond else 0.95 * x
 
 
+def remembered(x):
+    KEPT.append(x)
+    return x + 1e-3 * KEPT[-2] if len(KEPT) > 1 else x
+
+
 # The function, and a word of the reason why it is not traced.
 BAD = {
     "a branch": (lambda x: x if x[0] > 12.0 else 2.0 * x, "branch"),
     "float()": (lambda x: float(x[0]) * x, "float()"),
     "a type": (lambda x: x if type(x[0]) is np.float64 else -x, "same expression"),
+    "what it was called with": (remembered, "same expression"),
     "random numbers": (lambda x: x + np.random.default_rng().normal(), "again"),
     "a special function": (lambda x: __import__("scipy.special").special.gamma(x), "gamma"),
     "an exception": (lambda x: 1 / 0, "ZeroDivisionError"),
@@ -134,17 +140,12 @@ def test_numpy_is_itself_after_a_trace_and_in_other_threads():
 
 @pytest.mark.parametrize("name", ZOO)
 def test_models_of_the_zoo_are_traced_and_are_the_same(name):
-    """At states near those of a simulation."""
+    """At states of a simulation."""
     example = ZOO[name]()
     system, scenario = example.system, example.scenario
     assert system.derivatives == {"f": "traced", "h": "traced"}, system.explain()
-    record, generator = scenario.simulate(1, 12), np.random.default_rng(0)
-    spread = np.abs(record.states).max(axis=0) + 0.1
-    states = record.states[:12] + 0.02 * spread * generator.standard_normal((12, system.n))
-    if system.states is not None:
-        states = np.clip(states, system.states.lower, system.states.upper)
-    own = system.copy(traced=True)
-    for k, x in enumerate(states):
+    record, own = scenario.simulate(1, 12), system.copy(traced=True)
+    for k, x in enumerate(record.states[:12]):
         u = record.inputs[k] if system.m else np.zeros(0)
         for which in ("f", "h"):
             found, expected = getattr(own, which)(x, u), getattr(system, which)(x, u)
@@ -168,11 +169,11 @@ class Plant:
         return qpmhe.System(self.f, self.h, n=2, p=1, **options)
 
 
-def estimator(system, engine="python"):
+def estimator(system, engine="python", **options):
     cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10.0 * np.eye(2), noise=4.0)
     return qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger([0.4, 0.1]), cost, horizon=5, initial_state=[1.0, -1.0],
-        max_qps=2, engine=engine,
+        max_qps=2, engine=engine, **options,
     )
 
 
@@ -226,6 +227,29 @@ def test_a_warning_as_an_error_takes_no_sample(engine):
         assert mhe.time == 1
         estimate = mhe.update(0.4)
     assert estimate.cost == pytest.approx(cost_by_hand(plant, estimate, [0.5, 0.4]), rel=1e-12)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("options", [
+    {"candidate": "reinitialized", "delay": 2}, {"arrival": "smoothed", "warm_start": True},
+], ids=["reinitialized", "smoothed"])
+def test_what_a_compiled_estimator_hands_over_is_all_it_knew(options):
+    one, two = (estimator(Plant().system(), engine, **options) for engine in ENGINES)
+    for t, y in enumerate(YS[:30]):
+        own = {"noise_weight": [[7.0]]} if t % 5 == 2 else {}
+        expected, expectation = one.update(y, **own), contextlib.nullcontext()
+        if t == 20:
+            # As if its trace had failed, without any difference.
+            two._engine._system.trace_fault = lambda x, u: "no difference"
+            two._engine._next_check = 0
+            expectation = pytest.warns(EngineWarning, match="no difference")
+        with expectation:
+            found = two.update(y, **own)
+        np.testing.assert_allclose(found.trajectory, expected.trajectory, atol=1e-8)
+        assert found.cost == pytest.approx(expected.cost, rel=1e-8)
+        if expected.delayed is not None:
+            np.testing.assert_allclose(found.delayed, expected.delayed, atol=1e-8)
+    assert two.engine == "python"
 
 
 # Models that are not traced, or in part
