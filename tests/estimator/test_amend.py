@@ -104,13 +104,11 @@ def test_a_growing_window_and_slides_to_the_front():
 
 def test_nothing_new_changes_nothing():
     """Nor does a measurement that is too large to be squared."""
-    for hidden in ([], [0, 1], [0, 1, 2]):
-        record, mhe = samples(6, missing=0.0), estimator()
-        record[4][0][hidden] = NAN
-        for y, u, _ in record:
-            before = mhe.update(y, u)
-        for nothing in (None, [None] * 3, [1e200, None, None]):
-            after = mhe.amend(4, nothing)
-            same(before, after)
-            assert Status.MODEL_FAILED not in after.status
-            np.testing.assert_array_equal(mhe.state, before.state)
+    mhe = estimator()
+    for y, u, _ in samples(6, missing=0.0):
+        before = mhe.update(y, u)
+    for nothing in (None, [None] * 3, [1e200, None, None]):
+        after = mhe.amend(4, nothing)
+        same(before, after)
+        assert Status.MODEL_FAILED not in after.status
+        np.testing.assert_array_equal(mhe.state, before.state)

@@ -1,7 +1,6 @@
 """The compiled step beside the Python one, on data and models that the table of cases lacks."""
 
 import copy
-import functools
 import math
 import pickle
 
@@ -11,7 +10,7 @@ import pytest
 import qpmhe
 from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
-from qpmhe.errors import EngineWarning, InvalidInputError, OptionError
+from qpmhe.errors import InvalidInputError
 from qpmhe.estimation.snapshot import read
 from tests.codegen.cases import Case, case, recorded, spd
 from tests.codegen.test_agreement import ARRAYS, agree
@@ -22,6 +21,8 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
 ]
 ENGINES, STEPS, INF, NAN = ("python", "compiled"), 24, np.inf, np.nan
+
+
 def system_of(f, h, **options):
     # The Python side is evaluated by CasADi's virtual machine: nothing in common but the model.
     return qpmhe.from_casadi(f, h, compiled=False, **options)
@@ -68,18 +69,8 @@ def large(n):
 MODELS = {
     "wide": wide,
     # Where the rows of the factorisation's panels change their padding.
-    "n=23": lambda: large(23), "n=25": lambda: large(25),
-    **{f"N={k}": lambda k=k: case("inputs").with_options(horizon=k) for k in (1, 12)},
-    # Components that do not depend on the state, and an output that depends on none.
-    "no slopes": lambda: case_of(system_of(
-        lambda x, u: [u[0], 0.5], lambda x, u: 2.0 * u[0], n=2, m=1
-    ), [[0.1], [0.1]], [0.5, 0.5]),
+    "n=25": lambda: large(25), "N=1": lambda: case("inputs").with_options(horizon=1),
 }
-
-
-@functools.cache
-def made(name):
-    return MODELS[name]()
 
 
 def spoilt(one, generator, share=0.3):
@@ -116,15 +107,10 @@ def equal(one, other):
     )
 
 
-def loaded(mhe, fresh):
-    fresh.load_state_dict(pickle.loads(pickle.dumps(mhe.state_dict())))
-    return fresh
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_the_same_estimates_whatever_comes(name):
     """And copies of an estimator, however they are made, go on to the last bit."""
-    one = made(name)
+    one = MODELS[name]()
     for k, way in enumerate((
         {"max_qps": 3, "delay": 1}, {"max_qps": None, "warm_start": True},
         {"max_qps": None, "backend": "banded", "tolerance": 1e-3, "candidate": "reinitialized"},
@@ -146,10 +132,8 @@ def test_the_same_estimates_whatever_comes(name):
             if t == 3 * k + 1:
                 fresh = one.estimator("compiled", **way)
                 fresh.update(**one.samples[0])
-                copies = [
-                    loaded(compiled, fresh), pickle.loads(pickle.dumps(compiled)),
-                    copy.deepcopy(compiled),
-                ]
+                fresh.load_state_dict(compiled.state_dict())
+                copies = [fresh, pickle.loads(pickle.dumps(compiled)), copy.deepcopy(compiled)]
         expected = reference.covariances()
         for mhe in (compiled, *copies):
             np.testing.assert_allclose(
@@ -158,25 +142,12 @@ def test_the_same_estimates_whatever_comes(name):
             assert (mhe.engine, mhe.time) == ("compiled", STEPS)
 
 
-def test_a_discount_that_underflows_within_the_window():
-    """The oldest stages then weigh nothing: no reason for the factorisation to fail."""
-    system, estimates = system_of(lambda x: 0.9 * x, lambda x: x + 0.1 * x**3, n=1), []
-    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=5.0, noise=5.0, discount=0.01)
-    for horizon in (20, 190):
-        mhe = estimator(system, cost, horizon=horizon, initial_state=[0.5], max_qps=3)
-        estimates.append([mhe.update(y) for y in 0.3 + 0.1 * np.sin(np.arange(200.0))])
-    for short, long in zip(*estimates, strict=True):
-        assert Status.SOLVER_FAILED not in long.status
-        # What is 20 samples old weighs 1e-40.
-        np.testing.assert_allclose(long.state, short.state, rtol=1e-9)
-
-
 def test_an_outage_longer_than_the_window():
     """The observer waits where the model last worked, however long that is ago."""
     system = system_of(lambda x, u: x * u[0], lambda x, u: x, n=1, m=1)
     for engine in ENGINES:
         mhe = estimator(system, gain=0.5, engine=engine)
-        for samples in (1, 2, 3, 63, 64, 65, 130):
+        for samples in (1, 2, 64, 65):
             mhe.reset()
             with pytest.raises(InvalidInputError, match="no estimate yet"):
                 mhe.covariances()
@@ -189,42 +160,6 @@ def test_an_outage_longer_than_the_window():
             assert mhe.update([5.0], [1.0]).state[0] == pytest.approx(5.0, abs=3.0)
 
 
-def test_without_a_compiler_it_is_the_python_step_with_a_warning(monkeypatch, tmp_path):
-    """`tests/codegen/test_auto.py` has other reasons."""
-    monkeypatch.setenv("CC", "")
-    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path))
-    words = "falls back to the Python step: there is no C compiler.*install"
-    with pytest.warns(EngineWarning, match=words) as caught:
-        mhe = estimator()
-    assert [w.filename for w in caught] == [__file__]
-    assert mhe.engine == "python"
-    twin = estimator(engine="python")
-    for y in ([1.0], [0.5], [2.0]):
-        np.testing.assert_array_equal(mhe.update(y).trajectory, twin.update(y).trajectory)
-
-
-def test_what_has_no_c_form_is_an_error_with_a_remedy():
-    """`tests/codegen/test_write.py` has the rest."""
-    observer = qpmhe.OutputInjection(lambda z, v: 0.3 * v if v[0] > 0 else v)
-    words = r"no C code for this estimator: the correction of .* has no C form \(.*asks for"
-    with pytest.raises(OptionError, match=words):
-        estimator(observer=observer)
-
-
-# What it remembers
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_late_measurements_are_no_samples_with_a_far_observer(engine):
-    mhe = estimator(gain=0.0, horizon=3, engine=engine)
-    mhe.update([1e3])
-    for _ in range(4):
-        assert Status.OBSERVER_FAR not in mhe.amend(0, [1e3]).status
-    loaded(mhe, copy.deepcopy(mhe))
-    assert Status.OBSERVER_FAR not in mhe.update([1e3]).status
-    assert Status.OBSERVER_FAR in mhe.update([1e3]).status
-
-
 def test_damaged_snapshots_are_refused_whole():
     one = case("reactor")
     mhe, twin = (one.estimator("compiled") for _ in range(2))
@@ -234,9 +169,7 @@ def test_damaged_snapshots_are_refused_whole():
     good = read(mhe.state_dict())
     memory = good["memory"]
     damaged = [{}, {**good, "problem": (2, 1, 0, 99)}, {**good, "engine": "python"}]
-    damaged += [{**good, "memory": bad} for bad in (
-        None, "abc", memory[:-1], memory[None], np.full_like(memory, 255), [300] * memory.size,
-    )]
+    damaged += [{**good, "memory": bad} for bad in (None, memory[:-1], np.full_like(memory, 255))]
     for name, value in (
         ("history", NAN), ("z_end", NAN), ("last_good", INF), ("trajectory", NAN),
         ("is_observed", 2), ("is_complete", 0), ("step", -1.0), ("first", 9), ("far", -1),
@@ -254,22 +187,31 @@ def test_damaged_snapshots_are_refused_whole():
 
 def test_a_record_is_its_samples():
     """Longer than what is handed to C at once, with missing samples, and in several calls."""
-    one, options = made("wide"), {"warm_start": True, "delay": 2}
+    one, options = wide(), {"warm_start": True, "delay": 2}
     ys = np.resize([
         np.full(one.system.p, NAN) if sample["y"] is None else sample["y"]
         for sample in spoilt(one, np.random.default_rng(4), share=0.1)
     ], (600, one.system.p))
     single, whole = (one.estimator("compiled", **options) for _ in range(2))
-    for first, last in ((0, 550), (550, 550), (550, 551), (551, 600)):
-        start, observer, rows = single.state, single.observer_state, ys[first:last]
+    for first, last in ((0, 550), (550, 550), (550, 600)):
+        rows = ys[first:last]
         run = whole.run(np.asfortranarray(rows[::-1][::-1]))
         estimates = [single.update(y) for y in rows]
-        expected = qpmhe.Run.of(start, estimates, observer_start=observer)
-        for field in ("states", "observer_states", "filtered", "costs", "candidate_costs", "flags",
-                      "qps", "delayed"):
-            np.testing.assert_array_equal(getattr(run, field), getattr(expected, field), field)
-        assert len(run.times) == len(run) == last - first
+        np.testing.assert_array_equal(run.states[-1], single.state)
+        for field, name in (("costs", "cost"), ("qps", "qps"), ("filtered", "filtered")):
+            found, expected = getattr(run, field), [getattr(one, name) for one in estimates]
+            np.testing.assert_array_equal(found, np.reshape(expected, found.shape))
         assert (run.times > 0.0).all()
-        assert whole.time == single.time
     runs = [mhe.run(ys, covariances=True).covariances for mhe in (single, whole)]
     np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_rows_dropped_for_long_are_worth_a_warning(engine):
+    """What is measured moves farther than W lets the state follow."""
+    system = system_of(lambda x: x, lambda x: x, n=1, disturbances=qpmhe.Box(-0.01, 0.01))
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1e-3, noise=10.0)
+    mhe = estimator(system, cost, 0.9, horizon=4, max_qps=3, engine=engine)
+    with pytest.warns(qpmhe.ObserverWarning, match="inequalities were dropped in") as caught:
+        _ = [mhe.update([3.0 * t]) for t in range(30)]
+    assert [w.filename for w in caught] == [__file__]

@@ -1,6 +1,5 @@
 """Jacobians: by complex steps, by differences, or the user's own, in any unit."""
 
-import json
 import math
 
 import numpy as np
@@ -10,7 +9,6 @@ import qpmhe
 from qpmhe.errors import ModelError
 
 from .spoil import check
-from .untraced import untraced
 
 NONE = np.zeros(0)
 COMPLEX, DIFFERENCES = "complex step", "finite differences"
@@ -130,17 +128,15 @@ def test_differences_at_a_bound_go_inwards(unit):
             )
 
 
-def test_an_estimator_on_a_bound_needs_no_model_beyond_it():
-    system = qpmhe.System(
-        untraced(lambda x: [0.9 * x[0] + 0.1 * x[0] * math.sqrt(x[0])]), lambda x: x, n=1, p=1,
-        states=qpmhe.Box([0.0], [np.inf]),
-    )
-    # Nor does the test of a correction.
-    observer = qpmhe.OutputInjection(lambda z, v: 0.1 * v * math.sqrt(z[0]))
-    for gain in ([0.5], observer):
-        estimate = estimator(system, 0.1, gain, [0.0], 0.01).update([0.2])
-        assert estimate.improved, estimate.message
-        assert not estimate.message
+def test_differences_at_an_upper_bound_are_of_second_order():
+    def f(x):
+        if x[0] > 1.0:
+            raise ValueError("beyond the bound")
+        return [math.exp(float(x[0]))]
+
+    system = system_of(f, n=1, states=qpmhe.Box([-1.0], [1.0]), scales=[1.0])
+    points = np.array([[1.0], [1.0 - 1e-9], [0.5], [-1.0]])
+    compare(system.f_jacobian, points, np.exp(points)[..., None], rtol=1e-9)
 
 
 # Jacobians of the user's own
@@ -154,22 +150,15 @@ def slope(x):
     return np.array([[x[1], x[0]], [np.cos(x[0]), 2.0]])
 
 
-@pytest.mark.parametrize("wrong", [0.05, 1e4])
-def test_a_wrong_entry_is_named_with_both_values(wrong):
+def test_a_wrong_entry_is_named_with_both_values():
     for entry in np.ndindex(2, 2):
         def jacobian(x, entry=entry):
             value = slope(x)
-            value[entry] += wrong
+            value[entry] += 0.05
             return value
 
-        with pytest.raises(ModelError) as caught:
-            system_of(spiral, jacobian, scales=[1.0, 1.0])
-        text = str(caught.value)
-        assert f"f_jacobian[{entry[0]}, {entry[1]}] is " in text
-        x = np.array(json.loads(text.split("x = ")[1].split(", but")[0]))
-        assert f"is {jacobian(x)[entry]:.6g} at" in text
-        right = float(text.split("there is ")[1].split(". Correct")[0])
-        assert right == pytest.approx(slope(x)[entry], rel=1e-5)
+        words = [f"f_jacobian[{entry[0]}, {entry[1]}] is ", "but the derivative"]
+        check(ModelError, words, system_of, spiral, jacobian, scales=[1.0, 1.0])
 
 
 def test_wrong_jacobians():
@@ -189,39 +178,20 @@ def test_wrong_jacobians():
     system = system_of(lambda x: x + 1e-9 * x**4, lambda x: np.diag(1.0 + 0.0 * x))
     words = ["f_jacobian[1, 1] is 1 at x = [1.0, 1000.0]", "there is 5"]
     check(ModelError, words, estimator, system, 1.0, [0.1, 0.1], [1.0, 1000.0])
-    # At a kink any slope between the sides is a derivative.
-    for at_zero in (0.3, 0.6, 1.2):
-        system = system_of(
-            lambda x: np.where(x > 0, 0.9 * x, 0.3 * x), lambda x, at_zero=at_zero: np.where(
-                x > 0, 0.9, np.where(x < 0, 0.3, at_zero))[..., None], n=1, scales=[1.0],
-        )
-        if at_zero > 1.0:
-            check(ModelError, ["is 1.2 at"], system.check, np.zeros(1), NONE)
-        else:
-            system.check(np.zeros(1), NONE)
 
 
 def test_right_jacobians_are_used_as_given():
     x = np.random.default_rng(6).standard_normal((5, 2))
     for jacobian in (
         slope, lambda x: [[x[1], x[0]], [math.cos(x[0]), 2.0]],
-        lambda x: np.stack([
-            np.stack([x[..., 1], x[..., 0]], axis=-1),
-            np.stack([np.cos(x[..., 0]), 2.0 + 0.0 * x[..., 0]], axis=-1),
-        ], axis=-2),
         lambda x: np.array([[x[1], x[0]], [np.cos(x[0]), 2.0 + 0.0 * x[0]]]),
     ):
         system = system_of(spiral, jacobian)
         assert (system.f_jacobian.method, system.h_jacobian.method) == ("given", COMPLEX)
         compare(system.f_jacobian, x, [slope(xi) for xi in x], rtol=1e-14)
-    for f, m in ((lambda x: x @ LINEAR.T, 0), (lambda x, u: x @ LINEAR.T + u, 2)):
-        system = system_of(f, lambda x: LINEAR, m=m)  # of many states, too
-        found = system.f_jacobian.batch(np.ones((4, 2)), np.ones((4, m)))
-        np.testing.assert_array_equal(found, [LINEAR] * 4)
+    linear = system_of(lambda x: x @ LINEAR.T, lambda x: LINEAR)
+    compare(linear.f_jacobian, x, [LINEAR] * 5)
     system = qpmhe.System(  # of one output a vector will do
         spiral, lambda x: 2.0 * x[..., 1:], n=2, p=1, h_jacobian=lambda x: np.array([0.0, 2.0])
     )
     compare(system.h_jacobian, np.ones((3, 2)), [[[0.0, 2.0]]] * 3)
-
-
-# In any unit

@@ -3,7 +3,6 @@
 `tests/test_odd_values.py` gives every argument odd values; here is a message of each kind.
 """
 
-import itertools
 import math
 from operator import and_
 
@@ -22,7 +21,7 @@ from qpmhe.errors import (
     WeightError,
 )
 
-from .spoil import A, check, cost_of, estimator, system_of, unharmed, with_input
+from .spoil import check, cost_of, estimator, system_of, unharmed, with_input
 from .untraced import untraced
 
 TERMS = ("prior", "disturbance", "noise")
@@ -47,6 +46,8 @@ def test_parts():
         InvalidInputError, ["Luenberger has no covariance", "qpmhe.ExtendedKalman"],
         estimator, cost=cost_of(prior=qpmhe.ObserverPrior()),
     )
+
+
 def test_initial_states():
     system = system_of(h=lambda x: np.sqrt(x[..., :1]))
     mhe = estimator(system)
@@ -55,7 +56,6 @@ def test_initial_states():
     for state, kind, text in (
         ([[1.0, 2.0]], ShapeError, ["initial_state", "shape (1, 2)", "(2,)"]),
         ([math.inf, 1.0], InvalidInputError, ["initial_state", "[inf, 1.0]", "finite"]),
-        ([1.0, 2j], InvalidInputError, ["initial_state", "2j", "real numbers"]),
         ([-1.0, 2.0], ModelError, ["h is [nan] at the initial state [-1.0, 2.0]"]),
     ):
         check(kind, text, estimator, system, initial_state=state)
@@ -64,23 +64,20 @@ def test_initial_states():
         np.testing.assert_array_equal(mhe.state, before)
 
 
-BAD_MATRICES = [
-    (np.ones((2, 2)), WeightError, ["eigenvalue ", "positive definite"]),
-    (np.diag([1.0, -2.0]), WeightError, ["eigenvalue -2", "positive definite"]),
-    ([[1.0, 0.5], [0.0, 1.0]], WeightError, ["not symmetric", "by 0.5"]),
-    ([1.0, 2.0], ShapeError, ["shape (2,)", "np.diag"]),
-    ([[1.0, 0.0], [0.0, math.nan]], InvalidInputError, ["nan", "finite"]),
-]
-
-
 def test_weights_and_covariances():
-    for name, (value, kind, text) in itertools.product(TERMS, BAD_MATRICES):
-        check(kind, [f"{name} ", *text], cost_of, 2, 2, **{name: value})
-        covariances = dict.fromkeys(TERMS, np.eye(2)) | {name: value}
-        if name != "noise":  # singular ones will do
-            text = [word.replace("definite", "semidefinite") for word in text]
-        if name == "noise" or value is not BAD_MATRICES[0][0]:
-            check(kind, [f"{name} covariance ", *text], qpmhe.ExtendedKalman, **covariances)
+    for value, kind, text in (
+        (np.diag([1.0, -2.0]), WeightError, ["eigenvalue -2"]),
+        ([[1.0, 0.5], [0.0, 1.0]], WeightError, ["not symmetric", "by 0.5"]),
+        ([1.0, 2.0], ShapeError, ["shape (2,)", "np.diag"]),
+        ([[1.0, 0.0], [0.0, math.nan]], InvalidInputError, ["nan", "finite"]),
+    ):
+        for name in TERMS:
+            check(kind, [f"{name} ", *text], cost_of, 2, 2, **{name: value})
+            given = dict.fromkeys(TERMS, np.eye(2)) | {name: value}
+            check(kind, [f"{name} covariance ", *text], qpmhe.ExtendedKalman, **given)
+    singular = {name: np.ones((2, 2)) for name in ("prior", "disturbance")}
+    qpmhe.ExtendedKalman(**singular, noise=np.eye(2))
+    check(WeightError, ["noise ", "positive definite"], cost_of, 2, 2, noise=np.ones((2, 2)))
 
 
 def test_sets():
@@ -90,15 +87,12 @@ def test_sets():
         (Box, [0.0, 0.0], [1.0], SetError, ["(2,)", "(1,)", "equal length"]),
         (Box, [0.0, 2.0], [1.0, 1.0], SetError, ["component 1", "lower 2.0", "upper 1.0"]),
         (Polytope, np.eye(2), [1.0], SetError, ["shape (2, 2)", "bound (1,)", "(r, d) and (r,)"]),
-        (Polytope, np.diag([1.0, 0.0]), [1.0] * 2, SetError, ["row 1 of matrix is zero", "leave"]),
-        (Polytope, [[1.0], [-1.0]], [0.0, -1.0], SetError, [*empty, "Polytope(", "2 rows"]),
         (and_, quarter, Polytope([[-1.0, 1.0]], [-1.0]), SetError, empty),
         (and_, quarter, Polytope([[1.0] * 3], [1.0]), SetError, ["dimensions 2 and 3", "equal"]),
     ):
         check(kind, text, build, one, other)
-    for name, right in (("states", 2), ("disturbances", 2), ("noises", 1)):
-        text = [f"{name} has dimension 3", f"expected {right}"]
-        check(SetError, text, system_of, **{name: Box([0.0] * 3, [1.0] * 3)})
+    text = ["disturbances has dimension 3", "expected 2"]
+    check(SetError, text, system_of, disturbances=Box([0.0] * 3, [1.0] * 3))
     check(SetError, ["noises is (0.0, 1.0)", "qpmhe.Box"], system_of, noises=(0.0, 1.0))
 
 
@@ -109,36 +103,28 @@ def double(x, u=None):
 
 def test_systems():
     for make, name, expected, value in (
-        (system_of, "n", "integer >= 1", 0), (system_of, "p", "integer >= 1", 2.0),
-        (system_of, "m", "integer >= 0", -1), (ode, "dt", "finite number > 0", 0),
-        (ode, "method", "'euler', 'rk4'", "RK4"),
+        (system_of, "n", "integer >= 1", 0), (system_of, "m", "integer >= 0", -1),
+        (ode, "dt", "finite number > 0", 0), (ode, "method", "'euler', 'rk4'", "RK4"),
     ):
         check(OptionError, [f"{name} is {value!r}", expected], make, **{name: value})
     for name in ("f", "h"):
         functions = {"f": lambda x: x, "h": lambda x: x[..., :1], name: 3.0}
         check(ModelError, [f"{name} is 3.0", "a function"], qpmhe.System, **functions, n=2, p=1)
-        size = 2 if name == "f" else 1
-        text = [f"{name} returned shape (2, 2) at x = ", f"expected ({size},)", "Check n, p"]
+        text = [f"{name} returned shape (2, 2) at x = ", "Check n, p"]
         check(ModelError, text, system_of, **{name: lambda x: np.ones((2, 2))})
         text = [f"{name} changes its argument in place", "copy"]
         check(ModelError, text, system_of, **{name: double}, p=2, m=2)
     check(ModelError, ["f needs 2 arguments", "pass m"], system_of, lambda x, u: x)
-    check(ModelError, ["rate returned shape (3,)", "expected (2,)"], ode, lambda x: np.ones(3))
 
 
 def test_options_out_of_range():
     for name, value, *words in (
         ("horizon", 0, "expected an integer >= 1"), ("max_qps", 1.5, "expected an integer >= 0"),
         ("max_solver_iterations", 0, "expected an integer >= 1", "max_qps=0"),
-        ("tolerance", math.nan, "a finite number > 0"),
-        ("solver_tolerance", "tight", "a finite number > 0"),
-        ("time_budget", 0, "expected a finite number > 0"),
-        ("delay", -1, "expected an integer >= 0"), ("delay", 4, "at most the horizon, 3"),
+        ("tolerance", math.nan, "a finite number > 0"), ("time_budget", 0, "finite number > 0"),
+        ("delay", 4, "at most the horizon, 3"), ("warm_start", "best", "True or False"),
         ("engine", "Python", "expected one of", "'python'"),
         ("infeasible", "drop", "'drop_rows'", "'keep_candidate'"),
-        ("candidate", 0, "'observer'", "'reinitialized'"),
-        ("arrival", "smooth", "'observer'", "'smoothed'"),
-        ("warm_start", "best", "True or False"), ("project_observer", None, "True or False"),
     ):
         check(OptionError, [f"{name} is {value!r}", *words], estimator, **{name: value})
     names = [entry.name for entry in qpmhe.solvers.backends()]
@@ -148,9 +134,8 @@ def test_options_out_of_range():
 
 def test_unknown_options_are_refused_with_the_known_ones():
     for make in (estimator, system_of, cost_of, qpmhe.solvers.SolverOptions):
-        for kind in (OptionError, TypeError):
-            with pytest.raises(kind, match="has no option 'nonsense'; expect"):
-                make(nonsense=1)
+        with pytest.raises(TypeError, match="has no option 'nonsense'; expect"):
+            make(nonsense=1)
     with pytest.raises(OptionError, match="Did you mean max_qps"):
         estimator(max_qp=2)
 
@@ -170,28 +155,21 @@ OF_ONE = [
     (WeightError, ["noise_weight has the eigenvalue 0", "positive definite"],
      lambda mhe: mhe.update([1.0], noise_weight=0.0)),
     (ShapeError, ["measurements has shape (5, 2)", "(T, 1)"], lambda mhe: mhe.run(ONES[:, [0, 0]])),
-    (InvalidInputError, ["measurements", "high"], lambda mhe: mhe.run([[1.0], ["high"]])),
     (InvalidInputError, ["inputs"], lambda mhe: mhe.run(ONES, ONES)),
     (InvalidInputError, ["time is ", "an integer from ", "samples in the window", "longer"],
      lambda mhe: mhe.amend(mhe.time - 8, [1.0])),
-    (InvalidInputError, ["time is ", "an integer from "], lambda mhe: mhe.amend(mhe.time, [1.0])),
     (ShapeError, ["y has shape (0,)", "(1,)"], lambda mhe: mhe.amend(mhe.time - 1, [])),
 ]
 WITH_INPUT = [
     (InvalidInputError, ["u is missing", "update(y, u)"], lambda mhe: mhe.update([1.0])),
-    (ShapeError, ["u has shape (1,)", "expected (2,)"], lambda mhe: mhe.update([1.0], [1.0])),
     (InvalidInputError, ["u is missing", "2 inputs"], lambda mhe: mhe.run(ONES, None)),
     (ShapeError, ["inputs has 1 samples", "expected 5"], lambda mhe: mhe.run(ONES, [[0.0, 0.0]])),
-]
-IN_TIME = [
-    (OptionError, ["dt is nan", "finite number > 0"], lambda mhe: mhe.update([1], dt=math.nan))
 ]
 
 
 @pytest.mark.parametrize(("build", "wrong", "sample"), [
     (begun, OF_ONE, ([1.5],)), (with_input, WITH_INPUT, ([1.5], [0.1, 0.2])),
-    (lambda: estimator(ode(lambda x: x @ (A - np.eye(2)))), IN_TIME, ([1.5],)),
-], ids=["one output", "inputs", "time"])
+], ids=["one output", "inputs"])
 def test_samples_that_do_not_fit_leave_the_estimator_as_it_was(build, wrong, sample):
     unharmed(build, wrong, sample)
     text = ["time is 0", "no sample yet", "call update first"]
@@ -216,12 +194,11 @@ def correction(z, v):
     return 0.5 * v
 
 
-def scalar(f=lambda x: 0.9 * x, h=lambda x: x, gain=0.5, h_jacobian=None, **options):
+def scalar(f=lambda x: 0.9 * x, h=lambda x: x, observer=None, **slopes):
     return qpmhe.MovingHorizonEstimator(
-        qpmhe.System(f, h, n=1, p=1, h_jacobian=h_jacobian),
-        options.pop("observer", qpmhe.Luenberger([gain])),
-        qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0),
-        **({"horizon": 4, "initial_state": [1.0]} | options),
+        qpmhe.System(f, h, n=1, p=1, **slopes), observer or qpmhe.Luenberger([0.5]),
+        qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0), horizon=4,
+        initial_state=[1.0],
     )
 
 
@@ -229,7 +206,6 @@ def test_what_fails_at_the_newest_stage_is_in_the_message():
     beyond, no_slope = raising("beyond the table"), raising("no slope")
     for parts, text in (  # the observer is at 50 after a measurement of 100
         ({"f": beyond}, "f raised ValueError: beyond the table at x = [50."),
-        ({"h": lambda x: x if x[0].real < 20.0 else np.ones(3)}, "h returned shape (3,)"),
         ({"h": lambda x: np.where(x > 2.0, np.nan, x)}, "not finite at x = [50."),
         ({"h": untraced(lambda x: x), "h_jacobian": lambda x: no_slope(x).reshape(1, 1) / x},
          "the Jacobian of h raised ValueError: no slope at x = [50."),
@@ -245,26 +221,3 @@ def test_what_fails_at_the_newest_stage_is_in_the_message():
         assert text in estimate.message
     mhe.reset()  # a message is of its own step
     assert [mhe.update(1.0).message for _ in range(3)] == ["", "", ""]
-
-
-def test_what_a_trial_or_a_jacobian_raises_on_the_way_is_in_the_message():
-    """The observer stays at 1, and a measurement of 0 leads every step below it."""
-    below, slope = (raising(text, -np.inf) for text in ("a negative pressure", "no slope"))
-    given = {"f": lambda x: x, "gain": 0.0, "max_qps": 3}
-    mhe = scalar(
-        h=lambda x: x if x[0] >= 1.0 else below(x), h_jacobian=lambda x: np.eye(1), **given
-    )
-    estimate = mhe.update(0.0)
-    assert Status.NO_DECREASE in estimate.status
-    assert estimate.message.startswith("h raised ValueError: a negative pressure at x = [0.")
-    for fails, text in (
-        (slope, "the Jacobian of h raised ValueError: no slope"),
-        (lambda x: x * np.nan, "the Jacobian of f or h is not finite along the trajectory"),
-    ):
-        def h_jacobian(x, fails=fails):
-            return fails(x).reshape(1, 1) if x[0] < 0.9 else np.eye(1)
-
-        estimate = scalar(h=untraced(lambda x: x), h_jacobian=h_jacobian, **given).update(0.0)
-        assert Status.IMPROVED | Status.MODEL_FAILED in estimate.status
-        assert estimate.qps == 1
-        assert estimate.message.startswith(text)

@@ -15,7 +15,6 @@ BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
 NARROW = {"disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}
 CASES = {
     "delayed": {"delay": 2, "discount": 0.8, "held": {1: 0.5}},
-    "observer alone": {"max_qps": 0},
     "reinitialized in a set": {"candidate": "reinitialized", "sets": BOX, "warm_start": True},
     "dropped": {"sets": NARROW, "max_qps": 2},
     "smoothed": {"arrival": "smoothed", "discount": 0.8, "warm_start": True},
@@ -141,15 +140,6 @@ def test_a_spoilt_estimator_goes_on_as_its_twin(name):
     spoilt.reset()
     for arguments in samples(10, 1):
         assert_same(feed(spoilt, arguments, True), feed(twin, arguments))
-
-
-def test_state_and_filtered_are_rows_of_the_trajectory():
-    """As documented: changing one changes the other, of this estimate alone."""
-    estimate = estimator(delay=1).update([0.1], [0.0])
-    estimate.state[...] = 7.0
-    assert estimate.trajectory[-1].tolist() == [7.0, 7.0]
-    assert np.shares_memory(estimate.filtered, estimate.trajectory)
-    assert not np.shares_memory(estimate.candidate, estimate.trajectory)
 
 
 # Interrupts

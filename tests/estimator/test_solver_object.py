@@ -9,7 +9,6 @@ import pytest
 import qpmhe
 from qpmhe.errors import BackendError, InvalidInputError, OptionError
 from qpmhe.solvers import RawSolution, Solver, SolverOptions, available, create
-from qpmhe_solvers.recorder import Recording
 
 from .spoil import check, estimator
 
@@ -62,10 +61,6 @@ def test_an_object_does_what_its_name_does(name):
 
 
 def test_objects_that_do_not_fit_are_refused():
-    class Bare(Counting):
-        def __init__(self):
-            pass
-
     for options, given, words in (
         ({"max_iterations": 3}, {"max_solver_iterations": 5},
          ["max_solver_iterations is 5", "max_iterations=3", "SolverOptions(max_iterations=5)"]),
@@ -79,7 +74,6 @@ def test_objects_that_do_not_fit_are_refused():
     solver = create("banded", SolverOptions(7, absolute_tolerance=1e-5, time_limit=2.0))
     estimator(backend=solver, **agreeing).update([1.0])
     check(BackendError, ["is not known"], estimator, backend=Counting)
-    check(BackendError, ["call super().__init__(options)"], estimator, backend=Bare())
 
 
 def test_a_solver_starts_afresh_where_its_estimator_changes():
@@ -109,30 +103,15 @@ def test_a_solver_starts_afresh_where_its_estimator_changes():
 
 
 def test_an_estimator_with_an_object_can_be_copied():
-    for way in (lambda mhe: pickle.loads(pickle.dumps(mhe)), copy.copy, copy.deepcopy, None):
+    for way in (lambda mhe: pickle.loads(pickle.dumps(mhe)), copy.copy, copy.deepcopy):
         mhe = constrained(backend=create("auto", SolverOptions(40)))
         mhe.run(Y[:6])
-        if way is None:  # snapshots do not depend on the object
-            twin = constrained(max_solver_iterations=40)
-            twin.load_state_dict(mhe.state_dict())
-        else:
-            twin = way(mhe)
+        twin = way(mhe)
         assert twin.settings.max_solver_iterations == 40
         for y in Y[6:]:
             np.testing.assert_array_equal(twin.update(y).state, mhe.update(y).state)
 
-    class Local(Counting):
-        pass
-
-    with pytest.raises(InvalidInputError, match=r"Local.* cannot be pickled .*state_dict"):
-        pickle.dumps(estimator(backend=Local()))
-
-
-@pytest.mark.parametrize("name", ["auto", "banded", "osqp", "daqp"])
-def test_runs_are_the_same_with_and_without_recording(name, tmp_path):
-    expected = constrained(backend=name).run(Y)
-    with Recording(tmp_path, name, only="all", limit=1000) as recording:
-        found = constrained(backend=recording.backend).run(Y)
-    np.testing.assert_array_equal(found.states, expected.states)
-    # Nearest points and corrections are QPs, too.
-    assert len(recording.files) == recording.seen >= Y.size
+    solver = Counting()
+    solver.held = lambda: None
+    with pytest.raises(InvalidInputError, match=r"Counting.* cannot be pickled .*state_dict"):
+        pickle.dumps(estimator(backend=solver))
