@@ -1,7 +1,4 @@
-"""Cases through libraries that are made with sanitizers: ``LD_PRELOAD=libasan.so python -m ...``.
-
-The arguments are the number of a level of optimisation, and names of cases.
-"""
+"""Cases through libraries with sanitizers: ``LD_PRELOAD=libasan.so ... clean LEVEL CASE ...``."""
 
 import sys
 import warnings

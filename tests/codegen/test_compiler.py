@@ -36,10 +36,8 @@ class Script:
 
     def __init__(self, folder, monkeypatch):
         self.path, self.log, self.monkeypatch = folder / "my cc", folder / "calls", monkeypatch
-        if not self.path.exists():
-            self.path.write_text('#!/bin/sh\necho "$*" >> "$COMPILER_LOG"\neval "$COMPILER_BODY"\n')
-            self.path.chmod(0o755)
-        self.log.unlink(missing_ok=True)
+        self.path.write_text('#!/bin/sh\necho "$*" >> "$COMPILER_LOG"\neval "$COMPILER_BODY"\n')
+        self.path.chmod(0o755)
         monkeypatch.setenv("COMPILER_LOG", str(self.log))
         self.does(RIGHT)
 
@@ -64,36 +62,19 @@ class Script:
         return self.log.read_text().splitlines() if self.log.exists() else []
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Of a compiler that is the same one for all tests, and of a library."""
-    return tmp_path_factory.mktemp("compiler")
-
-
 @pytest.fixture
 def cache(tmp_path):
     return tmp_path / "cache"
 
 
 @pytest.fixture(autouse=True)
-def script(folder, tmp_path, cache, monkeypatch):
+def script(tmp_path, cache, monkeypatch):
     """An empty cache, the usual "auto", and a compiler that counts its calls."""
     monkeypatch.setenv("QPMHE_CACHE_DIR", str(cache))
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(compiler, "_checked", set())
-    return Script(folder, monkeypatch)
-
-
-@pytest.fixture
-def filled(folder, cache, script, monkeypatch):
-    """The estimator's library in the cache, which is made once for all tests."""
-    with monkeypatch.context() as patch:
-        patch.setenv("QPMHE_CACHE_DIR", str(folder / "library"))
-        name = compile_it().path.name
-    shutil.copytree(folder / "library", cache)
-    script.log.unlink(missing_ok=True)
-    return cache / name
+    return Script(tmp_path, monkeypatch)
 
 
 def answer(files=ANSWER, **options):
@@ -291,6 +272,10 @@ def test_auto_takes_what_was_compiled_without_generating_it_again(script, monkey
         mhe = estimator(**options)
         assert np.isfinite(mhe.update([1.0, 2.0]).cost)
         assert (mhe.engine, mhe.run(np.ones((2, 2))).engine) == (engine, engine)
+    with pytest.raises(InvalidInputError, match="leave them out"):
+        qpmhe.compile(estimator(), horizon=3)
+    with pytest.raises(OptionError, match="horizn"):
+        qpmhe.compile(*arguments()[0], horizn=3)
     again = qpmhe.compile(estimator())
     assert (again.is_new, again.path) == (False, made.path)
     options = {"members": 2, "horizon": 4, "initial_states": np.ones(2)}
@@ -311,10 +296,12 @@ def test_auto_takes_what_was_compiled_without_generating_it_again(script, monkey
         estimator()
 
 
-def test_auto_is_the_python_step_where_the_library_is_of_no_use(filled, script, monkeypatch):
+def test_auto_is_the_python_step_where_the_library_is_of_no_use(script, monkeypatch):
+    path = compile_it().path
+    script.log.unlink()
     for patches in (
         {(library, "planned"): lambda *_: 1 / 0}, {
-            (compiler, "_checked_by"): lambda: "another release",
+            (compiler, "_checked"): set(), (compiler, "_checked_by"): lambda: "another release",
             (rehearsal, "estimator_fault"): lambda *_: "J of the estimate is 2",
         },
     ):
@@ -328,14 +315,14 @@ def test_auto_is_the_python_step_where_the_library_is_of_no_use(filled, script, 
         assert estimator().engine == estimator(engine="compiled").engine == "compiled"
         with pytest.raises(CompilationError, match="cannot be written; set QPMHE_CACHE_DIR"):
             compile_it(horizon=5)
-    filled.with_suffix(".sha256").write_text("nonsense")
+    path.with_suffix(".sha256").write_text("nonsense")
     assert estimator().engine == "python"
-    shutil.rmtree(filled.parent)
-    filled.parent.write_text("a file")
+    shutil.rmtree(path.parent)
+    path.parent.write_text("a file")
     assert estimator().engine == "python"
     assert not script.calls
     # What lies beside a cache that cannot be made is found, unless its model has no key.
-    assert compile_it().path.parent.parent == filled.parent.parent
+    assert compile_it().path.parent.parent == path.parent.parent
     assert estimator().engine == "compiled"
     monkeypatch.setattr(library, "source_key", lambda *_: None)
     assert (estimator().engine, estimator(engine="compiled").engine) == ("python", "compiled")
@@ -391,7 +378,8 @@ def test_keys_change_with_the_generator(name, tmp_path, monkeypatch):
     assert fingerprint.source_key(system().symbolic) != before
 
 
-def test_a_snapshot_pins_its_engine(filled, tmp_path, monkeypatch):
+def test_a_snapshot_pins_its_engine(tmp_path, monkeypatch):
+    compile_it()
     ways = {"python": "python", "compiled": "auto"}
     for engine, other in (("python", "compiled"), ("compiled", "python")):
         monkeypatch.setenv("QPMHE_ENGINE", ways[engine])
@@ -424,18 +412,6 @@ def test_a_snapshot_pins_its_engine(filled, tmp_path, monkeypatch):
     assert (mhe.engine, mhe.time) == ("python", 1)
     # An estimator that was pickled waits for the compiler, as it was made to run it.
     assert pickle.loads(kept).engine == "compiled"
-
-
-def test_compile_validates_its_arguments():
-    parts, shared = arguments()
-    for given, options, error, words in (
-        ((estimator(),), {"horizon": 3}, InvalidInputError, "leave them out"),
-        (parts, {"horizn": 3, **shared}, OptionError, "horizn"),
-        (parts[:1], shared, InvalidInputError, "observer is None"),
-        (parts, {"backend": "osqp", **shared}, OptionError, "solves its QPs itself"),
-    ):
-        with pytest.raises(error, match=words):
-            qpmhe.compile(*given, **options)
 
 
 MODEL_LIES = {
@@ -503,22 +479,3 @@ def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypa
         is_right(mhe)
         assert len(script.calls) == 6  # what is known to be wrong is not compiled again
         monkeypatch.setattr(compiler, "_checked", set())
-
-
-def test_a_library_is_checked_once(monkeypatch):
-    calls, checked = [], rehearsal.estimator_fault
-    monkeypatch.setattr(
-        rehearsal, "estimator_fault", lambda *given: calls.append(1) or checked(*given)
-    )
-    for release, count in (("one", 1), ("one", 1), ("two", 2)):
-        monkeypatch.setattr(compiler, "_checked_by", lambda release=release: release)
-        monkeypatch.setattr(compiler, "_checked", set())  # as in another process
-        assert estimator(engine="compiled").engine == "compiled"
-        assert len(calls) == count
-
-
-def test_what_is_not_finite_is_no_fault(cache):
-    for h in (lambda x: 1e200 * x, lambda x: ca.exp(700.0 * x), lambda x: ca.log(x - 0.99)):
-        one = qpmhe.from_casadi(lambda x: 0.9 * x, h, n=2, compiled=True)
-        assert estimator(parts=(one, *arguments()[0][1:]), engine="compiled").engine == "compiled"
-    assert not list(cache.glob("*.level"))

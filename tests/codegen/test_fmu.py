@@ -1,8 +1,6 @@
 """The estimator as an FMU, run by FMPy beside the Python step."""
 
 import shutil
-import subprocess
-import zipfile
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from qpmhe import codegen
 from qpmhe.errors import CompilationError
 
 from .cases import case
-from .test_written import STRICT
 
 fmpy = pytest.importorskip("fmpy")
 fmi2 = pytest.importorskip("fmpy.fmi2")
@@ -107,15 +104,3 @@ def test_what_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(CompilationError, match="there is no C compiler"):
         codegen.write(mhe, tmp_path, fmu=True)
-
-
-def test_equal_estimators_make_equal_files_that_hold_their_sources(tmp_path):
-    one = case("reactor").estimator("python")
-    _, source, first = codegen.write(one, tmp_path / "a", name="unit", fmu=True)
-    assert first.read_bytes() == codegen.write(one, tmp_path, name="unit", fmu=True)[2].read_bytes()
-    with zipfile.ZipFile(first) as archive:
-        assert archive.read("sources/unit.c") == source.read_bytes()
-        archive.extractall(tmp_path)
-    # The standard's functions have parameters that a unit need not use.
-    command = ["cc", "-std=c99", *STRICT, "-Wno-unused-parameter", "-fsyntax-only", "unit_fmu.c"]
-    subprocess.run(command, cwd=tmp_path / "sources", check=True)

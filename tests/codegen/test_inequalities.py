@@ -69,17 +69,6 @@ def test_random_qps_with_and_without_a_first_guess(shape):
 
 
 @shapes
-def test_no_unit_matters(shape):
-    rng, (n, p, *_) = np.random.default_rng(12), SHAPES[shape]
-    for equal in (0.0, 0.3):
-        for tight in (0.01, 0.1, 0.3, 1.0, 3.0):
-            (qp,) = drawn(shape, 12, tight, equal, count=1)
-            of_x, of_y = (10.0 ** rng.integers(-9, 10, size) for size in (n, p))
-            status, d, _ = solver_of(shape)(qp.in_units(of_x, of_y))
-            is_best(qp, status, (d.reshape(-1, n) / of_x).ravel(), 1e-8)
-
-
-@shapes
 def test_iterations_are_capped_and_counted(shape):
     solver = solver_of(shape)
     for qp in drawn(shape, 13, 0.1, 0.3, count=5):

@@ -1,6 +1,5 @@
 """`qpmhe.codegen.write`: its arguments, its files, and what it refuses."""
 
-import dataclasses
 import re
 import shutil
 import subprocess
@@ -10,7 +9,6 @@ import pytest
 
 import qpmhe
 from qpmhe import codegen
-from qpmhe.codegen.library import generated
 from qpmhe.errors import InvalidInputError, OptionError, QpmheError
 
 from .cases import case
@@ -36,8 +34,6 @@ def test_sources_with_other_weights_and_options_differ_in_the_data_only(tmp_path
     assert texts[0][0] == texts[1][0]
     assert ".max_qps = 1," in texts[0][1]
     assert ".max_qps = 2147483647," in texts[1][1]
-    header, _ = codegen.write(linear(time_budget=1e-9), folder)
-    assert "clock" in header.read_text()
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
@@ -72,14 +68,6 @@ def test_what_is_refused(tmp_path):
         codegen.write(linear().system, tmp_path / "out")
     with pytest.raises(QpmheError, match="backend='auto'"):
         codegen.write(linear(backend="osqp"), tmp_path / "out")
-    large = linear(257, max_qps=0)
     with pytest.raises(QpmheError, match=r"257 states; .* at most 256"):
-        codegen.write(large, tmp_path / "out")
-    assert large.system.symbolic is not None  # CasADi evaluates it instead
-    large = linear(50, max_qps=0)
-    with pytest.raises(OptionError, match=r"a horizon of 800000 with 50 states .* shorter one"):
-        generated(
-            large.system, large.observer, large.cost,
-            dataclasses.replace(large.settings, horizon=800000),
-        )
+        codegen.write(linear(257, max_qps=0), tmp_path / "out")
     assert not (tmp_path / "out").exists()

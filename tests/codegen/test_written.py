@@ -28,9 +28,6 @@ EXACT = ("-Wshadow", "-Wconversion")
 # With sanitizers GCC 12 warns of indices that loops of one output do not reach; they watch these.
 WATCHED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wno-array-bounds")
 LEVELS = (("-O0",), ("-O1",), *compiler._LEVELS)
-COMPILERS = {
-    os.path.realpath(path): path for path in map(shutil.which, ("cc", "gcc", "clang")) if path
-}
 HEADERS = {"<math.h>", "<tgmath.h>", "<stddef.h>", "<string.h>", '"mhe.h"'}
 # Reads the start, and measurements and inputs; writes the estimates.
 DRIVER = r"""
@@ -54,14 +51,12 @@ int main(void)
 """
 
 
-def estimates(one, samples, folder, flags, command=CC, real="double"):
+def estimates(one, samples, folder, flags, real="double"):
     """What the written code makes of a case's measurements and inputs."""
     write(one.estimator("python"), folder, real=real)
     (folder / "main.c").write_text(DRIVER)
-    subprocess.run(
-        [command, "-std=c99", *flags, "-o", "main", "main.c", "mhe.c", "-lm"], cwd=folder,
-        check=True,
-    )
+    command = [CC, "-std=c99", *flags, "-o", "main", "main.c", "mhe.c", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
     mhe = one.estimator("python")
     layout, _ = planned(mhe.system, mhe.observer, mhe.cost, mhe.settings, real)
     rows = [one.start, *(sample[key] for sample in samples for key in ("y", "u") if key in sample)]
@@ -125,9 +120,8 @@ def test_compiles_without_warnings(name, tmp_path):
     assert set(re.findall(r"^#include (.*)", source.read_text(), re.M)) <= HEADERS
 
 
-@pytest.mark.parametrize("command", COMPILERS.values())
-@pytest.mark.parametrize("name", ["huber conditions", "states in both"])
-def test_levels_differ_by_contraction_only(name, command, tmp_path):
+@pytest.mark.parametrize("name", ["mixed losses", "states in both"])
+def test_levels_differ_by_contraction_only(name, tmp_path):
     """Without contraction of a * b + c to one rounding, all levels give the same bits.
 
     With it, none breaks J(estimate) <= J(candidate).
@@ -137,7 +131,7 @@ def test_levels_differ_by_contraction_only(name, command, tmp_path):
     for level in LEVELS:
         for contraction in ("-ffp-contract=off", "-ffp-contract=fast")[: 1 + (level in LEVELS[2:])]:
             flags = (*FLAGS, contraction, *level)
-            found = estimates(one, [*samples, *wild(one)], tmp_path, flags, command)
+            found = estimates(one, [*samples, *wild(one)], tmp_path, flags)
             if contraction == "-ffp-contract=off":
                 bits.add(found.tobytes())
     assert len(bits) == 1
