@@ -454,7 +454,7 @@ class PythonEngine:
             raise InvalidInputError("there is no estimate yet; call update first.")
         with np.errstate(all="ignore"):
             problem = self._tools.formulation.problem(self._window)
-            trial = problem.evaluate(self._trajectory.copy())
+            trial = problem.evaluate(self._trajectory.copy(), roll_out=False)
             if trial.violation == math.inf:
                 raise InvalidInputError("the model has no finite values along the estimate.")
             return window_covariances(

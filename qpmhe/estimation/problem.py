@@ -330,14 +330,17 @@ class Problem:
             np.clip(trajectory, *self._clip, out=trajectory)
         return trajectory
 
-    def evaluate(self, trajectory: Array, of_candidate: bool = False) -> Trial:
+    def evaluate(
+        self, trajectory: Array, of_candidate: bool = False, roll_out: bool = True
+    ) -> Trial:
         """Evaluate a trajectory (K + 1, n); never raises, whatever the model does.
 
         The candidate's is rolled out along the directions of the cost alone, and no set judges it.
+        Without ``roll_out`` the trajectory is evaluated as it is.
         """
         formulation, prior_weight = self._formulation, self.prior_weight
         try:
-            if self._has_noise_free:
+            if self._has_noise_free and roll_out:
                 trajectory = self._rolled_out(trajectory, of_candidate)
             residuals = self._residuals(trajectory)
             offset = trajectory[0] - self.prior

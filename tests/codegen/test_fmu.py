@@ -1,8 +1,6 @@
 """The estimator as an FMU, run by FMPy beside the Python step."""
 
 import shutil
-import subprocess
-import zipfile
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from qpmhe import codegen
 from qpmhe.errors import CompilationError
 
 from .cases import case
-from .driver import STRICT
 
 fmpy = pytest.importorskip("fmpy")
 fmi2 = pytest.importorskip("fmpy.fmi2")
@@ -60,49 +57,35 @@ class Unit:
 
 
 @pytest.mark.parametrize("name", ["reactor with gaps", "inputs converged"])
-def test_it_is_the_python_step(tmp_path, name):
+def test_it_is_the_python_step_from_any_state(name, tmp_path):
     one = case(name)
     reference = one.estimator("python")
-    unit, found = Unit(reference, tmp_path), []
+    unit, found, start = Unit(reference, tmp_path), [], 1.1 * np.asarray(one.start)
     assert unit.step == (one.system.dt or 1.0)
     unit.start()
     np.testing.assert_array_equal(unit.get("state"), one.start)
+    unit.take(**one.samples[0])
+    unit.fmu.reset()
+    unit.set(initial_state=start)  # a parameter
+    unit.start()
+    reference.reset(start)
     regular = [sample for sample in one.samples if "dt" not in sample]
     for t, sample in enumerate(regular):
         if t == 10:
-            kept = unit.fmu.getFMUstate()
-            saved = unit.fmu.serializeFMUstate(kept)
+            saved = unit.fmu.serializeFMUstate(unit.fmu.getFMUstate())
         found.append(unit.take(t, **sample))
         expected = reference.update(**sample)
-        for variable in ("state", "filtered"):
-            wanted = getattr(expected, variable)
+        for variable in ("state", "filtered", "cost", "candidate_cost"):
+            wanted = np.atleast_1d(getattr(expected, variable))
             np.testing.assert_allclose(unit.get(variable), wanted, rtol=1e-9, atol=1e-9)
-        (cost,), (candidate,) = unit.get("cost"), unit.get("candidate_cost")
-        assert cost == pytest.approx(expected.cost, rel=1e-9)
-        assert cost <= candidate == pytest.approx(expected.candidate_cost, rel=1e-9)
+        assert unit.get("cost") <= unit.get("candidate_cost")
         assert unit.fmu.getInteger([unit.places["status"], unit.places["qps"]]) == [
             expected.status.value, expected.qps
         ]
     # The same record again, from a state that was serialised in the middle.
-    unit.fmu.freeFMUstate(kept)
     unit.fmu.setFMUstate(unit.fmu.deSerializeFMUstate(saved))
     assert [unit.take(**sample) for sample in regular[10:]] == found[10:]
     unit.fmu.terminate()
-    unit.fmu.freeInstance()
-
-
-def test_the_initial_state_is_a_parameter(tmp_path):
-    one = case("reactor")
-    reference = one.estimator("python")
-    unit, other = Unit(reference, tmp_path), one.start + np.array([0.5, -0.02])
-    for _ in range(2):  # and after a reset
-        unit.set(initial_state=other)
-        unit.start()
-        reference.reset(other)
-        for t, sample in enumerate(one.samples[:6]):
-            wanted = reference.update(**sample).state
-            np.testing.assert_allclose(unit.take(t, **sample), wanted, rtol=1e-9)
-        unit.fmu.reset()
     unit.fmu.freeInstance()
 
 
@@ -110,33 +93,14 @@ def test_what_is_refused(tmp_path, monkeypatch):
     mhe = case("inputs").estimator("python")
     unit = Unit(mhe, tmp_path)
     unit.start()
-    unit.set(u=[0.0, 0.0])
+    unit.take(u=[0.0, 0.0])
     for refused in (
         lambda: unit.fmu.doStep(0.0, 2.0 * unit.step), lambda: unit.set(cost=[1.0]),
         lambda: unit.take(u=[np.nan, 0.0]),
     ):
         with pytest.raises(fmpy.fmi1.FMICallException):
             refused()
-    unit.take(u=[0.0, 0.0])
     unit.fmu.freeInstance()
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(CompilationError, match="there is no C compiler"):
         codegen.write(mhe, tmp_path, fmu=True)
-
-
-def test_equal_estimators_make_equal_files_that_hold_their_sources(tmp_path):
-    one = case("reactor").estimator("python")
-    first, second = (
-        codegen.write(one, tmp_path / folder, name="unit", fmu=True)[2] for folder in "ab"
-    )
-    assert first.read_bytes() == second.read_bytes()
-    with zipfile.ZipFile(first) as archive:
-        names = archive.namelist()
-        assert {"sources/unit.h", "sources/unit.c", "sources/unit_fmu.c"} < set(names)
-        assert archive.read("sources/unit.c") == (tmp_path / "a" / "unit.c").read_bytes()
-        archive.extractall(tmp_path)
-    # The standard's functions have parameters that a unit need not use.
-    subprocess.run(
-        ["cc", "-std=c99", *STRICT, "-Wno-unused-parameter", "-c", "unit_fmu.c"],
-        cwd=tmp_path / "sources", check=True,
-    )
