@@ -3,7 +3,6 @@
 import pickle
 import subprocess
 import sys
-import warnings
 
 import numpy as np
 import pytest
@@ -113,19 +112,3 @@ run._repr_html_()
 assert len(pyplot.get_fignums()) == 1
 """
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_a_cell_shows_its_figure(tmp_path):
-    reason = "needs nbformat, nbclient and ipykernel"
-    nbformat = pytest.importorskip("nbformat", reason=reason)
-    nbclient = pytest.importorskip("nbclient", reason=reason)
-    pytest.importorskip("ipykernel", reason=reason)
-    cells = [f"{SETUP}run", "qpmhe.plots.costs(run);", "print(1)\nqpmhe.plots.states(run);"]
-    notebook = nbformat.v4.new_notebook(cells=list(map(nbformat.v4.new_code_cell, cells)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the client's event loop and sockets
-        nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute(cwd=tmp_path)
-    shown = [output["data"] for cell in notebook.cells for output in cell["outputs"]
-             if "data" in output]
-    for data, kind in zip(shown, ("text/html", "image/png", "image/png"), strict=True):
-        assert kind in data

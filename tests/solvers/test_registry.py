@@ -148,7 +148,7 @@ class Zero(Solver):
 
 one = Backend("zero", Zero, "none")
 def two():
-    return [Backend("zero2", Zero, "none"), Backend("zero3", Zero, "none")]
+    return [Backend("zero2", Zero, "none")]
 def taken():
     return Backend("osqp", Zero, "none")
 def leaving():
@@ -161,8 +161,7 @@ with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     import qpmhe_solvers as s
     print("plugin" in sys.modules)
-    names = {lookup}
-    s.available(); s.backends()
+    s.backend("zero2"); s.available(); s.backends()
 print([name for name in s.available() if "zero" in name])
 print(s.create("zero").solve(s.QP(2, 2)).status.name)
 for one in caught:
@@ -170,8 +169,7 @@ for one in caught:
 """
 
 
-@pytest.mark.parametrize("lookup", ["s.available()", "s.backends()", "s.backend('zero2')"])
-def test_entry_points(tmp_path, lookup):
+def test_entry_points(tmp_path):
     (tmp_path / "plugin.py").write_text(PLUGIN)
     info = tmp_path / "plugin-1.0.dist-info"
     info.mkdir()
@@ -180,10 +178,10 @@ def test_entry_points(tmp_path, lookup):
         "[qpmhe.backends]\none = plugin:one\ntwo = plugin:two\ngone = nosuch:x\n"
         "clash = plugin:taken\nleaves = plugin:leaving\n"
     )
-    told = fresh_interpreter(SCRIPT.format(folder=str(tmp_path), lookup=lookup))
+    told = fresh_interpreter(SCRIPT.format(folder=str(tmp_path)))
     early, names, status, *warned = told.splitlines()
     assert early == "False"  # importing the package loads nobody's entry points
-    assert (names, status) == ("['zero', 'zero2', 'zero3']", "STOPPED")
+    assert (names, status) == ("['zero', 'zero2']", "STOPPED")
     assert len(warned) == 3
     for name, words in (
         ("gone", "ModuleNotFoundError"), ("clash", "registered already"),
