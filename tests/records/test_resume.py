@@ -15,11 +15,14 @@ from qpmhe.records.checkpoints import load, save
 from .oscillator import lines
 from .tools import (
     CONTINUOUS,
+    DISCRETE,
     OPTIONS,
+    STEPS,
     cut_off,
     estimate,
     finish,
     get,
+    pipe,
     put,
     rows,
     start,
@@ -109,6 +112,17 @@ def test_a_record_cut_at_any_byte(here):
             assert get("out.csv") == expected, place
 
 
+def test_the_usual_step_is_remembered(here, monkeypatch):
+    text = [STEPS[0], *(row for t, row in enumerate(STEPS[1:41]) if t not in (20, 21))]
+    expected = whole(text, DISCRETE)
+    put("record.csv", text[:21])
+    estimate(DISCRETE, **OPTIONS)
+    pipe(monkeypatch, [text[0], *text[21:]])  # a gap is the first thing that there is to see
+    summary = resume("-", DISCRETE)
+    assert (summary.before, summary.inserted) == (20, 2)
+    assert get("out.csv") == expected
+
+
 @pytest.fixture
 def cut(here):
     """A record of which 40 samples are known to the checkpoint."""
@@ -167,4 +181,4 @@ def test_damaged_checkpoints_and_results_that_do_not_belong_to_them(cut):
     for damaged in (b"", b"x", sound[: len(sound) // 2], sound[:-1], other, *flipped):
         CHECKPOINT.write_bytes(damaged)
         with pytest.raises(CheckpointError, match="--overwrite"):
-            resume()
+            load(CHECKPOINT)
