@@ -1,4 +1,4 @@
-"""Parameters and noisy inputs as states: sets, runs in both engines, wrong arguments."""
+"""Parameters and noisy inputs as states: runs in both engines, wrong arguments."""
 
 import numpy as np
 import pytest
@@ -6,38 +6,6 @@ import pytest
 import qpmhe
 
 PLANT = qpmhe.System(lambda x, u: 0.9 * x + u[:1], lambda x: x, n=1, p=1, m=2)
-
-
-def test_some_all_or_none_of_the_parameters():
-    x, u = np.array([2.0]), np.array([1.0, 3.0])
-    some = qpmhe.augment_parameters(PLANT, nominal=[3.0])  # which the model ignores
-    np.testing.assert_allclose(some.f(np.array([2.0, 3.0]), u[:1]), [2.8, 3.0])
-    jacobian = some.f_jacobian(np.array([2.0, 3.0]), u[:1])
-    np.testing.assert_allclose(jacobian, [[0.9, 0.0], [0.0, 1.0]])
-    none = qpmhe.augment_parameters(PLANT, nominal=[3.0], estimated=[])
-    assert (none.n, none.m) == (1, 1)
-    np.testing.assert_array_equal(none.f(x, u[:1]), PLANT.f(x, u))
-    whole = qpmhe.augment_parameters(PLANT, nominal=u, estimated=[0])
-    assert (whole.n, whole.m) == (2, 0)
-    np.testing.assert_allclose(whole.f(np.array([2.0, 5.0]), np.zeros(0)), [6.8, 5.0])
-
-
-def test_sets_are_carried_over():
-    box, w, v = qpmhe.Box([-1.0], [1.0]), qpmhe.Box([-0.1], [0.1]), qpmhe.Box([-2.0], [2.0])
-    model = qpmhe.System(
-        lambda x, u: u * x, lambda x: x, n=1, p=1, m=1, states=box, disturbances=w, noises=v
-    )
-    bounds = qpmhe.Box([0.0], [0.9])
-    system = qpmhe.augment_parameters(model, nominal=[0.5], parameter_bounds=bounds)
-    noisy = qpmhe.noisy_inputs(model)
-    for one, lower, upper, most in (
-        (system, [-1.0, 0.0], [1.0, 0.9], [0.1, 0.0]),
-        (noisy, [-1.0, -np.inf], [1.0, np.inf], [0.1, np.inf]),
-    ):
-        assert one.states.lower.tolist() == lower
-        assert one.states.upper.tolist() == upper
-        assert one.disturbances.upper.tolist() == most
-        assert one.noises is v
 
 
 def estimator(system, **options):

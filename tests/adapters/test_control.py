@@ -47,9 +47,15 @@ def test_a_linear_system_is_sampled_exactly_discretised_or_taken_as_it_is():
         same(from_control(plant, dt=0.1, method=method), plain, POINTS, INPUTS)
     for dt in (True, 0.1):
         same(from_control(control.ss(0.5 * A, B, C, D, dt)), linear(0.5 * A, B), POINTS, INPUTS)
-    system = from_control(nonlinear(lambda t, x, u, params: 0.9 * np.sin(x), inputs=0, dt=True))
+
+    def update(t, x, u, params):
+        assert t == pytest.approx(round(t))  # asked at its own times only
+        return 0.5 * np.sqrt(x - 0.7)  # not a number at some probes, at all times
+
+    system = from_control(nonlinear(update, inputs=0, dt=True))
     assert system.m == 0
-    np.testing.assert_allclose(system.f.batch(POINTS, np.empty((7, 0))), 0.9 * np.sin(POINTS))
+    found = system.f.batch(1.0 + POINTS**2, np.empty((7, 0)))
+    np.testing.assert_allclose(found, 0.5 * np.sqrt(0.3 + POINTS**2))
 
 
 def rotating():
@@ -85,14 +91,6 @@ def test_a_system_that_depends_on_time_is_refused(change, dt, at):
     for where, functions in (("dynamics", (changed[0], angle)), ("output", (swing, changed[1]))):
         with pytest.raises(ModelError, match=rf"the {where} of .*{at}.*time-invariant"):
             from_control(nonlinear(*functions, dt=dt), dt=None if dt else 0.125)
-
-
-def test_a_map_is_asked_at_its_own_times_only():
-    def update(t, x, u, params):
-        assert t == pytest.approx(round(t))
-        return 0.5 * np.sqrt(x - 0.7)  # not a number at some probes, at all times
-
-    assert from_control(nonlinear(update, dt=True)).n == 2
 
 
 F, G = np.array([[1.0, 0.1], [0.2, 0.95]]), np.array([[0.0], [0.1]])
@@ -145,6 +143,11 @@ def test_a_block_takes_missing_measurements_and_repeated_calls():
             x = block.dynamics(t, before, [y, 0.1])
             assert mhe.time == t + 1
         np.testing.assert_array_equal(x, other.update([y], [0.1]).state)
+    # Another state than its own resets it.
+    other.reset(GUESS)
+    again = block.dynamics(3, GUESS, [0.7, 0.1])
+    np.testing.assert_array_equal(again, other.update([0.7], [0.1]).state)
+    assert mhe.time == 1
 
 
 def test_labels_and_options_of_a_block():

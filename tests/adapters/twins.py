@@ -1,6 +1,7 @@
 """One model in every language that a `System` can be made from, and its plain evaluation."""
 
-from functools import cache
+from functools import cache, partial
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -55,20 +56,12 @@ def by_casadi(compiled=True, **options):
     return qpmhe.from_casadi(f, h, compiled=compiled, **options)
 
 
-def by_interpreter(**options):
-    return by_casadi(compiled=False, **options)
-
-
 def jax_rate(x, u):
-    import jax.numpy as jnp
-
-    return rate(x, u, jnp)
+    return rate(x, u, import_module("jax.numpy"))
 
 
 def jax_output(x, u):
-    import jax.numpy as jnp
-
-    return output(x, u, jnp)
+    return output(x, u, import_module("jax.numpy"))
 
 
 def by_jax(**options):
@@ -92,8 +85,8 @@ def by_control(**options):
 
 
 LANGUAGES = {
-    "numpy": by_numpy, "casadi": by_casadi, "interpreted": by_interpreter, "jax": by_jax,
-    "sympy": by_sympy, "control": by_control,
+    "numpy": by_numpy, "casadi": by_casadi, "interpreted": partial(by_casadi, compiled=False),
+    "jax": by_jax, "sympy": by_sympy, "control": by_control,
 }
 
 

@@ -19,12 +19,12 @@ def parts(gallery):
     return {name: import_module(f"gallery.smartloc.{name}") for name in ("record", "car", "bank")}
 
 
-def place(latitude=52.5, longitude=13.4, radius=6.371e6):
+def place():
     """A point of the Earth's surface and its axes east, north, up, all Earth-centred."""
-    b, a = np.radians((latitude, longitude))
+    b, a = np.radians((52.5, 13.4))
     east = np.array([-np.sin(a), np.cos(a), 0.0])
     up = np.array([np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)])
-    return radius * up, np.stack((east, np.cross(up, east), up))
+    return 6.371e6 * up, np.stack((east, np.cross(up, east), up))
 
 
 def drive():
@@ -100,14 +100,10 @@ def test_the_model_at_the_truth_leaves_no_residuals(parts, tmp_path):
     assert np.abs(left[~missing]).max() < 1e-3
     for k in range(STEPS - 1):
         np.testing.assert_allclose(system.f(states[k], u[k]), states[k + 1], atol=1e-9)
-    strong = found.strong(36.0)
-    assert np.array_equal(np.isfinite(strong.ranges), found.strengths >= 36.0)
-
-
-def test_a_folder_that_is_no_record_is_refused(parts, tmp_path):
-    (write(tmp_path) / "ground_truth.txt").write_text("point3 0 1 2\n")
+    assert np.array_equal(np.isfinite(found.strong(36.0).ranges), found.strengths >= 36.0)
+    (tmp_path / "smartloc_made" / "ground_truth.txt").write_text("point3 0 1 2\n")
     with pytest.raises(import_module("gallery.command").DataError, match="point3"):
-        parts["record"].read(tmp_path)
+        parts["record"].read(tmp_path / "smartloc_made")
 
 
 def test_the_least_cost_is_found_from_far_away_and_the_command_runs(parts, tmp_path):
