@@ -153,6 +153,18 @@ def test_set_before_the_first_sample_projects_the_start():
         assert states.violation(mhe.state) == 0.0
 
 
+def test_states_move_into_other_bounds_in_the_observers_metric():
+    mhe = estimator(sets=SETS, max_qps=0)
+    mhe.update([0.1, 0.2, 0.3], [0.4])
+    z, P = mhe.observer_state, mhe._engine._window.metric.covariance
+    bounds = {"states": Box([z[0] + 0.1, -2.0], [1.5, np.inf])}
+    candidate = mhe.update([0.1, 0.2, 0.3], [0.4], bounds=bounds).candidate
+    np.testing.assert_allclose(candidate[1], z + 0.1 * P[:, 0] / P[0, 0], rtol=1e-9)
+    assert abs(P[0, 1]) > 1e-3 * P[0, 0]
+    first = mhe.set(bounds={"states": Box([0.6, -2.0], [1.5, np.inf])}).candidate[0]
+    np.testing.assert_allclose(first, [0.6, 0.1 * P[1, 0] / P[0, 0]], rtol=1e-9)
+
+
 @every
 def test_parameters_are_the_last_inputs(name):
     mhe, plain = estimator(**OPTIONS[name]), estimator(**OPTIONS[name], parameters=None)
