@@ -132,12 +132,12 @@ def test_a_function_with_a_branch_is_called_state_by_state():
 
 
 def test_what_is_written_into_an_argument_changes_nothing():
-    def clipped(x):
+    def clipped(x, u):
         x[x > 12.0] = 12.0
-        return 0.5 * x
+        return 0.5 * x + u
 
     states = np.array([[20.0], [4.0]])
-    system = qpmhe.System(clipped, lambda x: x, n=1, p=1)
-    assert system.f(states[0], NONE) == 6.0
-    np.testing.assert_array_equal(system.f.batch(states, np.zeros((2, 0))), [[6.0], [2.0]])
+    system = qpmhe.System(clipped, lambda x: x, n=1, p=1, m=1)
+    assert system.f(states[0], np.zeros(1)) == 6.0
+    np.testing.assert_array_equal(system.f.batch(states, np.zeros((2, 1))), [[6.0], [2.0]])
     assert states[0] == 20.0
