@@ -39,7 +39,6 @@ def watched(mhe):
     ("f", "nan", 1), ("f", "raises", 0), ("h", "nan", 1), ("h", "raises", 0),
 ])
 def test_the_candidate_is_that_of_a_replay(where, how, seed):
-    """Where the model fails; elsewhere the fuzzers of properties compare each candidate."""
     generator, start = np.random.default_rng(seed), np.ones(1)
     mhe, full, resumed = (
         qpmhe.MovingHorizonEstimator(

@@ -136,8 +136,6 @@ def test_the_state_of_another_estimator_is_refused_by_name(engine):
         "set of states": {"states": qpmhe.Box([-5.0, -5.0], [5.0, 5.0])},
         "model": {"system": system_of(engine, swing=1.001)},
         "(h)": {"system": system_of(engine, bend=0.1001)},
-        "candidate": {"candidate": "reinitialized"},
-        "expected": {"horizon": 5},
     }
     for count in (0, 15):
         state = fed(count, engine).state_dict()

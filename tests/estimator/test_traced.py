@@ -48,8 +48,7 @@ STRAIGHT = {
     "extrema": lambda x: np.maximum(x, 0.0) + np.minimum(x[::-1], x) + x.max() - np.min(x),
     "arctan2": lambda x: [np.arctan2(x[1], x[0]), np.hypot(x[0], x[1])],
     "wrapped": lambda x: (x + np.pi) % (2.0 * np.pi) - np.pi,
-    "whole numbers": lambda x: np.floor(x) + np.ceil(x) + np.trunc(x) + np.rint(x) + x // 0.3,
-    "remainders": lambda x: np.mod(x, 0.7) + np.fmod(x, 0.3) + x % -0.2,
+    "whole numbers": lambda x: np.floor(x) + np.ceil(x) + np.trunc(x) + np.rint(x) + x % -0.2,
     "powers": lambda x: np.abs(x) ** 0.3 + x**3 + np.square(x) + np.cbrt(x) + 2.0**x,
     "transcendental": lambda x: (
         np.log(np.abs(x)) + np.log1p(x * x) + np.expm1(0.01 * x) + np.tanh(x) + np.arctan(x)
@@ -115,7 +114,6 @@ BAD = {
     "random numbers": (lambda x: x + np.random.default_rng().normal(), "again"),
     "a special function": (lambda x: __import__("scipy.special").special.gamma(x), "gamma"),
     "an exception": (lambda x: 1 / 0, "ZeroDivisionError"),
-    "complex numbers": (lambda x: np.abs(x + 1j * x), "complex"),
 }
 
 
