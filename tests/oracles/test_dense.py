@@ -225,17 +225,6 @@ def residuals(flat, prior, Y):
     return np.concatenate([x[0] - prior, w.ravel() / 0.1, v / 0.2])
 
 
-@pytest.mark.parametrize("max_qps", [1, 2])
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_backends_agree_without_sets(backend, max_qps):
-    costs = []
-    for name in (backend, "banded"):
-        mhe, Y = reactor(backend=name, max_qps=max_qps, solver_tolerance=1e-9)
-        costs.append(mhe.run(Y).costs)
-    # After one QP an error of d is one of the first order in J.
-    np.testing.assert_allclose(*costs, rtol=1e-4 if backend == "ecos" else 1e-6)
-
-
 @cache
 def bounded_minima():
     """The reactor in a state box that binds, and the minimum of each of its windows."""

@@ -121,7 +121,7 @@ def off(run, plant):
     return distance(run.states, np.array([x for x, _ in kalman(plant)[0]]))
 
 
-@pytest.mark.parametrize("horizon", [1, 2, 5, 10, 50])
+@pytest.mark.parametrize("horizon", [1, 2, 10, 50])
 @pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])
 @pytest.mark.parametrize("radius", [0.8, 1.15], ids=["stable", "unstable"])
 def test_every_horizon_gives_the_kalman_predictor_and_filter(radius, missing, horizon):
@@ -132,39 +132,40 @@ def test_every_horizon_gives_the_kalman_predictor_and_filter(radius, missing, ho
         assert distance(run.filtered, np.array([x for x, _ in kalman(plant)[1]])) < 1e-8
 
 
-@pytest.mark.parametrize("missing", [False, True], ids=["complete", "missing"])
+@pytest.mark.parametrize("horizon", [1, 5, 30], ids=["one", "moving", "growing"])
 @pytest.mark.parametrize("radius", [0.8, 1.15], ids=["stable", "unstable"])
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
-def test_a_growing_window_is_the_rts_smoother(n, radius, missing):
-    plant = Plant(n, n, 1 + n % 2, radius, m=(n + 1) % 3, missing=missing, steps=30)
-    predicted, filtered, squares = kalman(plant)
-    mhe = plant.estimator(30)
-    for t, (y, u) in enumerate(zip(plant.Y, plant.U, strict=True)):
-        estimate = mhe.update(y, u if u.size else None)
-        assert distance(estimate.trajectory, rts(plant, predicted, filtered, t + 1)) < 1e-8
-        # The minimum of J is the sum of the normalised squared innovations.
-        assert estimate.cost == pytest.approx(squares[: t + 1].sum(), rel=1e-9)
-        x = estimate.trajectory
-        w = x[1:] - x[:-1] @ plant.A.T - plant.U[: t + 1] @ plant.B.T
-        v = plant.Y[: t + 1] - x[:-1] @ plant.C.T - plant.U[: t + 1] @ plant.D.T
-        np.testing.assert_allclose(estimate.disturbances, w, atol=1e-9)
-        np.testing.assert_allclose(estimate.noises, v, atol=1e-9)  # NaN where y is missing
-
-
-@pytest.mark.parametrize("horizon", [1, 5])
-def test_a_moving_window_is_the_rts_smoother_of_a_filter_that_starts_there(horizon):
-    plant = Plant(3, 3, 2, 0.9, m=1, missing=True, steps=25)
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_a_window_is_the_rts_smoother_of_a_filter_that_starts_there(n, radius, horizon):
+    plant = Plant(n, n, 1 + n % 2, radius, m=1 + n % 2, missing=True, steps=25)
     predicted, _, _ = kalman(plant)
     mhe = plant.estimator(horizon)
     for t in range(25):
-        trajectory = mhe.update(plant.Y[t], plant.U[t]).trajectory
+        estimate = mhe.update(plant.Y[t], plant.U[t])
         start = max(0, t + 1 - horizon)
         tail = copy.copy(plant)
         tail.Qs, tail.Rs = plant.Qs[start : t + 1], plant.Rs[start : t + 1]
         tail.z0, tail.P = predicted[start]
         tail.Y, tail.U = plant.Y[start : t + 1], plant.U[start : t + 1]
-        expected = rts(tail, *kalman(tail)[:2], t + 1 - start)
-        assert distance(trajectory, expected) < 1e-8
+        *filters, squares = kalman(tail)
+        assert distance(estimate.trajectory, rts(tail, *filters, t + 1 - start)) < 1e-8
+        # The minimum of J is the sum of the normalised squared innovations.
+        assert estimate.cost == pytest.approx(squares.sum(), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("backend", qpmhe.solvers.available())
+def test_a_growing_window_is_a_full_one_of_its_length(backend):
+    # Remark rem:emtpyN: until N samples are there, the horizon is t.
+    plant = Plant(6, 3, 2, 0.9, m=1, missing=True, steps=9)
+    growing = plant.estimator(9, backend=backend, max_qps=3).run(plant.Y, plant.U)
+    for length in (1, 2, 5):
+        run = plant.estimator(length, backend=backend, max_qps=3).run(
+            plant.Y[:length], plant.U[:length]
+        )
+        assert run.candidate_costs[-1] == growing.candidate_costs[length - 1]
+        assert run.statuses[-1] == growing.statuses[length - 1]
+        # Not every solver gives the same bits twice: some depend on how memory is aligned.
+        np.testing.assert_allclose(run.states[-1], growing.states[length], rtol=1e-9)
+        assert run.costs[-1] == pytest.approx(growing.costs[length - 1], rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("backend", qpmhe.solvers.available())
@@ -178,7 +179,7 @@ def test_one_qp_of_every_backend_gives_the_kalman_predictor(backend):
 @pytest.mark.parametrize("observer", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
 @pytest.mark.parametrize("horizon", [1, 4, 50])
 @pytest.mark.parametrize(
-    ("n", "r", "p"), [(2, 1, 1), (3, 1, 2), (3, 2, 1), (4, 2, 2), (5, 3, 2), (4, 4, 1)]
+    ("n", "r", "p"), [(2, 1, 1), (3, 1, 2), (5, 3, 2), (4, 4, 1)]
 )
 def test_disturbances_of_lower_dimension(n, r, p, horizon, observer, how):
     plant = Plant(100 * n + 10 * r + p, n, p, 1.0, steps=40, directions=r)
@@ -207,15 +208,6 @@ def test_singular_covariances_of_the_state_cost_few_digits(without_disturbance, 
         run = plant.estimator(horizon, max_qps=None, solver_tolerance=1e-10).run(plant.Y)
         means = np.array([x for x, _ in kalman(plant)[0]])
         assert np.abs(run.states - means).max() <= 2e-7 * (1.0 + np.abs(means).max())
-
-
-@pytest.mark.parametrize("observer", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
-def test_a_state_that_only_delays_another_has_singular_covariances_throughout(observer):
-    plant = Plant(3, 2, 2, 1.0, steps=30)
-    plant.A, plant.C = np.array([[1.0, 0.0], [1.0, 0.0]]), np.eye(2)
-    plant.P, plant.Q, plant.R = np.diag([0.5, 0.0]), np.diag([0.04, 0.0]), np.eye(2)
-    plant.Qs, plant.Rs = [plant.Q] * 30, [plant.R] * 30
-    assert off(plant.estimator(4, observer=observer, max_qps=None).run(plant.Y), plant) < 1e-9
 
 
 @pytest.mark.parametrize("candidate", ["observer", "reinitialized"])

@@ -4,19 +4,12 @@ import numpy as np
 
 from qpmhe import Status
 
+NO_SETS = (None, None, None)
+
 
 def there(y):
     """Which components count: beyond 1e150, a number has no finite square."""
     return np.abs(y) <= 1e150
-
-
-def stage_weight(noise_weight, seen):
-    """Weight of the components of y that are there: the inverse of their covariance."""
-    weight = np.zeros_like(noise_weight)
-    if seen.any():
-        block = np.linalg.inv(noise_weight)[np.ix_(seen, seen)]
-        weight[np.ix_(seen, seen)] = np.linalg.inv(block)
-    return weight
 
 
 def true_cost(f, h, trajectory, prior, Y, weights):
@@ -25,10 +18,11 @@ def true_cost(f, h, trajectory, prior, Y, weights):
     offset = trajectory[0] - prior
     total, slack = offset @ P @ offset, 0.0
     for x, following, y in zip(trajectory[:-1], trajectory[1:], Y, strict=True):
-        seen = there(y)
-        fx, hx = f(x), h(x)
+        seen, fx, hx = there(y), f(x), h(x)
         w, v = following - fx, np.where(seen, np.where(seen, y, 0.0) - hx, 0.0)
-        weight = stage_weight(R, seen)
+        # The weight of what is there: the inverse of its covariance.
+        weight, block = np.zeros_like(R), np.ix_(seen, seen)
+        weight[block] = np.linalg.inv(np.linalg.inv(R)[block])
         total += w @ Q @ w + v @ weight @ v
         for r, size, part in ((w, following, Q), (w, fx, Q), (v, hx, weight)):
             error, largest = 1e-14 * np.abs(size).max(), np.abs(part).sum()
@@ -40,14 +34,12 @@ def observer_path(f, h, gain, z, Y):
     """States of z+ = f(z) + gain v with v = y - h(z), zero where y is missing."""
     path = [z]
     for y in Y:
-        v = np.where(there(y), y, 0.0) - h(z)
-        v[~there(y)] = 0.0
-        z = f(z) + gain @ v
+        z = f(z) + gain @ np.where(there(y), np.where(there(y), y, 0.0) - h(z), 0.0)
         path.append(z)
     return np.array(path)
 
 
-def keeps_promise(f, h, estimate, Y, weights, sets=(None, None, None)):
+def keeps_promise(f, h, estimate, Y, weights, sets=NO_SETS):
     """Hold an estimate to the promise; Y are the measurements of its window."""
     status, trajectory, seen = estimate.status, estimate.trajectory, there(Y)
     assert estimate.cost <= estimate.candidate_cost
@@ -69,18 +61,30 @@ def keeps_promise(f, h, estimate, Y, weights, sets=(None, None, None)):
         true, slack = true_cost(f, h, trajectory, estimate.candidate[0], Y, weights)
         assert abs(estimate.cost - true) <= 1e-9 * true + slack
         if not estimate.dropped and (estimate.improved or Status.CANDIDATE_OUTSIDE not in status):
-            within(sets, estimate, seen)
+            within(sets, estimate, seen, weights)
 
 
-def within(sets, estimate, seen):
+def within(sets, estimate, seen, weights):
     """Hold an estimate to boxes for x, w and v."""
     # An estimate is clipped into X, a candidate is believed to be on its boundary; a difference
-    # of large states is no better than their rounding.
+    # of large states is no better than their rounding. Misses count in deviations.
+    _, by_w, by_v = (np.sqrt(np.linalg.inv(one).diagonal()) for one in weights)
     rounding = 4e-15 * np.abs(estimate.trajectory[1:]).max(axis=1, keepdims=True)
     for box, points, slack in zip(
         sets, (estimate.trajectory, estimate.disturbances, np.where(seen, estimate.noises, np.nan)),
-        (0.0 if estimate.improved else 1e-9, 1e-8 + rounding, 1e-8), strict=True,
+        (0.0 if estimate.improved else 1e-9, 1e-8 * by_w + rounding, 1e-8 * by_v), strict=True,
     ):
         if box is not None:
             assert not (points < box.lower - slack).any()
             assert not (points > box.upper + slack).any()
+
+
+def steps(mhe, model, Y, weights, sets=NO_SETS, given=None, before=lambda t: None):
+    """Every estimate of a record, held to the promise; ``given`` is the record as it came."""
+    f, h = model
+    for t, y in enumerate(Y if given is None else given):
+        before(t)
+        estimate = mhe.update(y)
+        assert (estimate.time, mhe.time) == (t, t + 1)
+        keeps_promise(f, h, estimate, Y[max(0, t + 1 - mhe.horizon) : t + 1], weights, sets)
+        yield estimate

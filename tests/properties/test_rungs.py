@@ -8,10 +8,9 @@ from qpmhe import Status
 from qpmhe.errors import ObserverWarning
 from qpmhe.solvers import Backend, RawSolution, Solver, SolveStatus
 
-from .plain import keeps_promise
+from .plain import steps
 
-STEPS, HORIZON = 8, 4
-START = np.array([0.6, -0.2, 0.4])
+HORIZON, START = 4, np.array([0.6, -0.2, 0.4])
 GAIN = np.array([[0.08, 0.0], [0.06, 0.0], [0.0, 0.05]])
 WEIGHTS = (
     np.diag([1.0, 2.0, 1.0]), np.diag([40.0, 60.0, 50.0]), np.array([[20.0, 6.0], [6.0, 12.0]])
@@ -20,8 +19,6 @@ WEIGHTS = (
 SETS = {
     "X": {"states": qpmhe.Box([0.15, -0.28, 0.34], [0.65, 0.0, 0.45])},
     "rows of X": {"states": qpmhe.Polytope([[-1.0, -1.0, 0.0]], [0.12])},
-    "W": {"disturbances": qpmhe.Box([-0.03] * 3, [0.008] * 3)},
-    "V": {"noises": qpmhe.Box([-0.4, -0.2], [0.1, 0.1])},
     "X, W and V": {
         "states": qpmhe.Box([0.1, -0.33, 0.3], [0.65, 0.0, 0.5]),
         "disturbances": qpmhe.Box([-0.05] * 3, [0.008] * 3),
@@ -35,7 +32,6 @@ SETS = {
     },
 }
 BACKENDS = qpmhe.solvers.available()
-INEQUALITY_BACKENDS = [b for b in BACKENDS if qpmhe.solvers.backend(b).inequalities]
 quiet = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 
 
@@ -49,70 +45,56 @@ def h(x):
 
 
 def record():
-    rng, Y = np.random.default_rng(8), np.empty((STEPS, 2))
+    rng, Y = np.random.default_rng(8), np.empty((8, 2))
     x = START - np.array([0.15, 0.1, -0.05])
-    for t in range(STEPS):
+    for t in range(len(Y)):
         Y[t] = h(x) + rng.uniform(-0.3, 0.3, 2)
         x = f(x) + rng.uniform(-0.1, 0.1, 3)
     Y[5, 0] -= 0.3  # an outlier
     return Y
 
 
-def estimates(sets, **options):
+def estimator(sets, **options):
     prior, disturbance, noise = WEIGHTS
-    mhe = qpmhe.MovingHorizonEstimator(
+    return qpmhe.MovingHorizonEstimator(
         qpmhe.System(f, h, n=3, p=2, **sets), qpmhe.Luenberger(GAIN),
         qpmhe.QuadraticCost(prior=prior, disturbance=disturbance, noise=noise),
         horizon=HORIZON, initial_state=START, **options,
     )
-    return [mhe.update(y) for y in record()]
 
 
 def tight(name, **options):
     """Estimates in tight sets, with the plain observer's and whether that is outside."""
     sets, Y, found = SETS[name], record(), []
     boxes = [sets.get(one) for one in ("states", "disturbances", "noises")]
-    if name == "rows of X":
-        boxes[0] = None
-    for t, (estimate, free) in enumerate(zip(
-        estimates(sets, project_observer=False, **options), estimates({}, max_qps=0), strict=True
-    )):
-        keeps_promise(f, h, estimate, Y[max(0, t + 1 - HORIZON) : t + 1], WEIGHTS, boxes)
-        assert estimate.candidate.tolist() == free.trajectory.tolist()
-        assert estimate.candidate_cost == free.cost
-        found.append((estimate, free, Status.CANDIDATE_OUTSIDE in estimate.status))
-    assert sum(outside for *_, outside in found) >= 2
+    mhe, free = estimator(sets, project_observer=False, **options), estimator({}, max_qps=0)
+    boxes[0] = None if name == "rows of X" else boxes[0]
+    for y, estimate in zip(Y, steps(mhe, (f, h), Y, WEIGHTS, boxes), strict=True):
+        plain = free.update(y)
+        assert estimate.candidate.tolist() == plain.trajectory.tolist()
+        assert estimate.candidate_cost == plain.cost
+        found.append((estimate, Status.CANDIDATE_OUTSIDE in estimate.status))
+    assert sum(outside for _, outside in found) >= 2
     return found
 
 
-def kept(estimate, free):
-    """Whether an estimate is the candidate, bit for bit."""
-    assert estimate.dropped == ()
-    assert estimate.cost == estimate.candidate_cost == free.cost
-    assert estimate.disturbances.tolist() == free.disturbances.tolist()
-    assert estimate.noises.tolist() == free.noises.tolist()
-    return estimate.trajectory.tolist() == free.trajectory.tolist()
-
-
 @quiet
-@pytest.mark.parametrize("start", [False, True])
 @pytest.mark.parametrize("max_qps", [0, 1, None])
 @pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
 @pytest.mark.parametrize("name", SETS)
-def test_the_rungs_of_the_ladder(name, infeasible, max_qps, start):
+def test_the_rungs_of_the_ladder(name, infeasible, max_qps):
     satisfied = 0
-    for estimate, free, outside in tight(
-        name, infeasible=infeasible, max_qps=max_qps, warm_start=start
+    for estimate, outside in tight(
+        name, infeasible=infeasible, max_qps=max_qps, warm_start=infeasible == "drop_rows"
     ):
         if max_qps == 0:
-            assert kept(estimate, free)
             expected = Status.CANDIDATE_OUTSIDE if outside else Status(0)
             assert estimate.status & ~Status.OBSERVER_FAR == (
                 Status.CANDIDATE | Status.NO_QPS | expected
             )
             continue
-        assert estimate.improved or kept(estimate, free)
         assert outside or estimate.improved
+        assert estimate.improved or not estimate.dropped
         assert outside or estimate.nearest_points == 0
         assert not estimate.dropped or infeasible == "drop_rows"
         # With a cap of 1, there is one QP for the rung below, too.
@@ -123,22 +105,21 @@ def test_the_rungs_of_the_ladder(name, infeasible, max_qps, start):
 
 
 @quiet
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("backend", [b for b in BACKENDS if qpmhe.solvers.backend(b).inequalities])
+@pytest.mark.parametrize("name", ["X, W and V", "without zero"])
 def test_backends_take_the_same_rung(name, backend):
     found, usual = (
-        [one for one, *_ in tight(name, backend=given, max_qps=5)] for given in (backend, "auto")
+        [one for one, _ in tight(name, backend=given, max_qps=5)] for given in (backend, "auto")
     )
     for estimate, expected in zip(found, usual, strict=True):
         # Where linearised rows exclude each other, what a solver ends at is its own.
-        if backend in INEQUALITY_BACKENDS and Status.SOLVER_STOPPED not in expected.status:
+        if Status.SOLVER_STOPPED not in expected.status:
             assert estimate.dropped == expected.dropped
             assert estimate.cost == pytest.approx(expected.cost, rel=1e-2)
 
 
-@pytest.mark.parametrize("max_qps", [1, 3])
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend, max_qps):
+def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend):
     """The states must stay in X, where y is out of reach of any noise in V."""
     system = qpmhe.System(
         lambda x: 0.9 * x, lambda x: x, n=1, p=1,
@@ -147,7 +128,7 @@ def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend, ma
     mhe, other = (
         qpmhe.MovingHorizonEstimator(
             system, qpmhe.Luenberger([0.01]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
-            horizon=3, initial_state=[0.5], backend=backend, max_qps=max_qps, infeasible=infeasible,
+            horizon=3, initial_state=[0.5], backend=backend, max_qps=1, infeasible=infeasible,
         )
         for infeasible in ("drop_rows", "keep_candidate")
     )
@@ -173,9 +154,11 @@ def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend, ma
         assert "The estimate violates them as well." in candidate.explain()
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """A clock that goes on by one second with each QP that is solved; what each QP got of it."""
+@quiet
+@pytest.mark.parametrize("budget", [1.5, 2.5, 9.5])
+@pytest.mark.parametrize("name", SETS)
+def test_all_rungs_share_the_time(monkeypatch, name, budget):
+    """A clock goes on by one second with each QP that is solved."""
     class Ticking(Solver):
         now, limits = 0.0, []
 
@@ -191,20 +174,15 @@ def clock(monkeypatch):
     for module in ("estimator", "engine", "optimizer"):
         monkeypatch.setattr(f"qpmhe.estimation.{module}.perf_counter", lambda: Ticking.now)
     qpmhe.solvers.register(Backend("ticking", Ticking, "a test's"))
-    yield Ticking
-    qpmhe.solvers.unregister("ticking")
-
-
-@quiet
-@pytest.mark.parametrize("budget", [1.5, 2.5, 9.5])
-@pytest.mark.parametrize("name", SETS)
-def test_all_rungs_share_the_time(clock, name, budget):
     left = []
-    for estimate, *_ in tight(name, backend="ticking", time_budget=budget, max_qps=3):
-        solves = estimate.qps + estimate.corrections + estimate.nearest_points
-        assert estimate.step_time == estimate.solve_time == solves
-        left.extend(budget - k for k in range(solves))
-    assert clock.limits == left
+    try:
+        for estimate, _ in tight(name, backend="ticking", time_budget=budget, max_qps=3):
+            solves = estimate.qps + estimate.corrections + estimate.nearest_points
+            assert estimate.step_time == estimate.solve_time == solves
+            left.extend(budget - k for k in range(solves))
+    finally:
+        qpmhe.solvers.unregister("ticking")
+    assert Ticking.limits == left
     assert min(left) > 0.0
 
 
@@ -213,4 +191,4 @@ def test_all_rungs_share_the_time(clock, name, budget):
 def test_solvers_with_next_to_no_time_do_no_harm(monkeypatch, backend):
     """Their own clocks run; the one between QPs stands still, so that they are called."""
     monkeypatch.setattr("qpmhe.estimation.optimizer.perf_counter", lambda: 0.0)
-    assert all(one.qps for one, *_ in tight("X, W and V", backend=backend, time_budget=1e-9))
+    assert all(one.qps for one, _ in tight("X, W and V", backend=backend, time_budget=1e-9))
