@@ -18,8 +18,9 @@ MARKED = {"ecos": "INACCURATE"}
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_every_backend_is_what_it_says(name):
+def test_every_backend_is_what_it_says_and_prints_nothing(name, capfd):
     report = check(name)
+    assert capfd.readouterr() == ("", "")
     assert report.measured == report.declared, str(report)
     for finding in report.findings:
         complaints = finding.detail.split("; ") if finding.detail else []
