@@ -4,6 +4,7 @@ import ctypes
 import os
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 
 from qpmhe.models import Example, Record, Scenario, batch_reactor
 
@@ -25,25 +26,12 @@ def _odd(action: Callable[[], object]) -> Example:
     return parts._replace(scenario=scenario)
 
 
-def raises() -> Example:
-    return _odd(lambda: 1 / 0)
-
-
-def leaves() -> Example:
-    return _odd(lambda: exit(3))
-
-
-def crashes() -> Example:
-    return _odd(lambda: ctypes.string_at(0))
-
-
-def is_killed() -> Example:
-    return _odd(lambda: os.kill(os.getpid(), 9))
-
-
-def hangs() -> Example:
-    # PyDLL keeps the interpreter's lock: no thread of Python's gets a turn.
-    return _odd(lambda: ctypes.PyDLL(None).sleep(100))
+raises = partial(_odd, lambda: 1 / 0)
+leaves = partial(_odd, lambda: exit(3))
+crashes = partial(_odd, lambda: ctypes.string_at(0))
+is_killed = partial(_odd, lambda: os.kill(os.getpid(), 9))
+# PyDLL keeps the interpreter's lock: no thread of Python's gets a turn.
+hangs = partial(_odd, lambda: ctypes.PyDLL(None).sleep(100))
 
 
 def cannot_be_made() -> Example:
@@ -52,11 +40,3 @@ def cannot_be_made() -> Example:
 
 def three_parts() -> tuple[object, ...]:
     return batch_reactor()[:3]
-
-
-def wrong_part() -> tuple[object, ...]:
-    system, observer, _, scenario = batch_reactor()
-    return system, observer, "cost", scenario
-
-
-not_callable = 3

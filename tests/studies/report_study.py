@@ -1,6 +1,4 @@
-"""One small study for the tests of summary and report, really run, once a process."""
-
-from __future__ import annotations
+"""The command line, called; and one small study, really run, once a process."""
 
 import atexit
 from functools import cache
@@ -8,15 +6,24 @@ from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
 
-import pandas as pd
+from typer.testing import CliRunner
 
+from qpmhe.cli.app import app
 from qpmhe.studies import Store, Study, run, write_report
 
 BACKENDS = ("daqp", "osqp", "proxqp")
 
 
+def command(*words):
+    """Output of a command, in one line; its error is raised."""
+    answer = CliRunner().invoke(app, [str(word) for word in words])
+    if answer.exception is not None:
+        raise answer.exception
+    return " ".join(answer.output.split())
+
+
 @cache
-def stored() -> Store:
+def stored():
     """Three backends, two caps, three seeds of 40 steps; and a second, shorter horizon."""
     folder = Path(mkdtemp(prefix="qpmhe-report-"))
     atexit.register(rmtree, folder, ignore_errors=True)
@@ -31,17 +38,17 @@ def stored() -> Store:
 
 
 @cache
-def written() -> Path:
+def written():
     """Its report."""
     return write_report(stored(), stored().path.parent / "report")
 
 
-def frame() -> pd.DataFrame:
+def frame():
     """Its cells, a fresh copy."""
     return stored().frame()
 
 
-def spoilt(backend: str, seed: int, reason: str) -> pd.DataFrame:
+def spoilt(backend, seed, reason):
     """The same with one backend's runs of one seed failed, as the store has failed cells."""
     rows = frame()
     failed = (rows["backend"] == backend) & (rows["seed"] == seed)

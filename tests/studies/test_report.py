@@ -1,46 +1,42 @@
+"""Means and fronts of configurations; answers, figures and page of the report; the terminal."""
+
 import json
 import re
-import resource
-import subprocess
-import sys
-from dataclasses import dataclass
 from io import StringIO
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 from matplotlib.image import imread
 from rich.console import Console
+from scipy.stats import ttest_1samp
 
 from qpmhe.cli.report import show
-from qpmhe.errors import InvalidInputError
+from qpmhe.errors import InvalidInputError, ShapeError
 from qpmhe.plots.style import _resized
 from qpmhe.studies.report import cases, write_report
-from qpmhe.studies.report.answers import failures, limitations
+from qpmhe.studies.report.answers import limitations
 from qpmhe.studies.report.drawing import styles
-from qpmhe.studies.report.figures import anytime, profiles, spreads
+from qpmhe.studies.report.figures import profiles
 from qpmhe.studies.report.page import Part, choose_runs, files
-from qpmhe.studies.report.words import configuration_words, number, percent, seconds
-from qpmhe.studies.summary import summarise
+from qpmhe.studies.report.words import configuration_words, number, seconds
+from qpmhe.studies.summary import CONFIGURATION, pareto_front, summarise
 
 from .report_study import frame, spoilt, stored, written
 
 
-@dataclass
-class Altered:
-    """The store with other cells."""
+def altered(rows, **changes):
+    """The store with other cells, and other words about its trajectories."""
+    def trajectory(key):
+        kept = stored().trajectory(key)
+        return kept and {**kept, **changes}
 
-    rows: pd.DataFrame
-
-    def frame(self):
-        return self.rows
-
-    def meta(self):
-        return stored().meta()
-
-    def trajectory(self, key):
-        return stored().trajectory(key)
+    return SimpleNamespace(frame=lambda: rows, meta=stored().meta, trajectory=trajectory)
 
 
 def texts(rows):
@@ -57,6 +53,7 @@ def test_fastest_near_the_best_the_observer_and_failures():
     assert text.startswith(f"{configuration_words(first)}: {seconds(first.time_median)} per step")
     assert f"RMSE {number(first.rmse)} (95 %" in text
     assert found["Failures"] == "No backend failed, in any run or step."
+    assert found["Worse than no QP"] == "No configuration."
     found, case = texts(spoilt("osqp", 1, "out of time"))
     observer = case.summary[case.summary.backend == "observer"].iloc[0]
     assert found["Observer alone (no QP)"].startswith(f"RMSE {number(observer.rmse)} ")
@@ -65,106 +62,46 @@ def test_fastest_near_the_best_the_observer_and_failures():
     rows["reasons"] = [{"SOLVER_FAILED": 4} if one == "osqp" else {} for one in rows.backend]
     words = "osqp, 2 QPs per sample, cap 2: 10 % of the steps, but no run"
     assert words in texts(rows)[0]["Failures"]
+    rows = pd.concat([spoilt("osqp", 1, "x").assign(shared=True), rows.assign(environment=1)[:1]])
+    after = " ".join(limitations(rows, summarise(rows)))
+    for words in ("cores were shared", "2 environments", "2 of 31 runs failed", "fewer runs"):
+        assert words in after
 
 
 def test_what_is_worse_than_no_qp_is_named():
-    assert texts(frame())[0]["Worse than no QP"] == "No configuration."
     rows = frame()
     observer = rows[(rows.backend == "observer") & (rows.horizon == 10)].set_index("seed")
     worse = (rows.backend == "osqp") & (rows.solver_iterations == 2) & (rows.horizon == 10)
-    rows.loc[worse, "rmse"] = 4.0 * observer.rmse.loc[rows.seed[worse]].to_numpy()
     late = (rows.backend == "daqp") & rows.solver_iterations.isna() & (rows.horizon == 10)
-    rows.loc[late, "rmse_settled"] = (
-        1.5 * observer.rmse_settled.loc[rows.seed[late]].to_numpy()
-    )
-    mean = 4.0 * observer.rmse.mean()
-    settled = 1.5 * observer.rmse_settled.mean()
+    for which, name, times in ((worse, "rmse", 4.0), (late, "rmse_settled", 1.5)):
+        rows.loc[which, name] = times * observer[name].loc[rows.seed[which]].to_numpy()
+    mean, settled = 4.0 * observer.rmse.mean(), 1.5 * observer.rmse_settled.mean()
     assert texts(rows)[0]["Worse than no QP"] == (
         "2 of 6 configurations have a larger error than the observer alone, although J is never "
         "above the candidate's: osqp, 2 QPs per sample, cap 2 "
         f"(RMSE {number(mean)}, 4.00 times); daqp, 2 QPs per sample "
         f"(RMSE after settling {number(settled)}, 1.50 times)."
     )
-    early = rows.assign(rmse=frame().rmse)
-    assert texts(early)[0]["Worse than no QP"].startswith(
-        "1 of 6 configurations has a larger error after settling than the observer alone")
-    rows.loc[worse, "rmse"] = np.inf
-    assert "osqp, 2 QPs per sample, cap 2 (RMSE ∞); daqp" in texts(rows)[0]["Worse than no QP"]
 
 
-def test_one_backend_at_one_cap_is_not_drawn():
-    rows = summarise(frame())
-    assert anytime(rows[rows["solver_iterations"].isna()]) is not None
-    assert anytime(rows[rows["solver_iterations"].isna() & (rows["backend"] != "osqp")
-                        & (rows["backend"] != "proxqp")]) is None
-
-
-def test_most_of_what_is_worse_is_counted():
-    rows = frame().query("horizon == 10 and backend != 'observer'")
-    assert "Worse than no QP" not in texts(rows)[0]  # without the observer
-    worse = (rows.assign(solver_iterations=cap, rmse=rows.rmse * 100.0) for cap in (1, 2, 3))
-    rows = pd.concat([frame().query("horizon == 10 and backend == 'observer'"), *worse])
-    text = texts(rows.drop_duplicates(["backend", "solver_iterations", "seed"]))[0]
-    assert text["Worse than no QP"].startswith("9 of 9 configurations have")
-    assert text["Worse than no QP"].endswith("; and 3 more.")
-
-
-def test_accuracy_or_times_alone_and_nothing_at_all(tmp_path):
-    rows = frame().query("horizon == 10").assign(times=None)
+def test_accuracy_alone_and_nothing_at_all(tmp_path):
+    rows = frame().query("horizon == 10").assign(times=None, cost_ratio=np.nan)
     rows[["time_median", "time_p95", "time_p99", "time_max"]] = np.nan
     found, _ = texts(rows)
     assert "accuracy only" in found["Fastest"]
-    assert "RMSE" in found["Most accurate"]
     assert any("No times" in note for note in limitations(rows, summarise(rows)))
-    text = write_report(Altered(rows), tmp_path / "accuracy").read_text(encoding="utf-8")
-    assert "Accuracy against time" not in text
-    assert "Time per step" not in text
+    text = write_report(altered(rows), tmp_path).read_text(encoding="utf-8")
+    for words in ("Accuracy against time", "Time per step", "Performance profile", "true cost J"):
+        assert words not in text
     assert "Stopping the solver early" in text
     found, _ = texts(frame().assign(outcome="failed", reason="crash"))
     assert found["Result"] == "No configuration finished all its runs."
     with pytest.raises(InvalidInputError, match="no finished cell"):
         write_report((frame()[:0], {}), tmp_path)
 
-    page = write_report(Altered(frame().query("horizon == 10").assign(cost_ratio=np.nan)), tmp_path)
-    text, (_, data) = page.read_text(encoding="utf-8"), embedded(page)
-    assert "Performance profile" not in text
-    assert "true cost J" not in text
-    assert not (tmp_path / "profile.png").exists()
-    (case,) = data["cases"].values()
-    assert case["profile"] is None
-    assert "cost_ratio" not in case["accuracy"]
-    assert case["anytime"]["layout"]["yaxis"]["title"]["text"] == "RMSE"
 
-
-def test_limitations_and_failures_follow_the_data():
+def test_profiles_against_their_definition():
     rows = frame()
-    before = " ".join(limitations(rows, summarise(rows)))
-    assert "3 seeds" in before
-    assert "shared" not in before
-    fewer = spoilt("osqp", 1, "x")
-    found = failures(fewer)
-    assert {row["configuration"] for row in found} == {
-        "osqp, 2 QPs per sample", "osqp, 2 QPs per sample, cap 2"
-    }
-    assert all(row["seeds"] == [1] and row["reason"] == "x" for row in found)
-    rows = pd.concat([fewer.assign(shared=True), rows.assign(environment=1)[:1]])
-    after = " ".join(limitations(rows, summarise(rows)))
-    assert "cores were shared" in after
-    assert "2 environments" in after
-    assert "2 of 31 runs failed" in after
-    assert "fewer runs" in after
-
-
-def test_spreads_and_profile_against_their_definitions():
-    rows = frame()
-    (one,) = (one for one in spreads(rows.query("horizon == 10"))
-              if (one.backend, one.cap) == ("daqp", "2"))
-    mine = rows.query("horizon == 10 and backend == 'daqp' and solver_iterations == 2")
-    times = np.concatenate(list(mine.times)).astype(float)
-    assert one.steps == 120 == times.size
-    shares = (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
-    assert one.quantiles == pytest.approx(np.quantile(times, shares).tolist())
-
     found = profiles(rows)
     assert [(one.backend, one.problems) for one in found] == [
         ("daqp", 6), ("osqp", 6), ("proxqp", 6)]
@@ -179,45 +116,6 @@ def test_spreads_and_profile_against_their_definitions():
             mine = times[one.backend]
             share = (mine <= tau * least[mine.index]).sum() / 6
             assert (one.ratios <= tau).sum() / one.problems == share
-    assert profiles(rows.query("seed == 0 and horizon == 10")) == []  # one problem
-    assert profiles(rows.assign(cost_ratio=2.0)) == []  # nothing is solved
-
-
-def test_thirty_backends_look_different():
-    drawn = styles([f"solver {k:02d}" for k in range(30)]).values()
-    assert len({(one.color, one.symbol) for one in drawn}) == 31
-    assert len({(one.color, one.dash) for one in drawn}) == 31
-
-
-def test_numbers_durations_and_shares_in_words():
-    for words, cases_of in {
-        number: {0.0: "0", 0.012345: "0.0123", 0.99999: "1.00", 1234567.0: "1.23e+06",
-                 999.9: "1,000", -2.5: "-2.50", float("inf"): "∞", float("nan"): "–"},  # noqa: RUF001
-        seconds: {1.234e-6: "1.23 µs", 0.0009999: "1.00 ms", 0.0123: "12.3 ms", 2.0: "2.00 s"},
-        percent: {0: "0 %", 1e-5: "< 0.1 %", 0.123: "12.3 %", 0.99999: "> 99.9 %", 1: "100 %"},
-    }.items():
-        assert {value: words(value) for value in cases_of} == cases_of
-
-
-def test_a_menu_entry_for_each_state():
-    rows, (_, data) = summarise(frame()), embedded(written())
-    case = data["cases"]["batch-reactor-N-10"]
-    entries = dict(case["menus"]["accuracy"]["metric"])
-    assert list(entries)[:5] == ["rmse", "rmse_settled", "rmse_excess", "cost_ratio", "cost"]
-    assert list(entries.values())[5:] == ["RMSE of x1 (A)", "RMSE of x2 (B)"]
-    assert set(case["accuracy"]) == set(entries)
-    for j in (0, 1):
-        drawn = sorted(
-            y for trace in case["accuracy"][f"rmse_{j + 1}"]["data"]
-            if trace["meta"].get("backend") for y in trace["y"]
-        )
-        expected = [one[j] for one in rows[rows.horizon == 10].rmse_states]
-        assert drawn == pytest.approx(sorted(expected))
-        assert case["accuracy"][f"rmse_{j + 1}"]["layout"]["yaxis"]["title"]["text"] == (
-            entries[f"rmse_{j + 1}"]
-        )
-    (one, *_) = cases(rows)
-    assert Part(one, frame(), None).state_labels() == ["state 1", "state 2"]  # without names
 
 
 @pytest.mark.parametrize("inches", [None, 3.3])
@@ -227,7 +125,6 @@ def test_no_text_is_clipped_or_covered(inches):
     for case in cases(summarise(rows)):
         cells = rows[rows.horizon == case.summary.horizon.iloc[0]]
         runs = choose_runs(stored(), cells, case, 100_000)
-        assert runs.observer is not None
         few = choose_runs(stored(), cells, case, 0)  # where there is room for few
         assert few.left_out == len(runs.all) - len(few.all) > 0
         parts.append(Part(case, cells, 1e-3, runs))
@@ -248,7 +145,14 @@ def test_no_text_is_clipped_or_covered(inches):
             assert not [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])]
 
 
-def test_report_is_whole_and_needs_no_network():
+def embedded(page):
+    """The texts of the page's script elements, as a browser ends them, and the figures' data."""
+    text = page.read_text(encoding="utf-8")
+    scripts = re.findall(r"<script[^>]*>(.*?)</script>", text, re.DOTALL)
+    return scripts, next(json.loads(one) for one in scripts if one.startswith('{"cases"'))
+
+
+def test_the_report_is_whole_and_needs_no_network():
     page = written()
     folder, text = page.parent, page.read_text(encoding="utf-8")
     assert page.stat().st_size < 8e6
@@ -261,42 +165,32 @@ def test_report_is_whole_and_needs_no_network():
     }
     for stem in stems:
         assert imread(folder / f"{stem}.png")[..., :3].std() > 0.02
+    rows = summarise(frame())
     table = pd.read_csv(folder / "summary.csv")
-    assert table.rmse.to_numpy() == pytest.approx(summarise(frame()).rmse.to_numpy())
-    versions = stored().meta()["environments"][0]["versions"]
-    assert f"numpy {versions['numpy']}" in text
-
-
-def embedded(page):
-    """The texts of the page's script elements, as a browser ends them, and the figures' data."""
-    text = page.read_text(encoding="utf-8")
-    scripts = re.findall(r"<script[^>]*>(.*?)</script>", text, re.DOTALL)
-    return scripts, next(json.loads(one) for one in scripts if one.startswith('{"cases"'))
-
-
-def test_the_figures_are_what_plotly_takes():
+    assert table.rmse.to_numpy() == pytest.approx(rows.rmse.to_numpy())
+    assert f"numpy {stored().meta()['environments'][0]['versions']['numpy']}" in text
+    case = embedded(page)[1]["cases"]["batch-reactor-N-10"]
+    entries = dict(case["menus"]["accuracy"]["metric"])
+    assert list(entries)[:5] == ["rmse", "rmse_settled", "rmse_excess", "cost_ratio", "cost"]
+    assert list(entries.values())[5:] == ["RMSE of x1 (A)", "RMSE of x2 (B)"]
+    drawn = [y for trace in case["accuracy"]["rmse_2"]["data"]
+             if trace["meta"].get("backend") for y in trace["y"]]
+    assert sorted(drawn) == pytest.approx(
+        sorted(one[1] for one in rows[rows.horizon == 10].rmse_states))
     graph_objects = pytest.importorskip("plotly.graph_objects")
-    _, data = embedded(written())
-    for case in data["cases"].values():
-        figures = [case[name] for name in ("anytime", "times", "profile", "trajectories")]
-        for figure in [*figures, *case["accuracy"].values()]:
-            graph_objects.Figure(figure)  # raises where plotly does not know a property
-            assert figure["data"]
+    figures = [case[name] for name in ("anytime", "times", "profile", "trajectories")]
+    for figure in [*figures, *case["accuracy"].values()]:
+        graph_objects.Figure(figure)  # raises where plotly does not know a property
+        assert figure["data"]
 
 
 def test_no_text_of_a_user_reaches_into_the_script_elements(tmp_path):
     label = "]]><!--<script></script>"
-
-    class Labelled(Altered):
-        def trajectory(self, key):
-            return {**stored().trajectory(key), "labels": [label, "y"]}
-
     rows = spoilt("proxqp", 1, "</script><b>out of time").query("horizon == 4")
     plain = embedded(write_report((rows, stored().meta()), tmp_path / "plain"))[0]
-    page = write_report(Labelled(rows.assign(model=f"m.py:make(label={label!r})")), tmp_path)
+    rows = rows.assign(model=f"m.py:make(label={label!r})")
+    page = write_report(altered(rows, labels=(label, "y")), tmp_path)
     scripts, data = embedded(page)
-    assert 'id="trajectories"' not in (tmp_path / "plain" / "index.html").read_text()
-    assert len(scripts) == len(plain)
     # "<!--" and then "<script" would keep a browser within the element beyond its end.
     assert [one.count("<!--") for one in scripts] == [one.count("<!--") for one in plain]
     text = page.read_text(encoding="utf-8")
@@ -309,57 +203,28 @@ def test_no_text_of_a_user_reaches_into_the_script_elements(tmp_path):
     assert titles == [label, "y"]
 
 
-def test_a_full_disk_leaves_the_former_report(tmp_path):
-    page = tmp_path / "index.html"
-    page.write_text("the former one")
-    content = frame().query("horizon == 4"), stored().meta()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # to a program, a full disk
-    try:
-        with pytest.raises(InvalidInputError, match=r"cannot write the report into .*make room"):
-            write_report(content, tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [
-        ("index.html", "the former one")]
-
-
-def test_libraries_are_loaded_late():
-    code = (
-        "import sys, qpmhe.studies.report, qpmhe.cli.report;"
-        "print([m for m in ('pandas', 'plotly', 'itables', 'matplotlib.pyplot')"
-        " if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def shown(summary, width):
-    """What the terminal shows, and the headings of its first table, or their last words."""
+    """What the terminal shows, the lines of its table, and its headings, or their last words."""
     console = Console(width=width, record=True, color_system=None, file=StringIO())
     show(console, summary)
     text = console.export_text()
     assert "…" not in text
-    (line, *_) = (line for line in text.splitlines() if line.strip().startswith("backend"))
-    return text, set(re.split(r"\s{2,}", line.strip()))
-
-
-def table_lines(text):
-    return [line for line in text.splitlines() if re.match(r"\s*(daqp|osqp|proxqp|obs\w+) ", line)]
+    rows = [line.strip() for line in text.splitlines()
+            if re.match(r"\s*(backend|daqp|osqp|proxqp|observer) ", line)]
+    return text, rows[1:], set(re.split(r"\s{2,}", rows[0]))
 
 
 @pytest.mark.parametrize("width", [80, 120, 200])
 def test_the_terminals_room_is_used(width):
-    text, headings = shown(summarise(frame()), width)
+    text, _, headings = shown(summarise(frame().query("horizon == 10")), width)
     assert {"RMSE", "conv.", "median", "impr."} <= headings
     assert ("99 %" in headings) == (width >= 120)
     assert ({"95 %", "kept", "back", "hits", "max"} <= headings) == (width == 200)
     assert ("Only in the report, for want of room" in " ".join(text.split())) == (width < 200)
     assert not {"late", "NEES"} & headings
-    # What was asked for is shown at any width: generic backends, two starts, failed runs.
-    rows = frame().query("horizon == 10")
-    rows = rows.assign(late=0.9995, nees=1230.0, backend="qpsolvers:" + rows.backend)
-    text, headings = shown(summarise(pd.concat([rows, rows.assign(start="best")])), width)
+    # What was asked for is shown at any width.
+    rows = frame().query("horizon == 10").assign(late=0.9995, nees=1230.0)
+    text, _, headings = shown(summarise(pd.concat([rows, rows.assign(start="best")])), width)
     assert {"late", "NEES", "RMSE", "median"} <= headings
     assert "> 99.9 %" in text
     assert "1,230" in text
@@ -368,20 +233,86 @@ def test_the_terminals_room_is_used(width):
 def test_the_best_of_a_column_is_marked_once_and_of_many_rows_those_that_matter_are_shown():
     rows = frame().query("horizon == 10")
     summary = summarise(rows)
-    lines = table_lines(shown(summary, 120)[0])
+    _, lines, _ = shown(summary, 120)
     assert len(lines) == len(summary)
     assert {line.split()[0] for line in lines if re.search(r"[µm]s\*", line)} == {"observer"}
     near = summary[summary.rmse <= summary.rmse.min() * 1.001]
     best = near.loc[near.time_median.idxmin()]
     assert [line.split()[0] for line in lines if f"{best.rmse:.3f}*" in line] == [best.backend]
-    assert sum(line.rstrip().endswith("front") for line in lines) == summary.pareto.sum()
-    capped = rows[rows.solver_iterations == 2]
-    summary = summarise(pd.concat([rows, *(
-        capped.assign(solver_iterations=capped.solver_iterations + cap, rmse=capped.rmse * 2)
-        for cap in range(1, 13)
-    )]))
-    text, _ = shown(summary, 120)
-    lines = table_lines(text)
+    assert sum(line.endswith("front") for line in lines) == summary.pareto.sum()
+    many = [rows[rows.solver_iterations == 2].assign(solver_iterations=cap) for cap in range(3, 15)]
+    text, lines, _ = shown(summarise(pd.concat([rows, *many])), 120)
     assert len(lines) == int(re.search(r"(\d+) of 43 configurations", text).group(1)) < 20
-    assert {line.split()[0] for line in lines} == {"daqp", "osqp", "proxqp", "observer"}
-    assert sum(line.rstrip().endswith("front") for line in lines) == summary.pareto.sum()
+
+
+def cells_of(rows, row):
+    for key in CONFIGURATION:
+        rows = rows[rows[key].isna() if pd.isna(row[key]) else rows[key] == row[key]]
+    return rows
+
+
+def test_means_and_limits_are_students_and_the_excess_is_paired_by_seed():
+    rows = frame()
+    summary = summarise(rows)
+    assert len(summary) == 7 + 3
+    for _, row in summary.iterrows():
+        cells = cells_of(rows, row)
+        assert (len(cells), row.seeds, row.failures) == (3, 3, 0)
+        group = summary[summary.horizon == row.horizon]
+        front = pareto_front(group.time_median, group.rmse, 1e-3)
+        assert group.pareto.tolist() == front.tolist()
+        best = cells_of(rows, group.loc[group.rmse.idxmin()]).set_index("seed").rmse
+        cells = cells.assign(rmse_excess=cells.rmse / cells.seed.map(best) - 1.0)
+        for name in ("rmse", "rmse_settled", "cost_ratio", "time_p99", "rmse_excess"):
+            values = cells[name].to_numpy(float)
+            assert row[name] == pytest.approx(values.mean(), rel=1e-12)
+            if np.ptp(values) > 1e-9 * abs(values.mean()):
+                low, high = ttest_1samp(values, 0.0).confidence_interval(0.95)
+                least = -np.inf if name == "rmse_excess" else 0.0
+                assert row[f"{name}_low"] == pytest.approx(max(least, low), rel=1e-9)
+                assert row[f"{name}_high"] == pytest.approx(high, rel=1e-9)
+        assert row.rmse_states == pytest.approx(np.mean([*cells["rmse_states"]], axis=0))
+    alone = summarise(rows[rows.seed == 0])  # one seed has no limits
+    assert alone.rmse.notna().all()
+    assert alone[["rmse_low", "time_median_high"]].isna().all(axis=None)
+    with pytest.raises(InvalidInputError, match="time_p99"):
+        summarise(rows.drop(columns="time_p99"))
+
+
+def test_shares_stay_shares_and_failed_cells_are_counted_and_left_out_of_means():
+    rows = spoilt("osqp", 1, "out of time")
+    rows.loc[rows.seed == 0, "improved"] = 0.0
+    rows["reasons"] = [{"IMPROVED": 30, "SOLVER_FAILED": 10}] * len(rows)
+    summary = summarise(rows)
+    osqp = summary["backend"] == "osqp"
+    assert (summary.failures == osqp).all()
+    assert not summary.pareto[osqp].any()
+    row = summary[osqp].iloc[0]
+    assert row.rmse == pytest.approx(cells_of(rows, row).rmse.dropna().mean())
+    assert summary.failed_steps.tolist() == pytest.approx([0.25] * len(summary))
+    assert row.reasons == {"IMPROVED": 0.75, "SOLVER_FAILED": 0.25}
+    assert (row.improved_low, row.improved_high) == (0.0, 1.0)
+
+
+points = arrays.arrays(
+    float, st.tuples(st.integers(0, 12), st.just(2)),
+    elements=st.sampled_from([0.0, 1.0, 2.0, 3.0, 4.0, np.nan, np.inf]),
+)
+
+
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(points)
+def test_front_against_its_definition(rows):
+    finite = np.isfinite(rows).all(axis=1)
+    expected = [
+        bool(fine) and not any(
+            other_fine and (other <= row).all() and (other < row).any()
+            for other, other_fine in zip(rows, finite, strict=True)
+        )
+        for row, fine in zip(rows, finite, strict=True)
+    ]
+    assert pareto_front(rows[:, 0], rows[:, 1]).tolist() == expected
+    times, errors = [1.0, 2.0, 3.0, 4.0], [1.0, 0.9995, 0.998, 0.5]
+    assert pareto_front(times, errors, 1e-3).tolist() == [True, False, True, True]
+    with pytest.raises(ShapeError, match=r"\(2,\) and \(3,\)"):
+        pareto_front([1, 2], [1, 2, 3])
