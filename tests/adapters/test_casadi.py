@@ -103,10 +103,7 @@ def test_wrong_input_fails_at_construction_and_nan_before_a_run(functions, optio
 def falling(case):
     """Models of two states whose evaluation breaks off for x0 beyond 1: f, h, and h's values."""
     x, z, q = ca.MX.sym("x", 2), ca.SX.sym("z"), ca.SX.sym("q")
-    if case == "linear solver":
-        matrix = ca.densify(ca.diag(ca.vertcat(ca.fmax(1 - x[0], 0), 1)))
-        h, value = ca.solve(matrix, ca.vertcat(1, x[1]))[0], lambda x: 1 / (1 - x[0])
-    elif case == "QP":  # x0 <= r <= 1, near x1
+    if case == "QP":  # x0 <= r <= 1, near x1
         quiet = {"print_iter": False, "print_header": False, "print_info": False}
         dense = {"h": ca.Sparsity.dense(1, 1), "a": ca.Sparsity.dense(2, 1)}
         qp = ca.conic("qp", "qrqp", dense, quiet)
@@ -135,7 +132,7 @@ def estimator(system):
 
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 @pytest.mark.parametrize(("case", "compiled"), [
-    ("linear solver", False), ("QP", False), ("root", False), ("root", None),
+    ("QP", False), ("root", False), ("root", None),
     pytest.param("QP", True, marks=needs_compiler),
 ])  # fmt: skip
 def test_an_evaluation_that_breaks_off_is_no_number_and_fails_a_step_only(case, compiled):
