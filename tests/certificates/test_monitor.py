@@ -1,14 +1,13 @@
 """At run time: the set around the observer, what ends it, and the theorem's hypotheses."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import qpmhe
 from qpmhe.certificates import MismatchError, Monitor, Sizes, certify, certify_observer
-from qpmhe.errors import InvalidInputError, OptionError, ShapeError
+from qpmhe.errors import InvalidInputError, ShapeError
 
 from .helpers import box, linear, scalar, unit_cost
 
@@ -57,20 +56,16 @@ def test_the_truth_is_in_the_set_around_the_observer(certificate, options):
         mhe = estimator(certificate, **options)
         watch = followed(certificate, mhe)
         readings = [watch.check(mhe.update(y)) for y in ys]
-        assert watch.lost is None
-        for x, one in zip(states[1:], readings, strict=True):
-            assert ((one.lower <= x) & (x <= one.upper)).all()
         # The same along the run as a whole, and less for the signals that acted.
         run = estimator(certificate, **options).run(ys)
         band = certificate.observer_bound.along(run, initial_error=START)
+        assert (watch.lost, band.lost) == (None, None)
         for name in ("radius", "lower", "upper", "error"):
-            np.testing.assert_allclose(
-                getattr(band, name)[1:], [getattr(one, name) for one in readings], rtol=1e-9
-            )
-        np.testing.assert_array_equal(certificate.bound(run, initial_error=START), band.error)
-        known = certificate.bound(
-            run, states[1:] - states[:-1] @ A.T, ys - states[:-1, :1], initial_error=START
-        )
+            found = [getattr(one, name) for one in readings]
+            np.testing.assert_allclose(getattr(band, name)[1:], found, rtol=1e-9)
+        assert ((band.lower <= states) & (states <= band.upper)).all()
+        w, v = states[1:] - states[:-1] @ A.T, ys - states[:-1, :1]
+        known = certificate.bound(run, w, v, initial_error=START)
         assert (np.linalg.norm(states - run.states, axis=1) <= known).all()
         assert (known <= band.error * (1.0 + 1e-9)).all()
 
@@ -78,8 +73,6 @@ def test_the_truth_is_in_the_set_around_the_observer(certificate, options):
 EVENTS = {  # what happens in place of the sample 7, the sample that is lost, and the reason
     "missing": (lambda mhe, y: [mhe.update([np.nan])], 7, "a measurement was missing"),
     "amended": (lambda mhe, y: [mhe.update(y), mhe.amend(6, [3.0])], 7, "late measurement"),
-    "amended in secret": (
-        lambda mhe, y: [mhe.amend(6, [3.0]) and mhe.update(y)], 7, "late measurement"),
     "began again": (lambda mhe, y: [mhe.reset() or mhe.update(y)], 0, "restarted"),
     "not shown": (
         lambda mhe, y: [mhe.update(y) and mhe.update(y)], 8, "from 7 to 7 were not shown"),
@@ -106,34 +99,19 @@ def test_each_event_ends_the_bound_at_its_sample(certificate, event):
         ys[7] = np.nan if event == "missing" else 26.0
         band = certificate.observer_bound.along(estimator(certificate).run(ys), initial_error=START)
         assert (band.lost, band.reason) == (sample, watch.reason)
-        assert f"up to sample {sample}: there" in str(band)
-        np.testing.assert_array_equal(np.isnan(band.error), np.arange(31) > sample)
 
 
 def test_weights_do_not_matter_to_the_observer_and_wrong_sizes_are_found_out(certificate):
-    mhe, other = (estimator(certificate) for _ in range(2))
-    watch, same = followed(certificate, mhe), followed(certificate, other)
-    for y in record()[1][:9]:
-        reading = watch.check(mhe.update(y, noise_weight=[[9.0]]))
-        assert reading.radius == same.check(other.update(y)).radius
-    assert watch.check(mhe.set(disturbance_weight=np.eye(2))).lost is None
-    watch = followed(certificate, other := estimator(certificate), 0.0, sizes=Sizes(0.0, 0.0))
-    assert [watch.check(other.update([24.0])).lost for _ in range(4)] == [None, 1, 1, 1]
-    assert "larger than stated" in watch.reason
+    mhe = estimator(certificate)
+    watch = followed(certificate, mhe)
+    assert {watch.check(mhe.update(y, noise_weight=[[9.0]])).lost for y in record()[1]} == {None}
+    mhe.reset()
+    watch = followed(certificate, mhe, 0.0, sizes=Sizes(0.0, 0.0))
+    assert [watch.check(mhe.update([24.0])).lost for _ in range(4)] == [None, 1, 1, 1]
     run = estimator(certificate).run(np.full((4, 1), 24.0))
     band = certificate.observer_bound.along(run, 0.0, 0.0, initial_error=0.0)
     assert (band.lost, band.reason) == (1, watch.reason)
-
-
-def test_sensors_that_are_not_sampled_end_it():
-    certificate = certify(
-        linear(0.8 * np.eye(2), np.eye(2)), qpmhe.Luenberger(0.3 * np.eye(2)), unit_cost(2, 2),
-        horizon=4, region=box([-10.0, -10.0], [10.0, 10.0]),
-    )
-    mhe = estimator(certificate)
-    watch = followed(certificate, mhe, 0.5)
-    assert watch.check(mhe.update([0.1, 0.1])).lost is None
-    assert watch.check(mhe.update([0.1], sensors=0)).reason == "not all outputs were sampled"
+    assert "larger than stated" in band.reason
 
 
 def test_steps_and_inputs_that_were_not_certified():
@@ -144,18 +122,15 @@ def test_steps_and_inputs_that_were_not_certified():
         system, qpmhe.Luenberger([[0.2]]), unit_cost(), horizon=4, region=box(-5.0, 5.0),
         inputs=box(-1.0, 1.0), sizes=Sizes(0.1, 0.1),
     )
-    for kept, shown, words in (
-        ({}, {"dt": 0.07}, "length 0.07, and 0.1 is certified"),
-        ({"dt": 0.07}, {"dt": 0.07}, "length 0.07"),
-        ({"dt": 0.07}, {}, "another length"),
-        ({"u": 1.5}, {"u": [1.5]}, "input .* outside"),
+    for u, kept, shown, words in (
+        (0.3, {}, {"dt": 0.07}, "length 0.07, and 0.1 is certified"),
+        (0.3, {"dt": 0.07}, {}, "another length"), (1.5, {}, {}, "input .* outside"),
     ):
         mhe = estimator(certificate)
         watch = followed(certificate, mhe, 0.5)
         for t in range(4):
             assert watch.check(mhe.update([0.2], [0.3]), [0.3], dt=0.1 if t else None).lost is None
-        u = kept.pop("u", 0.3)
-        reading = watch.check(mhe.update([0.2], [u], **kept), **{"u": [0.3]} | shown)
+        reading = watch.check(mhe.update([0.2], [u], **kept), [u], **shown)
         assert reading.lost == 4
         assert re.search(words, reading.reason)
     run = estimator(certificate).run(np.zeros(9), np.where(np.arange(9) == 5, -1.5, 0.3)[:, None])
@@ -165,97 +140,50 @@ def test_steps_and_inputs_that_were_not_certified():
         watch.check(mhe.update([0.2], [0.3]))
 
 
-# Projection onto X
-
-
-def corner(projects):
-    """A system that often leaves its X, with a coupled observer, and its certificate."""
-    system = plant(states=box([0.0, -10.0], [10.0, 0.5]))
-    stability = certify_observer(system, qpmhe.Luenberger(GAIN), system.states, rho=0.9)
+@pytest.mark.parametrize("projects", [True, False])
+def test_a_projection_onto_x_keeps_the_bounds_in_the_certified_metric_alone(projects):
+    X, projected = box([0.0, -10.0], [10.0, 0.5]), 0  # which the observer often leaves
+    system, rng = plant(states=X), np.random.default_rng(0)
+    stability = certify_observer(system, qpmhe.Luenberger(GAIN), X, rho=0.9)
     observer = qpmhe.Luenberger(GAIN, metric=stability.P if projects else None)
-    return certify(system, observer, COST, horizon=4, sizes=SIZES, stability=stability)
-
-
-def inside(certificate, seed):
-    """A record whose states stay in X; the disturbance sees to it."""
-    rng, X = np.random.default_rng(seed), certificate.system.states
-    x, ys = [np.array([1.0, 0.2])], []
-    for _ in range(40):
-        tries = A @ x[-1] + rng.choice([-0.1, 0.1], (200, 2)) * rng.random((200, 2)) ** 0.2
-        kept = [each for each in tries if X.violation(each) == 0.0]
-        if not kept:
-            break
-        ys.append(x[-1][:1] + rng.choice([-0.2, 0.2]))
-        x.append(kept[0])
-    return np.array(x), np.array(ys)
-
-
-def test_a_projection_in_the_certified_metric_keeps_all_bounds():
-    certificate = corner(projects=True)
-    paper = certificate.of()
-    assert paper.model_lipschitz == pytest.approx(np.linalg.norm(A, 2), rel=0.02)
-    projected = 0
-    for seed in range(8):
-        states, ys = inside(certificate, seed)
-        mhe = estimator(certificate, initial_state=[0.0, 0.5])
-        watch = Monitor(certificate, mhe, initial_error=states[0] - mhe.observer_state)
-        w, v = states[1:] - states[:-1] @ A.T, ys - states[:-1, :1]
-        signals = np.linalg.norm(w, axis=1), np.abs(v[:, 0])
-        start = np.linalg.norm(states[0] - mhe.observer_state)
-        own, limits = (each.bound(start, *signals) for each in (paper.observer, paper.result))
-        for t, (x, y) in enumerate(zip(states[1:], ys, strict=True), 1):
-            estimate = mhe.update(y)
-            reading, error = watch.check(estimate), np.linalg.norm(x - estimate.state)
+    certificate = certify(system, observer, COST, horizon=4, sizes=SIZES, stability=stability)
+    assert (certificate.of().model_lipschitz is not None) is projects
+    for _ in range(8):
+        mhe, x = estimator(certificate, initial_state=[0.0, 0.5]), [np.array([1.0, 0.2])]
+        watch = Monitor(certificate, mhe, initial_error=x[0] - mhe.observer_state)
+        w, v = rng.choice([-0.1, 0.1], (25, 2)), rng.choice([-0.2, 0.2], (25, 1))
+        errors = []
+        for t in range(25):
+            estimate, ahead = mhe.update(x[t][:1] + v[t]), A @ x[t]
+            x.append(np.clip(ahead + w[t], X.lower, X.upper))
+            w[t] = x[-1] - ahead
+            reading, error = watch.check(estimate), np.linalg.norm(x[-1] - estimate.state)
             projected += qpmhe.Status.OBSERVER_PROJECTED in estimate.status
-            away = certificate.observer_bound.length(x - estimate.observer_state)
-            assert away * (1.0 - 1e-12) <= reading.radius
-            assert ((reading.lower <= x) & (x <= reading.upper)).all()
-            assert error <= min(reading.error, limits[t])
-            # The Lemma's link that has no kappa: (rho + L_f + 1 / C_w) S(t).
-            moved = np.linalg.norm(estimate.candidate[-1] - A @ estimate.candidate[-2])
-            most = own[t] / paper.observer.rate + np.dot(paper.observer.constants[1:], (
-                signals[0][t - 1], signals[1][t - 1]
-            ))
-            assert moved <= paper.kappa_bar * paper.L_bar * most
-        assert watch.applies
+            assert reading.lost is not None or error <= reading.error
+            errors.append(error)
+        lengths = (np.linalg.norm(e, axis=1) for e in (w, v))
+        limit = certificate.of().result.bound(np.linalg.norm(x[0] - [0.0, 0.5]), *lengths)
+        assert not projects or (errors <= limit[1:]).all()
+        assert watch.applies is projects
+        assert projects or "another metric than the certified one" in watch.reason
     assert projected > 15
 
 
-def test_a_projection_in_another_metric_ends_it():
-    certificate = corner(projects=False)
-    bound, ys = certificate.observer_bound, inside(certificate, 0)[1]
-    assert certificate.of().model_lipschitz is None
-    run = estimator(certificate, initial_state=[0.0, 0.5]).run(ys)
-    t = int((run.flags & qpmhe.Status.OBSERVER_PROJECTED.value).astype(bool).argmax())
-    band = bound.along(run, initial_error=2.0)
-    assert band.lost == t < len(ys) - 1
-    assert "another metric than the certified one" in band.reason
-    # An equal observer may be given the certified metric.
-    observer = qpmhe.Luenberger(GAIN, metric=bound.metric)
-    mhe = estimator(certificate, observer=observer, initial_state=[0.0, 0.5])
-    assert bound.along(mhe.run(ys), initial_error=2.0).lost is None
-
-
 def test_a_monitor_continues_from_its_state(certificate):
-    ys = record()[1]
-    ys[20] = np.nan
     mhe, again = estimator(certificate), estimator(certificate)
     whole, watch = followed(certificate, mhe), followed(certificate, again)
-    for t, y in enumerate(ys):
-        if t % 7 == 3:
-            state = watch.state_dict()
-            watch = followed(certificate, estimator(certificate), 99.0)
-            watch.load_state_dict(state)
+    for t, y in enumerate(record()[1]):
+        state = watch.state_dict()
+        watch = followed(certificate, estimator(certificate), 99.0)
+        watch.load_state_dict(state)
+        y = [np.nan] if t == 20 else y
         found, expected = watch.check(again.update(y)), whole.check(mhe.update(y))
         np.testing.assert_equal(vars(found), vars(expected))
-    mine = followed(certificate, estimator(certificate)).state_dict()
-    watch.load_state_dict(mine | {  # of another search, with another P
-        "metric": 4.0 * mine["metric"], "radius": 2.0 * mine["radius"],
-    })
-    assert watch.state_dict()["radius"] == pytest.approx(mine["radius"], rel=1e-9)
-    for wrong in ({}, {**state, "observer": [1.0]}):
-        with pytest.raises(InvalidInputError, match="not come from a monitor of this observer"):
-            watch.load_state_dict(wrong)
+    # Of another search, with another P.
+    watch.load_state_dict(state | {"metric": 4.0 * state["metric"], "radius": 2.0})
+    assert watch.state_dict()["radius"] == pytest.approx(1.0, rel=1e-9)
+    with pytest.raises(InvalidInputError, match="not come from a monitor of this observer"):
+        watch.load_state_dict({**state, "observer": [1.0]})
 
 
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
@@ -268,16 +196,13 @@ def test_the_measured_cost_may_give_less():
     )
     mhe = estimator(certificate, horizon=5, initial_state=[60.0], max_qps=5)
     watch, alone = Monitor(certificate, mhe, initial_error=60.0), followed(certificate, mhe, 60.0)
-    x = np.array([0.0])
+    x = np.zeros(1)
     for _ in range(12):
         estimate = mhe.update(x)
         reading = watch.check(estimate)
         x = 0.5 * x
         assert np.linalg.norm(x - estimate.state) <= reading.error <= alone.check(estimate).error
     assert reading.kind == "measured"
-
-
-# The theorem's hypotheses
 
 
 def changed(estimate, **values):
@@ -290,27 +215,20 @@ def changed(estimate, **values):
 BARS = {  # the sample 6, and why the theorem's bound ends there; the observer's need not
     "missing": (lambda mhe, y: mhe.update([np.nan]), "a measurement was missing"),
     "cost of less": (lambda mhe, y: changed(mhe.update(y), cost=lambda J: 0.999 * J), "cost is"),
-    "cost of more": (lambda mhe, y: changed(mhe.update(y), cost=lambda J: 1e9 * J), "cost is"),
-    "weights": (lambda mhe, y: mhe.update(y, noise_weight=[[1e-6]]), "cost is"),
     "estimate": (lambda mhe, y: changed(
         mhe.update(y), trajectory=lambda x: np.add(x, [0.0, 50.0])), "the estimate left"),
-    "stage": (lambda mhe, y: changed(
-        mhe.update(y), status=lambda s: s | qpmhe.Status.FAILED_STAGE), "could not be evaluated"),
     "candidate": (lambda mhe, y: changed(
         mhe.update(y), candidate=lambda z: z + 1e-3 * np.eye(len(z), 2)), "not the observer's"),
     "amended": (lambda mhe, y: mhe.update(y) and mhe.amend(5, y), "was changed|estimated again"),
 }
 
 
-@pytest.mark.parametrize(("unit", "events"), [
-    (1.0, BARS), (1e-9, ["cost of less"]), (1e9, ["cost of less"])
-])
+@pytest.mark.parametrize(("unit", "events"), [(1.0, BARS), (1e9, ["cost of less"])])
 def test_the_theorem_ends_where_a_hypothesis_does_in_any_unit(unit, events):
-    cost = qpmhe.QuadraticCost(
-        prior=np.eye(2) / unit**2, disturbance=100.0 / unit**2 * np.eye(2), noise=25.0 / unit**2
-    )
+    weights = {"prior": np.eye(2), "disturbance": 100.0 * np.eye(2), "noise": np.array([[25.0]])}
     certificate = certify(
-        plant(), qpmhe.Luenberger(GAIN), cost, horizon=4, sizes=Sizes(0.2 * unit, 0.2 * unit),
+        plant(), qpmhe.Luenberger(GAIN), horizon=4, sizes=Sizes(0.2 * unit, 0.2 * unit),
+        cost=qpmhe.QuadraticCost(**{name: each / unit**2 for name, each in weights.items()}),
         region=box([-10.0 * unit] * 2, [10.0 * unit] * 2),
     )
     for event in events:
@@ -322,13 +240,11 @@ def test_the_theorem_ends_where_a_hypothesis_does_in_any_unit(unit, events):
         assert watch.summary() == "The observer's bound held at all 6 samples. The theorem applies."
         watch.check(what(mhe, ys[6]))
         assert re.search(f"^from sample 6 on: .*({words})", watch.barred), event
-        for y in ys[7:20]:  # the window recovers; the bound goes back to the first sample
-            watch.check(mhe.update(y))
+        watch.check(mhe.update(ys[7]))  # the bound goes back to the first sample
         assert f"The theorem does not apply: {watch.barred}" in watch.summary()
 
 
 def test_what_the_theorem_does_not_cover_leaves_the_observers_bound(certificate):
-    ys = record()[1]
     for options, words in (
         ({"arrival": "smoothed"}, "smoothed"), ({"candidate": "reinitialized"}, "reinitialized"),
         ({"horizon": 3}, "horizon 3"), ({"cost": unit_cost(2)}, "another cost"),
@@ -336,12 +252,11 @@ def test_what_the_theorem_does_not_cover_leaves_the_observers_bound(certificate)
         mhe = estimator(certificate, **options)
         watch = Monitor(certificate, mhe, initial_error=START)
         assert words in watch.barred
-        reading = watch.check(mhe.update(ys[0]))
+        reading = watch.check(mhe.update([0.1]))
         assert (reading.lost is not None) == ("candidate" in options)
         mhe.reset()  # a run alone shows it, too
-        band = certificate.observer_bound.along(mhe.run(ys), initial_error=START)
+        band = certificate.observer_bound.along(mhe.run([0.1]), initial_error=START)
         assert (band.lost, band.reason) == (reading.lost, reading.reason)
-    assert Monitor(certificate, estimator(certificate), initial_error=START).applies
 
 
 def test_a_monitor_is_for_one_estimator(certificate):
@@ -350,16 +265,11 @@ def test_a_monitor_is_for_one_estimator(certificate):
     for asked, error, words in (
         (lambda: bound.along(other.run(record()[1]), initial_error=START), MismatchError,
          r"\[\[0.4\], \[0.1\]\]; the estimator's is \[\[0.8\]"),
-        (lambda: Monitor(bound, other, initial_error=START), MismatchError, r"is \[\[0.8\]"),
-        (lambda: Monitor(bound, estimator(certificate, system=plant()), initial_error=START),
-         MismatchError, "another System object"),
-        (lambda: Monitor(replace(certificate, observer_bound=None), mhe, initial_error=START),
-         OptionError, "no bound of the observer"),
+        (lambda: followed(certificate, estimator(certificate, system=plant())), MismatchError,
+         "another System object"),
         (lambda: Monitor(None, mhe, initial_error=START), InvalidInputError, "NoneType; expected"),
         (lambda: Monitor(certificate, mhe, initial_error=1.0).state_dict(), InvalidInputError,
          r"pass certificate\.observer_bound"),
-        (lambda: followed(certificate, mhe).check(None), InvalidInputError, "NoneType; expected"),
-        (lambda: certificate.bound(np.ones(3), initial_error=START), InvalidInputError, "ndarray"),
     ):
         with pytest.raises(error, match=words):
             asked()

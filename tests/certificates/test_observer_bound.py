@@ -6,22 +6,14 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import (
-    Evidence,
-    NotCertifiedError,
-    ObserverBound,
-    OutOfTimeError,
-    Sizes,
-    certify,
-    observer_bound,
-)
+from qpmhe import certificates
+from qpmhe.certificates import Evidence, Sizes, certify
 from qpmhe.certificates import certificate as certification
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.sizes import lengths_of
-from qpmhe.errors import InvalidInputError, OptionError, SetError, ShapeError
+from qpmhe.errors import OptionError, SetError, ShapeError
 
-from .attacks import RELATIVE
-from .helpers import box, linear, scalar, unit_box, unit_cost
+from .helpers import box, linear, unit_box, unit_cost
 
 
 def bound_of(system, gain, region, disturbances, noises):
@@ -30,12 +22,6 @@ def bound_of(system, gain, region, disturbances, noises):
         system, qpmhe.Luenberger(gain), unit_cost(system.n, system.p), horizon=1, region=region,
         sizes=Sizes(disturbances, noises),
     ).observer_bound
-
-
-def reactor():
-    system, observer, _, _ = qpmhe.models.batch_reactor()
-    sizes = box([-0.1, -0.1], [0.1, 0.1]), box(-0.2, 0.2)
-    return bound_of(system, observer.gain, box([2.0, 0.0], [6.0, 4.0]), *sizes), system
 
 
 @pytest.fixture(scope="module")
@@ -52,31 +38,26 @@ def four():
     return bound_of(system, K, region, box(-half, half), 0.01), system
 
 
-def extremes(size, dimension, rng):
-    """The corners of a box, or the ends of many directions."""
-    if isinstance(size, qpmhe.Box):
-        return np.array(list(itertools.product(*zip(size.lower, size.upper, strict=True))))
-    directions = rng.standard_normal((12, dimension))
-    return size * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+def corners(sides):
+    return np.array(list(itertools.product(*zip(sides.lower, sides.upper, strict=True))))
 
 
-@pytest.mark.parametrize("made", ["reactor", "four"])
-def test_no_adversary_exceeds_the_bound(made, four, pytestconfig):
+def test_no_adversary_exceeds_the_bound(four, pytestconfig):
     """Each takes the w and v, of all extreme ones, that take the error farthest in P."""
-    bound, system = four if made == "four" else reactor()
+    bound, system = four
     assert bound.evidence is Evidence.PROVED
     runs, rng = 4000 if pytestconfig.option.all else 300, np.random.default_rng(0)
-    P, K, (n, p) = bound.metric, bound.gain, bound.gain.shape
+    P, K, n = bound.metric, bound.gain, system.n
     low, high = bound.region.lower[:n], bound.region.upper[:n]
     x, z = (rng.choice([0.0, 0.1, 0.5, 0.9, 1.0], (runs, n)) * (high - low) + low for _ in "xz")
     x[::7] = z[::7]  # some begin without an error: the noise alone
-    pairs = list(itertools.product(
-        extremes(bound.sizes.disturbance, n, rng), extremes(bound.sizes.noise, p, rng)
-    ))
+    angles = np.arange(12) * np.pi / 6
+    noises = bound.sizes.noise * np.column_stack((np.cos(angles), np.sin(angles)))
+    pairs = list(itertools.product(corners(bound.sizes.disturbance), noises))
     u, alive = np.zeros((runs, 0)), np.ones(runs, bool)
     b = np.array([bound.initial(e) for e in x - z])
-    quiet, entering, sums = b == 0.0, bound.entering(), bound.stability.sums
-    paper, share = sums.initial * np.linalg.norm(x - z, axis=1), 0.0  # (eq:RGES)
+    entering, sums, share = bound.entering(), bound.stability.sums, 0.0
+    paper = sums.initial * np.linalg.norm(x - z, axis=1)  # (eq:RGES)
     for _ in range(60):
         f, h, ahead = system.f.batch(x, u), system.h.batch(x, u), system.f.batch(z, u)
         best, chosen, added = np.full(runs, -1.0), np.array([f, ahead]), np.zeros(runs)
@@ -105,8 +86,8 @@ def test_no_adversary_exceeds_the_bound(made, four, pytestconfig):
         far = bound.farthest(b[inside], other - z[inside], z[inside])
         assert np.all(np.linalg.norm(other - x[inside], axis=1) <= far)
     assert alive.mean() > 0.2
-    assert 0.4 < share <= 1.0 + RELATIVE
-    assert bound.limit() / np.sqrt(best[alive & quiet]).max() < 4.0
+    assert 0.4 < share <= 1.0 + 1e-9
+    assert bound.limit() / np.sqrt(best[alive]).max() < 4.0
 
 
 def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
@@ -117,16 +98,8 @@ def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
     reached = bound.components(bound.radii(1, 2.0)[1])[0]
     assert 2.0 * 0.5 + 0.16 <= reached <= 2.0 * bound.rate + 0.1601
     assert bound.components(bound.radii(0, [-2.0])[0])[0] == pytest.approx(2.0)
-    # A record of the worst comes near it.
-    w, v = np.full((40, 1), 0.1), np.full((40, 1), -0.2)
-    found = bound.components(bound.radii(40, [2.0], w, v))[:, 0]
-    true = 2.0 * 0.5 ** np.arange(41) + 0.32 * (1.0 - 0.5 ** np.arange(41))
-    assert (true <= found).all()
-    assert found[-1] <= 1.5 * true[-1]
-    np.testing.assert_allclose(found, bound.components(bound.radii(40, 2.0))[:, 0])
-    samples = bound.settling_samples
-    whole = bound.radii(samples, box(-18.0, 18.0))
-    assert whole[samples] <= 1.1 * bound.limit() < whole[samples - 1]
+    whole = bound.radii(bound.settling_samples, box(-18.0, 18.0))
+    assert whole[-1] <= 1.1 * bound.limit() < whole[-2]
 
 
 def plain(vectors, weight):
@@ -134,18 +107,15 @@ def plain(vectors, weight):
 
 
 def test_sizes_may_be_lengths_sets_or_vectors(four):
-    (four, _), rng = four, np.random.default_rng(1)
-    P, Q, R, V = four.metric, four.stability.Q, four.stability.R, four.gain.T
-    V = V @ P @ four.gain
+    (four, _), rng, ones = four, np.random.default_rng(1), np.ones((3, 4))
+    P, Q, R, V = four.metric, four.stability.Q, four.stability.R, four.stability.V
     w, v = 0.02 * rng.standard_normal((50, 4)), 0.05 * rng.standard_normal((50, 2))
     vectors = four.entering(w, v)
     np.testing.assert_allclose(vectors[:, 0], plain(w, P) + plain(v, V), rtol=1e-9)
     np.testing.assert_allclose(vectors[:, 1], np.hypot(plain(w, Q), plain(v, R)), rtol=1e-9)
     boxes = [box(-side, side) for side in (np.abs(w).max(axis=0), np.abs(v).max(axis=0))]
-    corners = (plain(extremes(*each, rng), M).max() for each, M in zip(
-        ((boxes[0], 4), (boxes[1], 2)), (P, V), strict=True
-    ))
-    assert four.entering(*boxes)[0] == pytest.approx(sum(corners), rel=1e-9)
+    most = plain(corners(boxes[0]), P).max() + plain(corners(boxes[1]), V).max()
+    assert four.entering(*boxes)[0] == pytest.approx(most, rel=1e-9)
     most = max(np.linalg.norm(w, axis=1)), max(np.linalg.norm(v, axis=1))
     for larger in (four.entering(*boxes), four.entering(*most), four.entering(boxes[0], v)):
         assert (vectors <= larger).all()
@@ -153,29 +123,14 @@ def test_sizes_may_be_lengths_sets_or_vectors(four):
     side, weight = np.linspace(0.1, 0.2, 14), np.full((14, 14), -0.05) + np.eye(14)
     found = float(lengths_of("w", box(-side, side), weight))
     assert found == pytest.approx(plain(side, np.abs(weight)), rel=1e-9)
-    # The system's own sets come first.
-    system = scalar(disturbances=box(-0.1, 0.2), noises=box(-np.inf, np.inf))
-    found = Sizes.usual(system, np.eye(1), 4.0 * np.eye(1), "the data")
-    assert str(found) == (
-        "w in [-0.1, 0.2], |v| <= 6 (the system's W and three standard deviations of the data)"
-    )
-    assert found.largest == pytest.approx((0.2, 6.0))
-
-
-def test_sizes_that_do_not_fit_are_named(four):
-    four, ones = four[0], np.ones((3, 4))
     for asked, error, words in (
-        (lambda: Sizes(noise=-1.0), OptionError, "noise is"),
-        (lambda: four.entering(-1.0), OptionError, "disturbances is -1"),
         (lambda: four.entering(np.ones((3, 2))), ShapeError, r"vectors \(T, 4\)"),
         (lambda: four.entering(ones, np.ones((4, 2))), ShapeError, "3 samples, and .* 4"),
-        (lambda: four.entering(box(-1.0, 1.0)), ShapeError, "dimension 1"),
         (lambda: four.entering(0.1, box([-1.0, -np.inf], [1.0, 1.0])), SetError, "unbounded"),
         (lambda: four.radii(4, 1.0, ones), ShapeError, "3 samples; expected 4"),
         (lambda: four.limit(ones), OptionError, "sample by sample"),
         (lambda: four.initial([1.0, 2.0]), ShapeError, "initial_error has shape"),
         (lambda: four.initial(ones), ShapeError, "several samples"),
-        (lambda: four.initial(np.nan), InvalidInputError, "initial_error"),
     ):
         with pytest.raises(error, match=words):
             asked()
@@ -184,47 +139,30 @@ def test_sizes_that_do_not_fit_are_named(four):
 # The set around the observer
 
 
-def random_bound(rng, n, unit=1.0):
-    """A bound with any P, whatever it is of."""
-    root = rng.standard_normal((n, n))
-
-    class Stability:
-        rho, V, gain, evidence = 0.9, np.eye(1), np.ones((n, 1)), Evidence.PROVED
-        P = (root @ root.T + 0.05 * np.eye(n)) / unit**2
-
-    whole = bounded_region(linear(np.eye(n), np.eye(n)), box(-1e9 * np.ones(n), 1e9 * np.ones(n)))
-    return ObserverBound(Stability(), whole, Sizes(1.0, 1.0))
-
-
 @pytest.mark.parametrize("n", [1, 2, 6])
 def test_no_point_of_the_set_is_farther(n):
-    rng = np.random.default_rng(n)
-    for _ in range(20):
-        bound, b = random_bound(rng, n), 10.0 ** rng.uniform(-3.0, 3.0)
-        offset = 10.0 ** rng.uniform(-3.0, 3.0) * rng.standard_normal(n)
-        e = np.vstack((np.eye(n), rng.standard_normal((60, n))))
-        for _ in range(50):  # to the next point that maximises the linearised distance
-            direction = np.linalg.solve(bound.metric, (e - offset).T).T
-            e = b * direction / plain(direction, bound.metric)[:, None]
-        true, found = np.linalg.norm(e - offset, axis=1).max(), float(bound.farthest(b, offset))
-        reach = b / np.sqrt(np.linalg.eigvalsh(bound.metric)[0])
+    """With any P, whatever it is of, in any unit."""
+    rng, ones = np.random.default_rng(n), 1e9 * np.ones(n)
+    place = bounded_region(linear(np.eye(n), np.eye(n)), box(-ones, ones))
+    for unit in np.repeat([1.0, 1e-6, 1e6], 10):
+        root = rng.standard_normal((n, n)) / unit
+        P, b = root @ root.T + 0.05 * np.eye(n) / unit**2, 10.0 ** rng.uniform(-3.0, 3.0)
+        stated = certificates.ObserverStability(0.9, 1.0, 1.0, 1.0, 1.0, P=P, gain=np.eye(n))
+        bound = certificates.ObserverBound(stated, place, Sizes(1.0, 1.0))
+        offset = 10.0 ** rng.uniform(-3.0, 3.0) * unit * rng.standard_normal(n)
+        e = np.vstack((rng.standard_normal((3000, n)), np.linalg.solve(P, offset), np.eye(n)))
+        e *= b / plain(e, P)[:, None]
+        true, found = np.linalg.norm(e + offset, axis=1).max(), float(bound.farthest(b, offset))
+        reach = b / np.sqrt(np.linalg.eigvalsh(P)[0])
         assert true <= found <= (np.linalg.norm(offset) + reach) * (1.0 + 1e-5)
         assert float(bound.farthest(b, np.zeros(n))) == pytest.approx(reach, rel=1e-5)
-        assert float(bound.farthest(0.0, offset)) == pytest.approx(np.linalg.norm(offset))
-    for unit in (1e-9, 1e9):
-        one, other = (random_bound(np.random.default_rng(7), n, each) for each in (1.0, unit))
-        found = float(other.farthest(0.3, unit * np.ones(n)))
-        assert found == pytest.approx(unit * float(one.farthest(0.3, np.ones(n))), rel=1e-9)
 
 
 def test_what_is_beyond_the_region_does_not_count(four):
-    four, z, far = four[0], np.array([0.4, -0.4, 0.0, 0.0]), 1e6
-    np.testing.assert_array_equal(four.around(far, z), (-0.5 * np.ones(4), 0.5 * np.ones(4)))
-    assert float(four.farthest(far, np.zeros(4), z)) == pytest.approx(np.sqrt(2 * 0.9**2 + 0.5))
+    four, z = four[0], np.array([0.4, -0.4, 0.0, 0.0])
+    np.testing.assert_array_equal(four.around(1e6, z), (-0.5 * np.ones(4), 0.5 * np.ones(4)))
+    assert float(four.farthest(1e6, np.zeros(4), z)) == pytest.approx(np.sqrt(2 * 0.9**2 + 0.5))
     np.testing.assert_allclose(four.around(1e-3, z)[1] - z, 1e-3 * four.slopes, rtol=1e-9)
-
-
-# What the headline rests on
 
 
 def scalar_certificate(slope, w=0.01):
@@ -237,37 +175,25 @@ def scalar_certificate(slope, w=0.01):
 def test_the_headline_says_whether_the_region_is_kept():
     certificate = scalar_certificate(1.5)
     assert "(proved while x stays in the region)" in certificate.headline
-    text = str(certificate)
-    assert "not proved that x stays in the region: f and the disturbances reach x1 = " in text
-    assert "1.51 through the face" in text
-    assert certificate.observer_bound.inner is None
-    assert certificate.to_dict()["observer_bound"]["invariance"]["holds"] is False
+    words = "not proved that x stays in the region: f and the disturbances reach x1 = "
+    assert words in str(certificate)
     certificate = scalar_certificate(0.8)
     assert "(proved), on a region 2 wide" in certificate.headline
     bound = certificate.observer_bound
-    low, high = bound.inner.region.lower[0], bound.inner.region.upper[0]
     limit = bound.components(bound.limit())[0]
-    assert (low, high) == pytest.approx((limit - 1.0, 1.0 - limit))
+    assert bound.inner.region.upper[0] == pytest.approx(1.0 - limit)
     assert bound.condition.startswith("x and z stay in the region (proved) from x1 in [-0.9")
     # Where the disturbance just fits, there is no room for the observer's error.
     tight = scalar_certificate(0.8, w=0.199).observer_bound
-    assert tight.inner is None
     assert tight.condition == "x stays in the region (proved); z is checked at each sample"
 
 
 def test_time_up_leaves_what_was_reached(monkeypatch):
     def late(*_, **__):
-        raise OutOfTimeError("the time for this search (1 s) was too short", ("more seconds",))
+        raise certificates.OutOfTimeError("the time for this search (1 s) was too short")
 
     monkeypatch.setattr(certification, "certify_detectability", late)
     certificate = scalar_certificate(0.8)
     assert certificate.observer_bound.evidence is Evidence.PROVED
     assert not certificate.constants
     assert "Not certified: detectability: the time for this search" in str(certificate)
-    monkeypatch.setattr(observer_bound, "certify_observer", late)
-    with pytest.raises(OutOfTimeError, match="more seconds"):
-        scalar_certificate(0.8)
-    for ending in ("", "."):
-        error = NotCertifiedError(f"f may jump there{ending}", ("a smaller region",))
-        assert str(error) == "f may jump there. What may help: a smaller region."
-        assert error.finding == "f may jump there"
