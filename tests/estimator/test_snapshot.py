@@ -156,6 +156,33 @@ def test_the_state_of_another_estimator_is_refused_by_name(engine):
         made(observer=injection(0.31)).load_state_dict(fed(9, observer=injection(0.3)).state_dict())
 
 
+@engines
+def test_caps_and_policies_may_change(engine):
+    """The observer's part is the same then; terms that were not there are computed."""
+    for first, second in (
+        ({"max_qps": 0}, {"max_qps": 2}), ({"max_qps": 3}, {"max_qps": 0}),
+        ({}, {"max_qps": None, "tolerance": 1e-6, "solver_tolerance": 1e-5, "delay": 1}),
+        ({}, {"warm_start": True, "max_qps": None, "max_solver_iterations": 70}),
+        ({"infeasible": "keep_candidate"}, {"infeasible": "drop_rows"}),
+    ):
+        other, fresh = made(engine, **second), fed(12, engine, **second)
+        other.load_state_dict(fed(12, engine, **first).state_dict())
+        for found, expected in zip(feed(other, 12, 20), feed(fresh, 12, 20), strict=True):
+            np.testing.assert_allclose(found.candidate, expected.candidate, rtol=1e-12)
+            np.testing.assert_allclose(found.trajectory, expected.trajectory, rtol=1e-6, atol=1e-7)
+            assert found.cost <= found.candidate_cost
+
+
+def leaf_paths(value, path=()):
+    items = (
+        value.items() if isinstance(value, dict)
+        else enumerate(value) if isinstance(value, (list, tuple)) else ()
+    )
+    return [path] * bool(path) + [
+        one for key, item in items for one in leaf_paths(item, (*path, key))
+    ]
+
+
 def replaced(value, path, new):
     if not path:
         return new
@@ -164,6 +191,70 @@ def replaced(value, path, new):
     return type(value)(
         replaced(v, path[1:], new) if k == path[0] else v for k, v in enumerate(value)
     )
+
+
+JUNK = [
+    None, 3, -1, 2**70, 0.5, np.nan, True, "text", b"bytes", [], {}, [[1, 2], [3]], object(),
+    np.zeros(0), np.zeros((3, 3)), np.array(1.25), np.array(["a"]), np.full(2, np.nan),
+]
+# What no computation confirms: estimates of the past, the covariance at the window's start, and
+# what a model that failed had before.
+UNCONFIRMED = [
+    ("history",), ("trajectory",), ("watched",), ("modes",), ("memory",), ("methods",),
+    ("linearized",), *(("window", name) for name in (
+        "earlier", "earlier_covariance", "time", "covariance", "y", "u", "irregular", "linear",
+        "panel", "gradient", "next_gradient",
+    )),
+]
+
+
+def mutated(state, generator):
+    """A state with some part of it replaced, and where."""
+    paths = leaf_paths(state)
+    path, old = paths[generator.integers(len(paths))], state
+    for key in path:
+        old = old[key]
+    kind, new = generator.integers(5), JUNK[generator.integers(len(JUNK))]
+    if isinstance(old, np.ndarray) and kind:
+        new = old.copy()
+        if kind == 1 and old.ndim:
+            new = new[:-1] if old.shape[0] else np.zeros((1, *old.shape[1:]), old.dtype)
+        elif kind == 2:
+            new = new.astype(np.float32 if old.dtype == np.float64 else np.int64)
+        elif new.size and new.dtype == np.float64:
+            k = generator.integers(new.size)
+            new.flat[k] = generator.choice([np.nan, np.inf, -7.0, 1.5 * new.flat[k] + 0.1])
+        elif new.size:
+            k = generator.integers(new.size)
+            new.flat[k] = ~new.flat[k]
+    elif isinstance(old, (list, tuple)) and kind == 1 and old:
+        new = old[:-1]
+    elif isinstance(old, int) and kind == 1:
+        new = old + int(generator.integers(1, 50)) * (1 if generator.random() < 0.5 else -1)
+    return path, replaced(state, path, new)
+
+
+@engines
+@pytest.mark.parametrize("name", ["smoothed", "kalman"])
+def test_damaged_states_are_refused_whole_or_harmless(name, engine):
+    options, generator, refused = OPTIONS[name], np.random.default_rng(3), 0
+    mhe, twin = (fed(11, engine, **options) for _ in range(2))
+    state = read(fed(15, engine, **options).state_dict())
+    for _ in range(90):
+        path, damaged = mutated(state, generator)
+        if leaves(damaged) == leaves(state):
+            continue
+        try:
+            mhe._engine.load_state_dict(damaged)
+        except InvalidInputError:
+            refused += 1
+        else:
+            assert path[:1] in UNCONFIRMED or path[:2] in UNCONFIRMED, path
+            mhe.update(np.zeros(1), np.zeros(1))
+            mhe = fed(11, engine, **options)
+        np.testing.assert_array_equal(mhe.state, twin.state)
+    assert refused > 55
+    same(feed(mhe, 11, 16), feed(twin, 11, 16))
 
 
 def test_damage_that_was_seen():

@@ -126,7 +126,7 @@ def test_a_function_that_asks_for_more_is_not_traced():
     assert f"{__file__}:{line} asks for" in traced(swallowed, (2,)).reason
 
 
-def test_numpy_is_itself_after_a_trace_and_in_other_threads():
+def test_numpy_is_itself_after_a_trace():
     before = np.zeros, np.array, math.sin
     for lines in (1, 3, 6, 12, 30, 40, 60, 100, 150, 200):  # interrupted, too
         with Interruption(lines), contextlib.suppress(KeyboardInterrupt, SystemError):
