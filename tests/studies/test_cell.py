@@ -96,6 +96,12 @@ def test_shares_of_steps_that_fail_are_fallback():
     assert (found["cap_hits"], found["solver_iterations_mean"]) == (1 / 8, 4)
 
 
+def test_costs_that_say_nothing_are_left_out_of_the_ratio():
+    costs = np.array([2.0, np.inf, 3.0, 1.0, np.nan, 0.0])
+    reference = np.array([1.0, 1.0, np.inf, 2.0, 1.0, 0.0])
+    assert metrics.cost_ratio(costs, reference) == (2.0 + 0.5) / 2
+
+
 def test_errors_of_different_units_are_summed_up_without_one():
     states, errors = np.random.default_rng(0).standard_normal((2, 30, 3))
     estimates, units = states + 0.1 * errors, np.array([2.0**-30, 1.0, 2.0**20])
