@@ -14,7 +14,7 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
 from .audit import Assumption, about_corrections, about_cost, about_slope, checked_ingredients
-from .contraction import certify_detectability, constant_gain
+from .contraction import certify_detectability, constant_gain, gain_if_constant
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import (
     CertificateError,
@@ -25,7 +25,7 @@ from .evidence import (
     weakest,
 )
 from .observer_bound import ObserverBound, bound_observer, with_invariance
-from .properties import Detectability, ObserverStability
+from .properties import Detectability, ObserverStability, fitting
 from .regions import Region, bounded_region
 from .sdp import started
 from .sizes import Size, Sizes
@@ -181,7 +181,8 @@ _OBSERVER, _OUTPUT, _DETECTABILITY, _INVARIANCE = 0.6, 0.4, 0.9, 0.2
 def certify(
     system: System, observer: Observer, cost: Cost, *, horizon: int | Sequence[int],
     region: ConvexSet | Region | None = None, inputs: Box | None = None,
-    sizes: Sizes | None = None, seconds: float | Deadline = DEFAULT_SECONDS,
+    sizes: Sizes | None = None, detectability: Detectability | None = None,
+    stability: ObserverStability | None = None, seconds: float | Deadline = DEFAULT_SECONDS,
 ) -> Certificate:
     """Bound the observer's error on a set of states, then the estimator's by the theorem.
 
@@ -201,6 +202,9 @@ def certify(
     sizes : Sizes, optional
         Which disturbances and noises the bounds are for; left out, the system's W and V, and
         three standard deviations by the cost's weights where it has none.
+    detectability, stability : optional
+        Constants to take instead of looking for them, such as assumed ones, or those that
+        were certified of this system and gain on a set that contains the region.
     seconds : float or Deadline
         Approximate time for the search for constants, after the solvers are loaded. What is not
         proved within its share rests on samples, and says so.
@@ -209,13 +213,19 @@ def certify(
     ------
     SetError, ShapeError, OptionError, InvalidInputError, ModelError
         If an argument does not fit.
+    MismatchError
+        If constants that are passed are of another system or gain, or of a set that does not
+        contain the region and the inputs.
     CertificateError, NotCertifiedError
-        If nothing bounds the error: the observer has no constant gain, or its stability cannot be
-        shown; the text says what may help.
+        If nothing bounds the error: the observer has no constant gain and no assumed constants,
+        or its stability cannot be shown; the text says what may help.
     """
     horizons, place = horizons_of(horizon), bounded_region(system, region, inputs)
-    constant_gain(observer, system)  # without one, all else would be in vain
-    found = examined(system, observer, cost, place, horizons, sizes, started(seconds))
+    if stability is None:  # without a gain, all else would be in vain
+        constant_gain(observer, system)
+    found = examined(
+        system, observer, cost, place, horizons, sizes, started(seconds), detectability, stability
+    )
     if not found.holds:
         # Where the state cannot be detected, no observer can be stable; a search that ran out of
         # time says nothing of it.
@@ -227,12 +237,10 @@ def certify(
 
 def examined(
     system: System, observer: Observer, cost: Cost, region: Region, horizons: Sequence[int],
-    sizes: Sizes | None, deadline: Deadline, stability: ObserverStability | None = None,
+    sizes: Sizes | None, deadline: Deadline, detectability: Detectability | None = None,
+    stability: ObserverStability | None = None,
 ) -> Certificate:
-    """The certificate of `certify`, also where nothing holds: its errors say why.
-
-    A stability that is passed was certified of this system, gain and region.
-    """
+    """The certificate of `certify`, also where nothing holds: its errors say why."""
     errors: dict[str, QpmheError] = {}
 
     def attempt(what: str, question: Callable[[], Result]) -> Result | None:
@@ -243,18 +251,22 @@ def examined(
             return None
 
     attempt("the theorem", lambda: checked_ingredients(system, observer, cost))
-    chosen = Sizes.of(sizes, system, cost)
+    chosen, gain = Sizes.of(sizes, system, cost), gain_if_constant(observer, system)
+    if detectability is not None:
+        detectability = fitting(detectability, system, region, gain)
+    proved = None
     if stability is None:
         proved = attempt("the observer", lambda: bound_observer(
             system, observer, cost, region, sizes=chosen, seconds=deadline.part(_OBSERVER)
         ))
         stability = None if proved is None else proved.stability
     else:
-        proved = with_invariance(
-            ObserverBound(stability, region, chosen, observer.metric), system,
-            deadline.part(_INVARIANCE),
-        )
-    detectability: Detectability | None = None
+        stability = fitting(stability, system, region, gain)
+        if stability.P is not None and stability.gain is not None:
+            proved = with_invariance(
+                ObserverBound(stability, region, chosen, observer.metric), system,
+                deadline.part(_INVARIANCE),
+            )
     assumptions: tuple[Assumption, ...] = ()
     constants: dict[int, TheoremConstants] = {}
     parts = [] if stability is None else [stability.evidence]
@@ -264,9 +276,10 @@ def examined(
             errors["the theorem"] = CertificateError(f"{about.text}; the theorem needs them.")
         output = about_slope(system, region, "h", deadline.part(_OUTPUT))
         assumptions = output, *about_corrections(system, observer), about
-        detectability = attempt("detectability", lambda: certify_detectability(
-            system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
-        ))
+        if detectability is None:
+            detectability = attempt("detectability", lambda: certify_detectability(
+                system, region, weights=_cheapest(weights), seconds=deadline.part(_DETECTABILITY)
+            ))
         if weights is not None and detectability is not None and stability is not None:
             if system.states is not None and proved is not None and proved.projects:
                 assumptions = *assumptions, about_slope(system, region, "f", deadline)

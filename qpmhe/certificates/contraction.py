@@ -166,7 +166,8 @@ def constant_gain(observer: Observer, system: System) -> Array:
         raise CertificateError(
             f"{type(observer).__name__} has no constant gain: {reason}. Detectability can be "
             "certified nevertheless; for the observer, take a Luenberger observer "
-            "(synthesise_gain finds one), or state constants of your own to TheoremConstants."
+            "(synthesise_gain finds one), or state its constants yourself: "
+            "ObserverStability.assumed(rho=..., C_p=..., C_w=..., C_v=..., kappa=...)."
         )
     return gain
 

@@ -7,11 +7,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .._checks import Array
+from .._checks import Array, positive
+from ..model.sets import ConvexSet
 from ..model.system import System
-from .evidence import Evidence, json_ready
-from .regions import Region
-from .theorem import DecayingSums
+from .evidence import Evidence, MismatchError, json_ready
+from .regions import Region, beyond, stated_region
+from .theorem import DecayingSums, checked_rate
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,6 +83,15 @@ class Detectability(_Certified):
     c_v: float
     form: str = field(default="assumed", kw_only=True)
 
+    @classmethod
+    def assumed(
+        cls, *, eta: float, c_p: float, c_w: float, c_v: float,
+        region: ConvexSet | Region | None = None,
+    ) -> Detectability:
+        """Constants that the user states without proof; without a region, everywhere."""
+        _checked("eta", eta=eta, c_p=c_p, c_w=c_w, c_v=c_v)
+        return cls(eta, c_p, c_w, c_v, region=stated_region(region))
+
     @property
     def sums(self) -> DecayingSums:
         """eta, c_p, c_w and c_v."""
@@ -129,10 +139,25 @@ class ObserverStability(_Certified):
     Q: Array | None = field(default=None, kw_only=True)
     R: Array | None = field(default=None, kw_only=True)
 
+    @classmethod
+    def assumed(
+        cls, *, rho: float, C_p: float, C_w: float, C_v: float, kappa: float,
+        region: ConvexSet | Region | None = None,
+    ) -> ObserverStability:
+        """Constants that the user states without proof; without a region, everywhere."""
+        _checked("rho", rho=rho, C_p=C_p, C_w=C_w, C_v=C_v, kappa=kappa)
+        return cls(rho, C_p, C_w, C_v, kappa, region=stated_region(region))
+
     @property
     def sums(self) -> DecayingSums:
         """rho, C_p, C_w and C_v."""
         return DecayingSums(self.rho, self.C_p, self.C_w, self.C_v)
+
+
+def _checked(rate: str, **constants: float) -> None:
+    """Raise an `OptionError` for one that is not positive, or a rate that is not below 1."""
+    for name, value in constants.items():
+        (checked_rate if name == rate else positive)(name, value)
 
 
 Result = TypeVar("Result", "Detectability", "ObserverStability")
@@ -146,3 +171,27 @@ def sealed(result: Result, system: System, evidence: Evidence) -> Result:
             value.setflags(write=False)
     vars(result).update(system=system, evidence=evidence)
     return result
+
+
+def fitting(part: Result, system: System, region: Region, gain: Array | None) -> Result:
+    """A part of a certificate, if it is about this system, region and gain."""
+    what = "detectability" if isinstance(part, Detectability) else "stability"
+    difference = "" if part.region is None else beyond(region, part.region)
+    if difference:
+        raise MismatchError(
+            f"the {what} that was passed does not hold on the whole region: {difference}. "
+            "Certify it on this region, with these inputs, or pass a region within its own."
+        )
+    own = getattr(part, "gain", None)
+    if own is not None and (gain is None or not np.array_equal(own, gain)):
+        theirs = "not constant" if gain is None else str(gain.tolist())
+        raise MismatchError(
+            f"the {what} that was passed is for the gain {own.tolist()}; the observer's is "
+            f"{theirs}. Certify this observer."
+        )
+    if part.evidence is not Evidence.ASSUMED and part.system is not system:
+        raise MismatchError(
+            f"the {what} that was passed is for another System object. Certify this system, or "
+            f"state the constants: {type(part).__name__}.assumed(...)."
+        )
+    return part

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -149,15 +150,21 @@ def _bounded(system: System, region: ConvexSet | None, inputs: Box | None) -> Re
         lower, upper = np.append(lower, inputs.lower), np.append(upper, inputs.upper)
     free = ~(np.isfinite(lower) & np.isfinite(upper))
     if free.any():
-        n = system.n
-        which = ", ".join(
-            f"x[{j}]" if j < n else f"u[{j - n}]" for j in np.flatnonzero(free).tolist()
-        )
+        which = ", ".join(_name(j, system.n) for j in np.flatnonzero(free))
         raise SetError(
             f"the region is unbounded in {which}; expected a bounded set. Intersect it with the "
             "states that occur: region & qpmhe.Box(lower, upper)."
         )
     return Region(chosen, lower, upper)
+
+
+def stated_region(region: Any) -> Region | None:
+    """A set that the user states; bounded or not, and for all inputs if not a region."""
+    if region is None or isinstance(region, Region):
+        return region
+    if not isinstance(region, ConvexSet):
+        raise SetError(f"region is {region!r}; expected a qpmhe.Box or a qpmhe.Polytope.")
+    return Region(region, *bounds(region))
 
 
 def bounds(states: ConvexSet) -> tuple[Array, Array]:
@@ -216,3 +223,28 @@ def _support(G: Array, g: Array, e: Array) -> tuple[Array, float, float]:
         (np.abs(G).T @ y + np.abs(e)).sum()
     )
     return np.asarray(answer.x, np.float64), side, residual
+
+
+def beyond(inner: Region, outer: Region) -> str:
+    """Where a region reaches beyond another, in words; empty if it lies within it.
+
+    An inequality must be one of the inner region's own, or hold on the box around it.
+    """
+    n, size = inner.n, outer.lower.size
+    if outer.n != n:
+        return f"it has {n} states instead of {outer.n}"
+    own = {(*row, limit) for row, limit in zip(*inequalities(inner.states), strict=True)}
+    eye = np.eye(size)[n:]
+    rows, limits = inequalities(outer.states)
+    rows = np.vstack((np.pad(rows, ((0, 0), (0, size - n))), eye, -eye))
+    limits = np.concatenate((limits, outer.upper[n:], -outer.lower[n:]))
+    most = row_bounds(rows, inner.lower[:size], inner.upper[:size])[1]
+    for row, limit, value in zip(rows, limits, most, strict=True):
+        if value > limit and (*row[:n], limit) not in own:
+            terms = " + ".join(f"{row[j]:.6g} {_name(j, n)}" for j in np.flatnonzero(row))
+            return f"{terms} <= {limit:.6g} is not shown to hold there: it may be {value:.6g}"
+    return ""
+
+
+def _name(j: Any, n: int) -> str:
+    return f"x[{j}]" if j < n else f"u[{j - n}]"
