@@ -89,8 +89,8 @@ class Window:
         At each sample; those on x alone also at the last state.
     boxes : dict, optional
         For the name of a set that at all samples.
-    loss : callable
-        Of the noises that are there and their weight.
+    losses : sequence of callable
+        Of the initial error, w, and the noises that are there, and of their weights.
     matrix : array_like, optional
         G of x+ = f(x, u) + G w.
     periods : pair of array_like
@@ -101,11 +101,11 @@ class Window:
 
     def __init__(
         self, f, h, ys, prior, weights, *, us=None, boxes=None, rows=(), discount=1.0,
-        loss=quadratic, matrix=None, periods=(None, None), hold=None,
+        losses=(quadratic,) * 3, matrix=None, periods=(None, None), hold=None,
     ):
         (P, Qs, Rs), count = weights, len(ys)
         self.x = x = ca.SX.sym("x", len(P), count + 1)
-        self.J = quadratic(wrapped(x[:, 0] - ca.DM(prior), periods[0]), P)
+        self.J = losses[0](wrapped(x[:, 0] - ca.DM(prior), periods[0]), P)
         if hold is not None:
             away = x[hold.components.tolist(), 0] - ca.DM(hold.target)
             self.J += quadratic(away, hold.weight)
@@ -124,10 +124,10 @@ class Window:
                     self.limits.append((ca.DM(null) @ w, 0.0, 0.0, 1.0))
                     w = ca.DM(np.linalg.pinv(matrix)) @ w
                 v = wrapped(ca.DM(np.nan_to_num(ys[i])) - h(x[:, i], u), periods[1])
-                self.J += factor * quadratic(w, Qs[i])
+                self.J += factor * losses[1](w, Qs[i])
                 if seen:
                     weight = np.linalg.inv(np.linalg.inv(Rs[i])[np.ix_(seen, seen)])
-                    self.J += factor * loss(v[seen], weight)
+                    self.J += factor * losses[2](v[seen], weight)
                 values |= {"u": u, "w": w, "v": v}
             for name, box in (boxes or {}).items():
                 letter = SETS[name]

@@ -149,8 +149,14 @@ class Problem:
             self.loss = str(rng.choice(["huber", "power", "barron"]))
         self.threshold, self.shape = rng.uniform(1.0, 2.5), float(rng.choice([0.5, 0.0, -2.0]))
         self.each, self.graduation = bool(rng.random() < 0.5), float(rng.choice([1.0, 10.0]))
+        self.exponent, self.robust = float(rng.choice([1.0, 1.2, 1.5, 2.0])), ["noise"]
+        if self.loss in ("huber", "power") and self.how is None:
+            self.robust += [one for one in ("prior", "disturbance") if rng.random() < 0.3]
         if self.loss and self.each:
-            self.R = np.diag(np.diag(self.R))
+            self.P, self.Q, self.R = (
+                np.diag(np.diag(one)) if name in self.robust else one for name, one in
+                (("prior", self.P), ("disturbance", self.Q), ("noise", self.R))
+            )
 
     def simulate(self, steps):
         rng, x = self.rng, self.start + np.linalg.cholesky(self.P) @ self.rng.normal(size=self.n)
@@ -243,7 +249,10 @@ class Problem:
                 # With losses by component weights stay diagonal.
                 one.noise = one.own["noise_weight"] = weights[1] * rng.uniform(0.3, 3.0)
             if "weights" in has and self.how != "covariance" and rng.random() < 0.2:
-                one.disturbance = one.own["disturbance_weight"] = 30.0 * spd(rng, r)
+                one.disturbance = 30.0 * spd(rng, r)
+                if self.each and "disturbance" in self.robust:
+                    one.disturbance = np.diag(np.diag(one.disturbance))
+                one.own["disturbance_weight"] = one.disturbance
             if self.k and rng.random() < 0.2:
                 one.known[self.m :] = one.own["parameters"] = rng.standard_normal(self.k)
             if "bounds" in has and rng.random() < 0.3:
@@ -461,16 +470,19 @@ class Problem:
             return system, observer, cost
         root, each = np.sqrt(units.cost), {"per_component": self.each}
         loss = {
-            "huber": lambda R: qpmhe.Huber(R, self.threshold * root, **each),
-            "power": lambda R: qpmhe.Power(R, 1.2, **each),
-            "barron": lambda R: qpmhe.Barron(
-                R, self.shape, self.threshold * root, **each, graduation=self.graduation
+            "huber": lambda W: qpmhe.Huber(W, self.threshold * root, **each),
+            "power": lambda W: qpmhe.Power(W, self.exponent, **each),
+            "barron": lambda W: qpmhe.Barron(
+                W, self.shape, self.threshold * root, **each, graduation=self.graduation
             ),
-        }[self.loss](cost.noise)
-        prior = cost.prior if cost.observer_prior is None else cost.observer_prior
-        return system, observer, qpmhe.RobustCost(
-            prior=prior, disturbance=cost.disturbance, noise=loss, discount=self.discount
-        )
+        }[self.loss]
+        terms = {
+            name: loss(getattr(cost, name)) if name in self.robust else getattr(cost, name)
+            for name in ("prior", "disturbance", "noise")
+        }
+        if self.from_observer:
+            terms["prior"] = cost.observer_prior
+        return system, observer, qpmhe.RobustCost(**terms, discount=self.discount)
 
     def estimator(self, units=None, **options):
         units = units or self.own_units
@@ -514,16 +526,23 @@ class Problem:
             r = ca.sqrt(ca.fmax(q, 1e-300))
             return ca.if_else(q <= square, q, 2.0 * self.threshold * r - square)
         if self.loss == "power":
-            return ca.sqrt(ca.fmax(q, 1e-300)) ** 1.2
+            return ca.sqrt(ca.fmax(q, 1e-300)) ** self.exponent
         if self.shape == 0.0:
             return 2.0 * square * ca.log(1.0 + q / (2.0 * square))
         return square * width / half * ((1.0 + q / (square * width)) ** half - 1.0)
 
-    def noise_cost(self, v, weight):
-        if self.loss is None:
-            return quadratic(v, weight)
-        forms = ca.vertsplit(v**2 * np.diag(weight)) if self.each else [quadratic(v, weight)]
-        return sum(self.rho(q) for q in forms)
+    def term(self, name):
+        """A term of J, of a residual and its weight."""
+        if self.loss is None or name not in self.robust or (name, self.from_observer) == (
+            "prior", True
+        ):
+            return quadratic
+
+        def cost(s, weight):
+            forms = ca.vertsplit(s**2 * np.diag(weight)) if self.each else [quadratic(s, weight)]
+            return sum(self.rho(q) for q in forms)
+
+        return cost
 
     def rows(self, sample):
         """All inequalities at a sample: misses count in deviations, or widths if less."""
@@ -570,7 +589,8 @@ class Problem:
             (np.linalg.inv(self.P) if prior_weight is None else prior_weight,
              [one.disturbance for one in samples], [one.noise for one in samples]),
             us=[np.append(one.known, one.dt) for one in samples],
-            rows=lambda i: self.rows(samples[i]), discount=self.discount, loss=self.noise_cost,
+            rows=lambda i: self.rows(samples[i]), discount=self.discount,
+            losses=[self.term(name) for name in ("prior", "disturbance", "noise")],
             matrix=self.G if self.how else None, periods=self.periods, hold=hold,
         )
 
