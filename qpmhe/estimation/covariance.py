@@ -10,6 +10,14 @@ from ..errors import InvalidInputError
 from ..model.system import System
 
 Array = NDArray[np.float64]
+# Of the variance before smoothing: below this share, fewer than three digits are left of it.
+_LEAST = 1e-13
+_LOST = (
+    "the covariances are not defined along the estimate: the weights of prior, disturbance and "
+    "noise there leave a direction of the states (nearly) undetermined. A redescending loss "
+    "(Cauchy, GemanMcClure, Barron) takes the weight from a large residual: take Huber for the "
+    "prior and the disturbance, or a larger threshold. Without one, increase the prior's weight."
+)
 
 
 def window_covariances(
@@ -38,6 +46,12 @@ def window_covariances(
     basis : (n, k) array
         The directions in which there are disturbances.
 
+    Raises
+    ------
+    InvalidInputError
+        Without finite Jacobians along the trajectory, or if the weights are so small in a
+        direction that rounding decides.
+
     References
     ----------
     Bierman, Fixed interval smoothing with discrete measurements, International Journal of
@@ -53,7 +67,7 @@ def window_covariances(
         ) from error
     if not (np.isfinite(a).all() and np.isfinite(c).all()):
         raise InvalidInputError("the Jacobians are not finite along the estimate.")
-    q, eye = weights.shape[-1], np.eye(n)
+    q = weights.shape[-1]
     # In deviations of the prior, rounded to powers of two: the result then depends on no unit.
     prior_weight, units, whole = unit_diagonal(prior_weight)
     a, c = np.ldexp(a, units[:, None] - units), np.ldexp(c, -units)
@@ -64,6 +78,16 @@ def window_covariances(
     # Columns of order one, and those of the identity as they are.
     basis = np.ldexp(basis, units[:, None])
     basis = np.ldexp(basis, 1 - np.frexp(np.abs(basis).max(axis=0, initial=0.0))[1])
+    try:
+        covariance = _smoothed(a, c, weights, prior_weight, basis)
+    except np.linalg.LinAlgError as error:
+        raise InvalidInputError(_LOST) from error
+    return np.asarray(np.ldexp(covariance, -whole - units[:, None] - units))
+
+
+def _smoothed(a: Array, c: Array, weights: Array, prior_weight: Array, basis: Array) -> Array:
+    count, n = a.shape[:2]
+    eye = np.eye(n)
     prior = np.linalg.inv(prior_weight)
     covariance = np.empty((count + 1, n, n))  # first predicted, then smoothed
     covariance[0] = 0.5 * (prior + prior.T)
@@ -77,10 +101,19 @@ def window_covariances(
         predicted = a[i] @ closed[i] @ covariance[i] @ a[i].T
         predicted += basis @ np.linalg.inv(basis.T @ weights[i, :n, :n] @ basis) @ basis.T
         covariance[i + 1] = 0.5 * (predicted + predicted.T)
+    predicted_variances = np.diagonal(covariance, axis1=1, axis2=2).copy()
     later = np.zeros((n, n))  # information of this and later outputs on the state
     for i in range(count - 1, -1, -1):
         transition = a[i] @ closed[i]
         later = gained[i] + transition.T @ later @ transition
         covariance[i] -= covariance[i] @ later @ covariance[i]
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    return np.asarray(np.ldexp(covariance, -whole - units[:, None] - units))
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    # Noise-free components may have no variance, up to rounding, from the start.
+    largest = predicted_variances.max(axis=1, keepdims=True)
+    uncertain = predicted_variances > _LEAST * largest
+    if not np.isfinite(covariance).all() or (
+        (variances < _LEAST * predicted_variances) & uncertain
+    ).any():
+        raise InvalidInputError(_LOST)
+    return covariance

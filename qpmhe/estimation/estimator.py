@@ -603,7 +603,9 @@ class MovingHorizonEstimator:
         Raises
         ------
         InvalidInputError
-            Before the first measurement, or if the model cannot be linearised there.
+            Before the first measurement, if the model cannot be linearised there, or if the
+            weights leave a direction of the states undetermined: a redescending loss takes
+            the weight from outliers.
         """
         return self._engine.covariances()
 
@@ -641,7 +643,7 @@ class MovingHorizonEstimator:
     def _newest_covariance(self) -> Array:
         try:
             value: Array = self.covariances()[-1]
-        except (InvalidInputError, np.linalg.LinAlgError):  # bad luck: the record goes on
+        except InvalidInputError:  # bad luck: the record goes on
             value = np.full((self.system.n, self.system.n), np.nan)
         return value
 

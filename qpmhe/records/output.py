@@ -76,7 +76,7 @@ class RowFormat:
     def _uncertainties(self, estimator: MovingHorizonEstimator) -> list[float]:
         try:
             both = estimator.covariances()[-2:]
-        except (InvalidInputError, np.linalg.LinAlgError):  # bad luck: the run continues
+        except InvalidInputError:  # bad luck: the run continues
             both = np.full((2, estimator.system.n, estimator.system.n), np.nan)
         if self._covariances == "full":
             return both[:, *self._upper].ravel().tolist()

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe import Barron, Cauchy
+from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
 
 from .plain import Record, differences, spd
+from .spoil import check, system_of
 from .systems import swing
 
 RNG = np.random.default_rng(0)
@@ -90,3 +93,35 @@ def test_there_are_none_without_jacobians_or_along_a_stage_that_failed():
     # A run goes on.
     known = np.isfinite(root().run([1.0, -5.0] + [1.0] * 6, covariances=True).covariances[:, 0, 0])
     assert (len(known), known[0], known[-1], known.all()) == (8, True, True, False)
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_weights_that_vanish_are_named_and_those_of_noises_are_missing_measurements(engine):
+    """Of redescending losses, to zero and to a number that is lost in rounding."""
+    if engine == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
+    weights = {"prior": np.eye(2), "disturbance": np.eye(2), "noise": np.eye(1)}
+
+    def estimator(term, loss):
+        cost = qpmhe.RobustCost(**weights | {term: loss(weights[term])})
+        return qpmhe.MovingHorizonEstimator(
+            system_of(), qpmhe.Luenberger([0.3, 0.1]), cost, horizon=3, max_qps=0,
+            initial_state=[0.0, 0.0], engine=engine,
+        )
+
+    for loss in (
+        lambda weight: Barron(weight, -math.inf, 0.3), lambda weight: Cauchy(weight, 0.3),
+        lambda weight: Barron(weight, -math.inf, 0.3, per_component=True),
+    ):
+        mhe = estimator("disturbance", loss)
+        run = mhe.run([0.0, 0.0, 1e11, 1e11], covariances=True)
+        check(InvalidInputError, ["weights", "undetermined", "Huber"], mhe.covariances)
+        known = np.isfinite(run.covariances).all(axis=(1, 2))
+        assert known[[0, 1, 3]].tolist() == [True, True, False]
+        # After the outlier the observer is far from the last measurement, too.
+        outlier, missing = estimator("noise", loss), estimator("noise", loss)
+        outlier.run([0.0, 1e11, 0.0])
+        missing.run([0.0, None, None])
+        np.testing.assert_allclose(
+            outlier.covariances(), missing.covariances(), rtol=1e-9, atol=1e-15
+        )
