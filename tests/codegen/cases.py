@@ -357,9 +357,20 @@ def _tank():
     return one.with_options(parameters=(0.5,), max_qps=None, solver_tolerance=1e-9)
 
 
-def _ship(kinds=("output", "state"), **sets):
+def _turn(period):
+    """The residual of a heading and its rate, as a user's function."""
+    def turn(a, b):
+        away = (a - b)[..., 0]
+        return np.stack((away - period * np.floor(away / period + 0.5), (a - b)[..., 1]), axis=-1)
+
+    return turn
+
+
+def _ship(kinds=("output", "state"), functions=False, **sets):
     """A turning ship whose heading is seen in degrees; the angles may be stated or not."""
     angles = {"output": qpmhe.angles([0], 360.0), "state": qpmhe.angles([0])}
+    if functions:
+        angles = {"output": _turn(360.0), "state": _turn(2.0 * np.pi)}
 
     def wrapped(angle):
         return ca.atan2(ca.sin(angle), ca.cos(angle))
@@ -472,6 +483,7 @@ FEATURES = {
     "angles": {
         "angles of outputs": (lambda: _ship(["output"]), WARM),
         "angles of states": (lambda: _ship(["state"]), gaps, AGAIN),
+        "angles by functions": (lambda: _ship(functions=True), gaps, WARM),
         "angles, conditions": (_ship, gaps, conditions),
         "angles unscented": (_ship, gaps, filtered(UKF), SMOOTH, WARM),
         "angles across the seam": (
