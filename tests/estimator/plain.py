@@ -1,12 +1,6 @@
-"""Window, candidate, J and its Gauss-Newton step by plain loops and dense algebra."""
-
-import math
+"""Window, candidate, J and its Hessian by plain loops and dense algebra."""
 
 import numpy as np
-
-from qpmhe.estimation.problem import Formulation
-from qpmhe.estimation.subproblem import Subproblem
-from qpmhe.estimation.window import Window
 
 STEP = 1e-30  # of the complex differences, which are exact for any tiny step
 
@@ -14,15 +8,6 @@ STEP = 1e-30  # of the complex differences, which are exact for any tiny step
 def spd(generator, n):
     root = generator.standard_normal((n, n))
     return root @ root.T + 0.5 * np.eye(n)
-
-
-def assembled(system, observer, cost, horizon, start, project=True):
-    """What a step in Python consists of: window, formulation and subproblem."""
-    formulation = Formulation(system, observer, cost)
-    return (
-        Window(system, observer, cost, horizon, start, True, project), formulation,
-        Subproblem(system, cost, formulation.constraints, horizon),
-    )
 
 
 def quadratic(s, weight):
@@ -162,16 +147,3 @@ class Record:
                 joint = cost.majorise(residuals[i : i + 1], joint[None])[0]
             total += self.discount ** (count - 1 - i) * slope.T @ joint @ slope
         return total
-
-    def improved(self, trajectory):
-        """The trajectory after one full Gauss-Newton step."""
-        step = np.linalg.solve(self.hessian(trajectory), -0.5 * self.gradient(trajectory).ravel())
-        better = trajectory + step.reshape(trajectory.shape)
-        assert self.cost(better) < self.cost(trajectory)
-        return better
-
-
-def is_minimum(record, trajectory, tolerance=1e-6):
-    """Whether J is stationary at a trajectory, next to its slope at the candidate."""
-    scale = 1.0 + np.abs(record.gradient(record.candidate)).max()
-    return math.isfinite(scale) and np.abs(record.gradient(trajectory)).max() < tolerance * scale

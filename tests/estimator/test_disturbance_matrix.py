@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import approx_fprime
 
 import qpmhe
 from qpmhe import Status, errors
@@ -102,26 +101,6 @@ def test_designed_gains_take_the_matrix():
     for design in (qpmhe.design_luenberger, qpmhe.SteadyStateKalman):
         found = design(system(), start, disturbance=Q, noise=R).gain
         np.testing.assert_allclose(found, full, rtol=1e-9)
-
-
-def test_robust_costs_are_stationary():
-    W, V = np.linalg.inv(np.diag(Q.diagonal())), np.linalg.inv(R)
-    of_w, of_v = qpmhe.Huber(W, 0.5, per_component=True), qpmhe.Power(V, 1.5)
-    price = qpmhe.RobustCost(prior=np.linalg.inv(P), disturbance=of_w, noise=of_v)
-    mhe, ys = estimator(price=price, tolerance=1e-12), 2.0 * Y[:4]
-    estimate = [mhe.update(y) for y in ys][-1]
-
-    def objective(unknowns):
-        x = unknowns[:3]
-        J = x @ np.linalg.solve(P, x)
-        for w, y in zip(unknowns[3:].reshape(-1, 2), ys, strict=True):
-            J += float(of_w.cost(w[None], W)[0] + of_v.cost((y - h(x))[None], V)[0])
-            x = f(x) + G @ w
-        return J
-
-    found = np.concatenate((estimate.trajectory[0], estimate.disturbances.ravel()))
-    assert objective(found) == pytest.approx(estimate.cost, rel=1e-10)
-    assert np.abs(approx_fprime(found, objective)).max() < 1e-3 * estimate.cost
 
 
 def test_what_does_not_fit_is_refused():
