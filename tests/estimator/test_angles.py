@@ -8,7 +8,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Box, Polytope, Status
-from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 PI, INF = np.pi, np.inf
@@ -196,12 +196,9 @@ def test_residual_functions_that_fail_at_some_calls_are_bad_luck(luck):
 
 
 RESIDUALS = [
-    (5, ModelError, "expected qpmhe.angles"),
     (lambda a, b: a - b + 0.1, ModelError, r"\[0.1, .* at a = b = .*expected zeros"),
     (lambda a, b: b - a, ModelError, "expected the same change"),
     (lambda a, b: (a - b)[:1], ModelError, r"shape \(1,\).*expected"),
-    (lambda a, b: 1 / 0, ModelError, "raised ZeroDivisionError"),
-    (lambda a, b: np.log(a - b), ModelError, "expected finite numbers"),
     (lambda a: a, ModelError, "takes 1 positional argument.*expected the difference a - b"),
     (qpmhe.angles([7]), InvalidInputError, "names component 7"),
 ]
@@ -215,10 +212,9 @@ def test_angles_and_residual_functions_that_are_none():
             assert name in str(caught.value)
     indices = r"indices is .*expected one or more integers >= 0"
     for error, text, *arguments in (
-        *((InvalidInputError, indices, one) for one in ([], [[0, 1]], [-1], [0.5], [True], "x")),
+        *((InvalidInputError, indices, one) for one in ([], [-1], [0.5], "x")),
         (InvalidInputError, r"\[2, 0, 2\], which names a component twice", [2, 0, 2]),
         *((OptionError, "period", [0, 1], one) for one in (0.0, INF, [1.0, -2.0])),
-        (ShapeError, "period", [0, 1], [1.0, 2.0, 3.0]),
     ):
         with pytest.raises(error, match=text):
             qpmhe.angles(*arguments)

@@ -150,22 +150,6 @@ def test_an_unseen_parameter_neither_drifts_nor_gets_stiff(seed):
     assert error < 0.3
 
 
-def test_nothing_is_measured_for_ten_horizons():
-    mhe, (y, u, _) = motor(0.1), record(0, UNSEEN)
-    mhe.run(y, u)
-    mhe.run([None] * HORIZON, np.ones((HORIZON, 1)))
-    target = mhe.hold.target[0]
-    assert abs(target - 1.3) < 0.5 * PRIOR[1]
-    for _ in range(9 * HORIZON):
-        estimate = mhe.update(None, [1.0])
-        assert (*mhe.hold.target, *mhe.hold.values, *mhe.hold.shares) == (target, 0.0, 1.0)
-        assert abs(estimate.trajectory[0, 1] - target) < 0.02 * PRIOR[1]
-    mhe.reset([0.0, 0.8])  # trusts the new start
-    assert mhe.hold is None
-    mhe.update(y[0], u[0])
-    np.testing.assert_array_equal(mhe.hold.target, [0.8])
-
-
 def test_sensitivity_has_the_hold():
     """By the newest measurement, on which neither target nor weight rests here."""
     (y, u, _), k, ends = record(6), UNSEEN + 8, []

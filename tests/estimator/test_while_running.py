@@ -67,13 +67,13 @@ def estimator(sets=None, kalman=None, robust=False, discount=1.0, weights=WEIGHT
     )
 
 
-def samples(count, seed=0, sets=False, single=True):
+def samples(count, seed, sets):
     """Arguments of `update`: a sample may have conditions of its own."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(count):
         y, own = rng.normal(0.0, 0.5, 3), {}
         y[rng.random(3) < 0.15] = np.nan
-        chances = rng.random(6) < 0.3 * single
+        chances = rng.random(6) < 0.3
         if chances[0]:
             own["noise_weight"] = np.diag(rng.uniform(0.5, 9.0, 3))
         if chances[1]:
