@@ -1,12 +1,6 @@
-"""Window, candidate, J and its Gauss-Newton step by plain loops and dense algebra."""
-
-import math
+"""A window and its Hessian by plain loops and dense algebra; losses and integrators."""
 
 import numpy as np
-
-from qpmhe.estimation.problem import Formulation
-from qpmhe.estimation.subproblem import Subproblem
-from qpmhe.estimation.window import Window
 
 STEP = 1e-30  # of the complex differences, which are exact for any tiny step
 
@@ -14,15 +8,6 @@ STEP = 1e-30  # of the complex differences, which are exact for any tiny step
 def spd(generator, n):
     root = generator.standard_normal((n, n))
     return root @ root.T + 0.5 * np.eye(n)
-
-
-def assembled(system, observer, cost, horizon, start, project=True):
-    """What a step in Python consists of: window, formulation and subproblem."""
-    formulation = Formulation(system, observer, cost)
-    return (
-        Window(system, observer, cost, horizon, start, True, project), formulation,
-        Subproblem(system, cost, formulation.constraints, horizon),
-    )
 
 
 def quadratic(s, weight):
@@ -67,15 +52,13 @@ def differences(function, trajectory):
 class Record:
     """All samples since the start, and the observer z+ = f(z) + gain (y - h(z)) along them.
 
-    Weights are (P, Q, R); losses those of the initial error, of w and of v.
+    Weights are (P, Q, R).
     """
 
-    def __init__(
-        self, h, gain, start, weights, horizon, *, discount=1.0, losses=(quadratic,) * 3
-    ):
+    def __init__(self, h, gain, start, weights, horizon, discount):
         self.h, self.gain, self.horizon = h, np.asarray(gain, dtype=float), horizon
         self.P, self.Q, self.R = weights
-        self.discount, self.losses = discount, losses
+        self.discount = discount
         self.z = [np.array(start, dtype=float)]
         self.steps, self.ys, self.noise_weights = [], [], []
 
@@ -87,10 +70,6 @@ class Record:
     @property
     def count(self):
         return len(self.ys) - self.first
-
-    @property
-    def candidate(self):
-        return np.array(self.z[self.first :])
 
     def push(self, step, y, noise_weight=None):
         """Take in a sample and the model x -> f(x) of its time."""
@@ -133,45 +112,16 @@ class Record:
             stages.append(np.concatenate([w, (y - self.h(trajectory[i])) * seen]))
         return np.array(stages)
 
-    def cost(self, trajectory):
-        """J by its definition."""
-        n, count = len(self.Q), self.count
-        prior, of_w, of_v = self.losses
-        total = self.discount**count * prior(trajectory[0] - self.z[self.first], self.P)
-        for i, residual in enumerate(self.residuals(trajectory)):
-            stage = of_w(residual[:n], self.Q)
-            stage = stage + of_v(residual[n:], self.weight(self.first + i))
-            total = total + self.discount ** (count - 1 - i) * stage
-        return total
-
-    def gradient(self, trajectory):
-        return differences(self.cost, trajectory).reshape(trajectory.shape)
-
-    def hessian(self, trajectory, cost=None):
-        """Of J/2: the residuals' Jacobians between the weights, or those that majorise a cost."""
+    def hessian(self, trajectory, cost):
+        """Of J/2, with the residuals' Jacobians between the weights that majorise the cost."""
         n, count, first = len(self.Q), self.count, self.first
         total = np.zeros((trajectory.size, trajectory.size))
-        offset = trajectory[0] - self.z[first]
-        total[:n, :n] = self.P if cost is None else cost.majorise_prior(offset, self.P)
+        total[:n, :n] = cost.majorise_prior(trajectory[0] - self.z[first], self.P)
         total *= self.discount**count
         residuals = self.residuals(trajectory)
         for i, slope in enumerate(differences(self.residuals, trajectory)):
             joint = np.zeros((len(slope), len(slope)))
             joint[:n, :n], joint[n:, n:] = self.Q, self.weight(first + i)
-            if cost is not None:
-                joint = cost.majorise(residuals[i : i + 1], joint[None])[0]
+            joint = cost.majorise(residuals[i : i + 1], joint[None])[0]
             total += self.discount ** (count - 1 - i) * slope.T @ joint @ slope
         return total
-
-    def improved(self, trajectory):
-        """The trajectory after one full Gauss-Newton step."""
-        step = np.linalg.solve(self.hessian(trajectory), -0.5 * self.gradient(trajectory).ravel())
-        better = trajectory + step.reshape(trajectory.shape)
-        assert self.cost(better) < self.cost(trajectory)
-        return better
-
-
-def is_minimum(record, trajectory, tolerance=1e-6):
-    """Whether J is stationary at a trajectory, next to its slope at the candidate."""
-    scale = 1.0 + np.abs(record.gradient(record.candidate)).max()
-    return math.isfinite(scale) and np.abs(record.gradient(trajectory)).max() < tolerance * scale

@@ -30,6 +30,12 @@ def estimator(system=None, observer=None, cost=None, **options):
     )
 
 
+def observer_alone(system, observer, start, **options):
+    """An estimator without QPs, if nothing else is asked for."""
+    options = {"initial_state": start, "max_qps": 0} | options
+    return estimator(system, observer, cost_of(system.n, system.p), **options)
+
+
 def with_input():
     return estimator(system_of(lambda x, u: x @ A.T + u, m=2))
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe import Status
 
 from .plain import spd
 
@@ -100,15 +99,3 @@ def test_a_growing_window_and_slides_to_the_front():
             compare([when], before - 1, samples(8))
     for when in (63, 65, 67):
         compare([when], when + when % 4, samples(when + 10, missing=0.05), observer=KALMAN)
-
-
-def test_nothing_new_changes_nothing():
-    """Nor does a measurement that is too large to be squared."""
-    mhe = estimator()
-    for y, u, _ in samples(6, missing=0.0):
-        before = mhe.update(y, u)
-    for nothing in (None, [None] * 3, [1e200, None, None]):
-        after = mhe.amend(4, nothing)
-        same(before, after)
-        assert Status.MODEL_FAILED not in after.status
-        np.testing.assert_array_equal(mhe.state, before.state)

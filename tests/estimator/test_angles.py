@@ -1,11 +1,14 @@
-"""Outputs and states that wrap: as accurate as with angles that go on beyond half a turn."""
+"""States and outputs that wrap: Jacobians, projections and bounds, and what is refused.
+
+`tests/oracles/test_angles.py` has Ipopt's costs with angles, in sets, too.
+"""
 
 import numpy as np
 import pytest
 
 import qpmhe
 from qpmhe import Box, Polytope, Status
-from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
+from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 PI, INF = np.pi, np.inf
@@ -32,15 +35,13 @@ def turned(a, b):
     return difference
 
 
-def compass(states=None, *, wraps=True, turn=0.0, residual=None, **options):
+def compass(states=None, *, turn=0.0, residual=None, **options):
     def f(x):
-        angle = x[..., 0] + x[..., 1] + turn
-        return np.stack((degrees(angle) if wraps else angle, 0.9 * x[..., 1]), axis=-1)
+        return np.stack((degrees(x[..., 0] + x[..., 1] + turn), 0.9 * x[..., 1]), axis=-1)
 
-    angle = dict.fromkeys(NAMES, residual or qpmhe.angles(0, 360.0)) if wraps else {}
+    angle = dict.fromkeys(NAMES, residual or qpmhe.angles(0, 360.0))
     return qpmhe.System(
-        f, lambda x: degrees(x[..., :1]) if wraps else x[..., :1], n=2, p=1, states=states,
-        **angle, **options,
+        f, lambda x: degrees(x[..., :1]), n=2, p=1, states=states, **angle, **options
     )
 
 
@@ -52,48 +53,26 @@ def needle(system, observer="luenberger", start=180.0, **options):
     )
 
 
-def follow(mhe, y, moves=False, wraps=False):
-    """Estimates of a record with late measurements and other bounds, and covariances."""
-    estimates = []
+@pytest.mark.parametrize("observer", ["injection", "extended", "unscented"])
+def test_nothing_is_lost_across_the_seam(observer):
+    """Beside an angle that goes on beyond half a turn."""
+    def f(x):
+        return np.stack((x[..., 0] + x[..., 1] + 115.0, 0.9 * x[..., 1]), axis=-1)
+
+    options = {"candidate": "reinitialized", "arrival": "smoothed"}
+    plain = needle(qpmhe.System(f, lambda x: x[..., :1], n=2, p=1), observer, **options)
+    noise, t = np.random.default_rng(1).normal(0.0, 2.0, 40), np.arange(40)
+    y = (180.0 + 115.0 * t + 12.0 * np.sin(0.2 * t) + noise)[:, None]
+    mhe = needle(compass(turn=115.0), observer, **options)
     for t, sample in enumerate(y):
-        low = 165.0 + 0.1 * t - 360.0 * (t % 3) * wraps  # as if in another turn
-        own = {"bounds": {"states": Box([low, -9.0], [low + 20.0, 9.0])}} if moves else {}
-        late = t % 5 == 3
-        estimates.append(mhe.update(None if late else sample, **(own if t % 4 < 3 else {})))
+        one, other = mhe.update(degrees(sample)), plain.update(sample)
         if t % 5 == 4:
-            estimates.append(mhe.amend(t - 1, y[t - 1]))
-    return estimates, mhe.covariances()
-
-
-@pytest.mark.parametrize(("observer", "turn", "sets", "options"), [
-    ("luenberger", 70.0, {}, {}),
-    ("injection", 110.0, {}, {"candidate": "reinitialized"}),
-    ("extended", 115.0, {}, {"arrival": "smoothed", "warm_start": True}),
-    ("unscented", 70.0, {}, {"candidate": "reinitialized", "arrival": "smoothed"}),
-    ("injection", 0.0, {"states": ACROSS & Polytope([[0.0, 1.0]], [2.0])}, {"max_qps": 1}),
-    ("luenberger", 0.0, {"states": ACROSS}, {"candidate": "reinitialized"}),
-    ("extended", 0.0, {"disturbances": Box([-0.6, -1.0], [0.6, 1.0]),
-                       "noises": Box([-2.5], [2.5])}, {"warm_start": True}),
-    ("unscented", 0.0, {"disturbances": Polytope([[1.0, 1.0], [-1.0, 1.0]], [0.7, 0.7]),
-                        "states": ACROSS}, {"horizon": 2}),
-])
-def test_nothing_is_lost_across_the_seam(observer, turn, sets, options):
-    noise, t = np.random.default_rng(1).normal(0.0, 2.0, 50), np.arange(50)
-    y, moves = (180.0 + turn * t + 12.0 * np.sin(0.2 * t) + noise)[:, None], "states" in sets
-    plain = compass(wraps=False, turn=turn, **sets)
-    expected = follow(needle(plain, observer, **options), y, moves)
-    for residual in (None, turned):
-        wrapping = compass(turn=turn, residual=residual, **sets)
-        found = follow(needle(wrapping, observer, **options), degrees(y), moves, True)
-        for one, other in zip(found[0], expected[0], strict=True):
-            error = one.trajectory - other.trajectory
-            assert np.abs(turned(error, 0.0)).max() < 1e-6
-            np.testing.assert_allclose(one.noises, other.noises, atol=1e-6)
-            assert one.cost == pytest.approx(other.cost, rel=1e-6, abs=1e-12)
-            assert one.status == other.status
-        np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
-    if not sets:
-        assert np.abs(error[:, 0]).max() > 360.0
+            one, other = mhe.amend(t - 1, degrees(y[t - 1])), plain.amend(t - 1, y[t - 1])
+        error = one.trajectory - other.trajectory
+        assert np.abs(turned(error, 0.0)).max() < 1e-6
+        assert one.cost == pytest.approx(other.cost, rel=1e-6, abs=1e-12)
+    np.testing.assert_allclose(mhe.covariances(), plain.covariances(), rtol=1e-6)
+    assert np.abs(error[:, 0]).max() > 360.0
 
 
 def test_degrees_and_turns_side_by_side():
@@ -217,12 +196,9 @@ def test_residual_functions_that_fail_at_some_calls_are_bad_luck(luck):
 
 
 RESIDUALS = [
-    (5, ModelError, "expected qpmhe.angles"),
     (lambda a, b: a - b + 0.1, ModelError, r"\[0.1, .* at a = b = .*expected zeros"),
     (lambda a, b: b - a, ModelError, "expected the same change"),
     (lambda a, b: (a - b)[:1], ModelError, r"shape \(1,\).*expected"),
-    (lambda a, b: 1 / 0, ModelError, "raised ZeroDivisionError"),
-    (lambda a, b: np.log(a - b), ModelError, "expected finite numbers"),
     (lambda a: a, ModelError, "takes 1 positional argument.*expected the difference a - b"),
     (qpmhe.angles([7]), InvalidInputError, "names component 7"),
 ]
@@ -236,10 +212,9 @@ def test_angles_and_residual_functions_that_are_none():
             assert name in str(caught.value)
     indices = r"indices is .*expected one or more integers >= 0"
     for error, text, *arguments in (
-        *((InvalidInputError, indices, one) for one in ([], [[0, 1]], [-1], [0.5], [True], "x")),
+        *((InvalidInputError, indices, one) for one in ([], [-1], [0.5], "x")),
         (InvalidInputError, r"\[2, 0, 2\], which names a component twice", [2, 0, 2]),
         *((OptionError, "period", [0, 1], one) for one in (0.0, INF, [1.0, -2.0])),
-        (ShapeError, "period", [0, 1], [1.0, 2.0, 3.0]),
     ):
         with pytest.raises(error, match=text):
             qpmhe.angles(*arguments)

@@ -45,7 +45,7 @@ def test_they_are_the_blocks_of_the_inverse_hessian(horizon, discount, missing, 
         )
         for _ in range(2)
     )
-    kept = Record(h, gain, START, WEIGHTS, horizon, discount=discount)
+    kept = Record(h, gain, START, WEIGHTS, horizon, discount)
 
     def check(trajectory):
         hessian = kept.hessian(trajectory, cost)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import approx_fprime
 
 import qpmhe
 from qpmhe import Status, errors
@@ -104,30 +103,9 @@ def test_designed_gains_take_the_matrix():
         np.testing.assert_allclose(found, full, rtol=1e-9)
 
 
-def test_robust_costs_are_stationary():
-    W, V = np.linalg.inv(np.diag(Q.diagonal())), np.linalg.inv(R)
-    of_w, of_v = qpmhe.Huber(W, 0.5, per_component=True), qpmhe.Power(V, 1.5)
-    price = qpmhe.RobustCost(prior=np.linalg.inv(P), disturbance=of_w, noise=of_v)
-    mhe, ys = estimator(price=price, tolerance=1e-12), 2.0 * Y[:4]
-    estimate = [mhe.update(y) for y in ys][-1]
-
-    def objective(unknowns):
-        x = unknowns[:3]
-        J = x @ np.linalg.solve(P, x)
-        for w, y in zip(unknowns[3:].reshape(-1, 2), ys, strict=True):
-            J += float(of_w.cost(w[None], W)[0] + of_v.cost((y - h(x))[None], V)[0])
-            x = f(x) + G @ w
-        return J
-
-    found = np.concatenate((estimate.trajectory[0], estimate.disturbances.ravel()))
-    assert objective(found) == pytest.approx(estimate.cost, rel=1e-10)
-    assert np.abs(approx_fprime(found, objective)).max() < 1e-3 * estimate.cost
-
-
 def test_what_does_not_fit_is_refused():
     for matrix, kind, text in (
         ([1.0, 2.0, 3.0], errors.ShapeError, ["shape (3,)", "(3, r)", "column for each"]),
-        (np.ones((3, 4)), errors.ShapeError, ["shape (3, 4)", "from 1 to 3"]),
         ([[1e9, 2e-9], [1.0, 2e-18], [0.0, 0.0]], errors.ModelError, ["dependent", "rank 2"]),
         ([[1.0], [np.nan], [0.0]], errors.InvalidInputError, ["disturbance_matrix", "finite"]),
     ):
@@ -138,22 +116,18 @@ def test_what_does_not_fit_is_refused():
     check(errors.ShapeError, ["for 3 disturbances; expected 2"], estimator, price=cost(np.eye(3)))
     text = ["disturbance covariance has shape (3, 3)", "expected (2, 2)"]
     check(errors.ShapeError, text, estimator, observer=kalman(np.eye(3)))
-    W = qpmhe.Box([-1.0] * 3, [1.0] * 3)
-    check(errors.SetError, ["disturbances has dimension 3; expected 2"], system, disturbances=W)
     W = qpmhe.Box([-np.inf, 0.5, -np.inf], [np.inf, 0.5, np.inf])
     fixed, price = system(None, disturbances=W), cost(np.diag([0.2, 0.0, 0.1]))
     check(errors.SetError, ["component 1", "0.5", "variance"], estimator, fixed, price=price)
     mhe, text = estimator(system(None), price=price), ["disturbance_weight", "singular"]
     check(errors.OptionError, text, mhe.update, 0.1, disturbance_weight=np.eye(3))
-    one, other = (estimator(system(matrix), kalman()) for matrix in (G, 2.0 * G))
-    check(errors.InvalidInputError, ["disturbance_matrix"], other.load_state_dict, one.state_dict())
     walk = qpmhe.System(lambda x: x, lambda x: x, n=2, p=2)
     noises = {"disturbance": np.diag([1.0, 0.0]), "noise": np.eye(2)}
     text = ["eigenvalue 1", "small variance"]
     check(errors.ModelError, text, qpmhe.design_luenberger, walk, [0.0, 0.0], **noises)
-    for matrix in ([[0.0, 1e-3], [1e-3, 1.0]], np.diag([1.0, -1e-9])):
-        for build in (cost, kalman):
-            check(errors.WeightError, ["disturbance covariance", "semidefinite"], build, matrix)
+    for build in (cost, kalman):
+        text = ["disturbance covariance", "semidefinite"]
+        check(errors.WeightError, text, build, np.diag([1.0, -1e-9]))
 
 
 def test_certificates_refuse_it_by_name():

@@ -70,9 +70,12 @@ def test_times_are_no_measurements():
     check(InvalidInputError, ["gain is [nan, 1.0]", "finite"], qpmhe.Luenberger, [pd.NA, 1.0])
 
 
-def test_neither_scipy_nor_pandas_is_imported():
+def test_neither_scipy_nor_pandas_is_imported_and_casadi_by_the_first_derivative():
     code = (
         "import sys, numpy as np, qpmhe.observers\n"
+        "one = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1)\n"
+        "assert 'casadi' not in sys.modules\n"
+        "assert one.derivatives['f'] == 'traced' and 'casadi' in sys.modules\n"
         "assert not [name for name in sys.modules if name.startswith('scipy')]\n"
         "system, observer, cost, scenario = qpmhe.models.batch_reactor()\n"
         "mhe = qpmhe.MovingHorizonEstimator(system, observer, cost, horizon=3,\n"

@@ -19,19 +19,11 @@ from qpmhe.observers import (
 )
 
 from .plain import spd
-from .spoil import check, cost_of
+from .spoil import check, observer_alone
 from .systems import linear
 
 DT = 0.05
 NONE = np.zeros(0)
-
-
-def estimator(system, observer, start, **options):
-    """Of the observer alone, if nothing else is asked for."""
-    return qpmhe.MovingHorizonEstimator(
-        system, observer, cost_of(system.n, system.p), initial_state=start,
-        **{"horizon": 3, "max_qps": 0} | options,
-    )
 
 
 class Plant:
@@ -56,8 +48,9 @@ def poles_of(matrix):
 
 def test_output_injection():
     system, start = linear(0.5 * np.eye(2), np.eye(2)), [1.0, -2.0]
-    listed = estimator(system, OutputInjection(lambda z, v: [0.1 * v[0] - v[1], 0.3 * v[1]]), start)
-    matrix = estimator(system, Luenberger([[0.1, -1.0], [0.0, 0.3]]), start)
+    injection = OutputInjection(lambda z, v: [0.1 * v[0] - v[1], 0.3 * v[1]])
+    listed = observer_alone(system, injection, start)
+    matrix = observer_alone(system, Luenberger([[0.1, -1.0], [0.0, 0.3]]), start)
     Y = np.random.default_rng(2).standard_normal((9, 2))
     np.testing.assert_allclose(listed.run(Y).states, matrix.run(Y).states, rtol=1e-13, atol=1e-15)
     nothing = "L(z, 0) = 0"
@@ -68,7 +61,7 @@ def test_output_injection():
         (lambda z, v: [][0], ["IndexError: ", "at z = [1.0, -2.0]"]),
         (lambda z, v: np.multiply(0.5, v, out=v), ["in place"]),
     ):
-        check(ModelError, text, estimator, system, OutputInjection(correction), start)
+        check(ModelError, text, observer_alone, system, OutputInjection(correction), start)
     check(ModelError, ["correction is 0.3; expected a function"], OutputInjection, 0.3)
 
 
@@ -98,7 +91,7 @@ def test_sigma_points_stay_within_the_bounds():
     Y = 1.5 + 0.3 * np.random.default_rng(1).standard_normal(60)
     for states, fails in ((qpmhe.Box([1.0], [np.inf]), False), (None, True)):
         system = qpmhe.System(f, lambda x: x, n=1, p=1, states=states)
-        run = estimator(system, observer, [1.1]).run(Y)
+        run = observer_alone(system, observer, [1.1]).run(Y)
         assert (run.share(Status.MODEL_FAILED) > 0) == fails
 # Designed gains
 
@@ -182,7 +175,7 @@ def test_high_gain_observers_that_make_no_sense():
         (linear(chain(2, DT), [[-1.0, 0.0]]), ModelError, ["C is [[-1.0, 0.0]]"]),
         (timed, InvalidInputError, ["dt of the high-gain observer is 0.1; expected 0.05"]),
     ):
-        check(kind, text, estimator, system, observer, np.zeros(system.n))
+        check(kind, text, observer_alone, system, observer, np.zeros(system.n))
 
 
 def test_an_observer_that_starts_again_has_the_state_that_it_starts_from():
@@ -194,7 +187,7 @@ def test_an_observer_that_starts_again_has_the_state_that_it_starts_from():
         return A @ x
 
     system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
-    mhe = estimator(system, Luenberger([[0.4], [0.1]]), [1.0, -1.0], horizon=2, max_qps=3)
+    mhe = observer_alone(system, Luenberger([[0.4], [0.1]]), [1.0, -1.0], horizon=2, max_qps=3)
     mhe.run([0.5, 200.0])
     failed = mhe.update(0.5)
     assert Status.MODEL_FAILED in failed.status

@@ -1,6 +1,5 @@
 """What is handed out or in is never memory of the estimator; an interrupted step was not taken."""
 
-
 import numpy as np
 import pytest
 
@@ -9,6 +8,7 @@ from qpmhe.codegen.compiler import find_compiler
 from qpmhe.estimation.settings import Settings
 
 from .same import assert_same, interrupted
+from .systems import pendulum
 
 BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
 # Outside of which the candidate is, now and then.
@@ -24,16 +24,6 @@ CASES = {
 NEW = [0.2, 0.1]
 
 
-def system_of(sets=None):
-    def rate(x, u):
-        return np.stack((x[..., 1], u[..., 0] - np.sin(x[..., 0])), axis=-1)
-
-    return qpmhe.System.from_ode(
-        rate, lambda x, u: x[..., :1] + 0.1 * x[..., :1] ** 2, dt=0.1, n=2, p=1, m=1,
-        method="euler", **(sets or {}),
-    )
-
-
 def estimator(sets=None, discount=1.0, robust=False, kalman=False, held=None, **options):
     """Of arrays that are spoilt afterwards."""
     if options.get("engine") == "compiled" and find_compiler() is None:
@@ -45,7 +35,7 @@ def estimator(sets=None, discount=1.0, robust=False, kalman=False, held=None, **
     if robust:
         cost = qpmhe.RobustCost(**given | {"noise": qpmhe.Huber(weights[2])}, discount=discount)
     observer = qpmhe.ExtendedKalman(**given) if kalman else qpmhe.Luenberger(gain)
-    system = system_of(sets)
+    system = pendulum("traced", **(sets or {}))
     if held:  # as `augment_parameters` does
         system.held = held
     mhe = qpmhe.MovingHorizonEstimator(
@@ -187,6 +177,3 @@ def test_an_interrupted_step_was_not_taken(name, stride):
             np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
         if t in actions:
             both(actions[t])
-
-
-# Batches

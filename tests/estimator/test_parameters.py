@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
 
 import qpmhe
 from qpmhe import Box, Luenberger, MovingHorizonEstimator, QuadraticCost
@@ -68,32 +67,6 @@ def test_an_unknown_constant_is_recovered(gain, candidate):
     assert abs(constant(mhe, y, u).state[1] - 1.3) < 0.1
 
 
-def test_the_estimate_is_the_minimum_over_state_parameter_and_noisy_disturbance():
-    y, u, _ = record(1, 8)
-    estimate = constant(motor(drift=0.0, gain=0.0, max_qps=None, tolerance=1e-14), y, u)
-
-    def residuals(unknown):
-        x, g, w = unknown[0], unknown[1], unknown[2:]
-        parts = [[x / PRIOR[0], (g - 1.0) / PRIOR[1]], w / WANDER]
-        for y_k, u_k, w_k in zip(y, u[:, 0], w, strict=True):
-            parts.append([(y_k - x) / NOISE])
-            x += DT * (-0.5 * x + g * u_k) + w_k
-        return np.concatenate(parts)
-
-    best = least_squares(residuals, np.zeros(10), xtol=1e-15, ftol=1e-15, gtol=1e-12)
-    assert estimate.cost == pytest.approx(2.0 * best.cost, rel=1e-7)
-    np.testing.assert_allclose(estimate.trajectory[0], best.x[:2], rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", qpmhe.solvers.available())
-def test_every_backend_keeps_parameters_constant(name):
-    (y, u, _), options = record(2, 20), {"drift": 0.0, "gain": 0.2, "backend": name, "max_qps": 5}
-    assert constant(motor(**options), y, u).improved
-    if qpmhe.solvers.backend(name).inequalities:  # the true value, 1.3, is outside
-        estimate = constant(motor(bounds=Box([0.5], [1.1]), **options), y, u)
-        assert estimate.state[1] == pytest.approx(1.1, abs=1e-3)
-
-
 def spring(x, theta):
     return np.stack([x[..., 1], -theta[..., 0] * x[..., 0] - theta[..., 1] * x[..., 1]], axis=-1)
 
@@ -112,16 +85,11 @@ WRONG = [
     ({"nominal": [2.0]}, "ModelError", r"IndexError.*theta = \[2.0\].*Check nominal"),
     ({"estimated": [-1]}, "InvalidInputError", "names parameter -1; expected .* 0 to 1"),
     ({"estimated": [1, 1]}, "InvalidInputError", r"\[1, 1\], which names one parameter twice"),
-    ({"estimated": [True]}, "ShapeError", r"mask of shape \(1,\); expected \(2,\)"),
     ({"parameter_bounds": Box([0.0, 1.0], [9.0, 9.0])}, "SetError", "outside parameter_bounds"),
     ({"parameter_bounds": Box([0.0] * 2, [9.0] * 2).soften(linear=1.0)}, "SetError", "is soft; "),
-    ({"m": 1}, "ModelError", r"f\(x, theta\) cannot be called as f\(x, u, theta\).*1 inputs"),
     ({"f": careless}, "ModelError", "changes its argument in place"),
     ({"method": "rk4"}, "OptionError", "method is 'rk4', but dt is missing"),
-    ({"drifting": "yes"}, "OptionError", "drifting is 'yes'; expected True or False"),
     ({"hold": 0.0}, "InvalidInputError", "hold is 0.0.*above 0"),
-    ({"hold": [0.1, np.inf]}, "InvalidInputError", "hold is inf.*omit it"),
-    ({"hold": [[0.1, 0.1]]}, "ShapeError", r"shape \(1, 2\)"),
     ({"hold": {1: 0.1}, "estimated": [0]}, "InvalidInputError", "key 1, .*not an estimated param"),
     ({"hold": 0.1, "estimated": []}, "InvalidInputError", "no parameter is estimated"),
 ]
@@ -180,22 +148,6 @@ def test_an_unseen_parameter_neither_drifts_nor_gets_stiff(seed):
     moved, error = drift_and_error(0.1, 0.1)
     assert moved < 0.6
     assert error < 0.3
-
-
-def test_nothing_is_measured_for_ten_horizons():
-    mhe, (y, u, _) = motor(0.1), record(0, UNSEEN)
-    mhe.run(y, u)
-    mhe.run([None] * HORIZON, np.ones((HORIZON, 1)))
-    target = mhe.hold.target[0]
-    assert abs(target - 1.3) < 0.5 * PRIOR[1]
-    for _ in range(9 * HORIZON):
-        estimate = mhe.update(None, [1.0])
-        assert (*mhe.hold.target, *mhe.hold.values, *mhe.hold.shares) == (target, 0.0, 1.0)
-        assert abs(estimate.trajectory[0, 1] - target) < 0.02 * PRIOR[1]
-    mhe.reset([0.0, 0.8])  # trusts the new start
-    assert mhe.hold is None
-    mhe.update(y[0], u[0])
-    np.testing.assert_array_equal(mhe.hold.target, [0.8])
 
 
 def test_sensitivity_has_the_hold():

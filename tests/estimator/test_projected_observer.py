@@ -11,18 +11,10 @@ from qpmhe import Status
 from qpmhe.errors import ShapeError, WeightError
 from qpmhe.observers.projection import NearestPoint
 
+from .spoil import observer_alone
 from .systems import linear
 
 INF = math.inf
-
-
-def estimator(system, observer, *, start):
-    cost = qpmhe.QuadraticCost(
-        prior=np.eye(system.n), disturbance=np.eye(system.n), noise=np.eye(system.p)
-    )
-    return qpmhe.MovingHorizonEstimator(
-        system, observer, cost, horizon=4, initial_state=start, max_qps=0
-    )
 
 
 def random_case(rng, rank):
@@ -86,9 +78,9 @@ def worst_excess(rng, steps, is_own):
     lower[0] = 0.0
     corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(n, -1).T
     observer = qpmhe.Luenberger(gain, metric=metric if is_own else np.eye(n))
-    mhe = estimator(
+    mhe = observer_alone(
         linear(a, c, states=qpmhe.Box(lower, upper)), observer,
-        start=corners[rng.integers(len(corners))],
+        corners[rng.integers(len(corners))],
     )
     root = np.linalg.cholesky(metric).T
     x, z, worst, projected = corners[rng.integers(len(corners))], mhe.state, -INF, 0
@@ -126,7 +118,7 @@ K, C = np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
 def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilises():
     def sizes(metric):
         system = linear(CLOSED + K @ C, C, states=qpmhe.Box([0.0, 0.0], [INF, INF]))
-        mhe = estimator(system, qpmhe.Luenberger(K, metric=metric), start=[1.0, 0.0])
+        mhe = observer_alone(system, qpmhe.Luenberger(K, metric=metric), [1.0, 0.0])
         return np.linalg.norm(mhe.run(np.zeros((60, 1))).states, axis=1)
 
     np.testing.assert_allclose(sizes(np.eye(2)), 1.2 ** np.arange(61), rtol=1e-9)
@@ -137,18 +129,3 @@ def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilise
         sizes([[1.0, 2.0], [2.0, 1.0]])
     with pytest.raises(ShapeError, match="metric has shape"):
         sizes(np.eye(3))
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_first_guess_outside_is_projected_with_a_warning():
-    metric, positive = np.array([[2.0, 1.0], [1.0, 1.0]]), qpmhe.Box([0.0, 0.0], [INF, INF])
-    system = linear(0.9 * np.eye(2), np.ones((1, 2)), states=positive)
-    observer = qpmhe.Luenberger([0.1, 0.1], metric=metric)
-    with pytest.warns(qpmhe.ObserverWarning, match=r"initial_state is \[-1\.0, 1\.0\]"):
-        mhe = estimator(system, observer, start=[-1.0, 1.0])
-    # min 2 + 2 s + s^2 over xi = (0, 1 + s) is at s = -1.
-    np.testing.assert_allclose(mhe.state, [0.0, 0.0], atol=1e-12)
-    mhe.update([1.0])
-    with pytest.raises(qpmhe.ObserverWarning, match="outside of the state set"):
-        mhe.reset([1.0, -2.0])
-    assert mhe.time == 1  # as it was

@@ -8,8 +8,6 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError
 
-from . import spoil
-from .plain import rk4
 from .spoil import check, cost_of
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[0.0], [1.0]])
@@ -100,25 +98,3 @@ def test_what_a_sample_shows(max_qps):
             np.testing.assert_array_equal(new[3][name], old[3][name])
         assert np.array_equal(new[0], old[0]) is (age == 0)
         assert not np.array_equal(new[1], old[1])
-
-
-def test_steps_of_any_length_by_default_with_runge_kuttas_method():
-    def rate(x):
-        return np.stack([x[..., 1], -np.sin(x[..., 0])], axis=-1)
-
-    box, x = qpmhe.Box([-9.0, -9.0], [9.0, 9.0]), np.array([0.5, 1.0])
-    system = qpmhe.System.from_ode(
-        lambda x, u: rate(x), lambda x, u: x[..., :1] * u[..., :1], dt=0.1, n=2, p=1, m=1,
-        states=box, disturbances=box,
-    )
-    timed = system.timed
-    assert timed.states is timed.disturbances is box
-    expected = rk4(lambda x, u: rate(x))(x, None, 0.7)
-    np.testing.assert_allclose(timed.f(x, np.array([3.0, 0.7])), expected, rtol=1e-13)
-    np.testing.assert_allclose(timed.h(x, np.array([3.0, 0.7])), [1.5])
-    one, other = (spoil.estimator(system, qpmhe.Luenberger([0.3, 0.1])) for _ in range(2))
-    for t, y in enumerate(np.random.default_rng(4).standard_normal(8)):
-        # A weight of one output may be a scalar, and the usual length may be named.
-        plainly = one.update(y, 1.0, noise_weight=[[2.0]])
-        named = other.update(y, 1.0, dt=0.1 if t % 3 else None, noise_weight=2.0)
-        np.testing.assert_allclose(named.trajectory, plainly.trajectory, rtol=1e-9, atol=1e-10)

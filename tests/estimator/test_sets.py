@@ -35,21 +35,6 @@ def test_a_point_is_in_an_intersection_as_far_as_in_each_inequality():
         assert whole.violation(points) == pytest.approx(expected, rel=1e-12, abs=1e-14)
 
 
-def test_components_that_are_bounded_and_fixed():
-    given = np.zeros(2)
-    box, polytope = Box(given, given + 1.0), Polytope(np.eye(2), given)
-    given[:] = -9.0  # copies are kept
-    assert (box.violation(given + 9.0), polytope.violation(given + 9.0)) == (0.0, 0.0)
-    wide = Box([-np.inf, 0.0, -1.0, -np.inf], [np.inf, 0.0, np.inf, 2.0])
-    np.testing.assert_array_equal(wide.bounded_components, [1, 2, 3])
-    np.testing.assert_array_equal(wide.fixed_components, [1])
-    # Sets that only touch are not empty.
-    point = Box(0, 1) & Box([1.0], [2.0])
-    np.testing.assert_array_equal(point.fixed_components, [0])
-    corner = Box([0.0, 0.0], [1.0, 1.0]) & Polytope([-1.0, -1.0], -2.0)
-    assert corner.violation(np.array([1.0, 1.0])) == 0.0
-
-
 @pytest.mark.parametrize(("units", "row"), [((1e-9, 1e9), 1e-9), ((1e-12, 1e-9), 1e12)])
 def test_whether_a_set_is_empty_depends_on_no_unit(units, row):
     units = np.array(units)
@@ -192,15 +177,11 @@ def test_a_constraint_that_fails_far_from_the_data_never_escapes(bad, penalty):
 
 
 def test_snapshots_continue_bit_for_bit_with_the_same_constraints_only():
-    ys = record(18)
-    first, second = (make(SOFT, max_qps=3) for _ in range(2))
+    ys, first = record(18), make(SOFT, max_qps=3)
     first.run(ys[:11])
-    third = pickle.loads(pickle.dumps(first))
-    second.load_state_dict(first.state_dict())
+    second = pickle.loads(pickle.dumps(first))
     for y in ys[11:]:
-        expected = first.update(y)
-        assert_same(second.update(y), expected)
-        assert_same(third.update(y), expected)
+        assert_same(second.update(y), first.update(y))
     soft = {"constraints": [Constraint(ball, linear=1.0)]}
     for one, other, words in (
         (soft, {"constraints": [Constraint(ball, linear=2.0)]}, "another constraints"),
@@ -234,16 +215,12 @@ def test_the_observer_is_not_projected_onto_a_soft_set():
 
 WRONG = [
     (lambda: UNIT.soften(), SetError, "row 0 of the soft set has no penalty"),
-    (lambda: UNIT.soften(linear=-1.0), SetError, "linear is -1.0; expected finite numbers >= 0"),
     (lambda: UNIT & UNIT.soften(linear=1.0), SetError, "intersect sets first and soften"),
     (lambda: Constraint(ball, linear=0.0), SetError, "leave the constraint hard"),
     (lambda: Constraint(lambda z: z), ModelError, "has the parameter z; expected only x"),
-    (lambda: Constraint(lambda u: u), ModelError, "g takes u, so that no estimate"),
     (lambda: make({"constraints": [ball]}), SetError, "expected a list of qpmhe.Constraint"),
     (lambda: make({"constraints": [Constraint(lambda x, u: x[0])]}), ModelError,
      "constraints[0] takes u, but the system has no inputs"),
-    (lambda: make({"constraints": [Constraint(lambda x: x, 3)]}), ModelError,
-     "constraints[0] returned shape (2,)"),
     (lambda: make({"constraints": [Constraint(lambda x: np.log(x[0] - 3.0))]}), ModelError,
      "constraints[0] is [nan] at the initial state"),
     (lambda: make({"states": SOFT["states"]}, engine="compiled"), OptionError, "soft set of"),

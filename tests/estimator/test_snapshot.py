@@ -12,6 +12,7 @@ from qpmhe.errors import InvalidInputError
 from qpmhe.estimation.snapshot import read, written
 
 from .same import assert_same, leaves
+from .systems import pendulum
 
 OPTIONS = {
     "observer alone": {"max_qps": 0, "delay": 3},
@@ -26,27 +27,6 @@ RECORD = np.random.default_rng(0).normal(0.0, 0.6, (30, 2))
 RECORD[7, 0] = np.nan
 
 
-class Pendulum:
-    """With methods, which pickle."""
-
-    def __init__(self, swing, bend, untraced):
-        self.swing, self.bend, self.untraced = swing, bend, untraced
-
-    def rate(self, x, u):
-        if self.untraced:
-            np.isnan(x)  # has no form in CasADi
-        return np.stack((x[..., 1], u[..., 0] - self.swing * np.sin(x[..., 0])), axis=-1)
-
-    def h(self, x, u):
-        return x[..., :1] + self.bend * x[..., :1] ** 2
-
-
-def system_of(engine, swing=1.0, bend=0.1, **sets):
-    options = {"n": 2, "p": 1, "m": 1, "dt": 0.1, "method": "euler", **sets}
-    pendulum = Pendulum(swing, bend, engine == "untraced")
-    return qpmhe.System.from_ode(pendulum.rate, pendulum.h, **options)
-
-
 def made(
     engine="untraced", kalman=False, robust=0.0, system=None, observer=None, weights=None,
     states=None, **options,
@@ -58,7 +38,7 @@ def made(
         observer = qpmhe.ExtendedKalman(**WEIGHTS)
         weights["prior"] = qpmhe.ObserverPrior()
     return qpmhe.MovingHorizonEstimator(
-        system or system_of(engine, states=states), observer or qpmhe.Luenberger([0.3, 0.4]),
+        system or pendulum(engine, states=states), observer or qpmhe.Luenberger([0.3, 0.4]),
         (qpmhe.RobustCost if robust else qpmhe.QuadraticCost)(**weights),
         **{"horizon": 4, "initial_state": [0.5, 0.0],
            "engine": engine if engine == "compiled" else "python"} | options,
@@ -134,8 +114,8 @@ def test_the_state_of_another_estimator_is_refused_by_name(engine):
         "observer.gain": {"observer": qpmhe.Luenberger([0.3, 0.41])},
         "another observer": {"kalman": True}, "another cost": {"robust": 1.0},
         "set of states": {"states": qpmhe.Box([-5.0, -5.0], [5.0, 5.0])},
-        "model": {"system": system_of(engine, swing=1.001)},
-        "(h)": {"system": system_of(engine, bend=0.1001)},
+        "model": {"system": pendulum(engine, swing=1.001)},
+        "(h)": {"system": pendulum(engine, bend=0.1001)},
     }
     for count in (0, 15):
         state = fed(count, engine).state_dict()

@@ -10,7 +10,7 @@ import qpmhe
 from qpmhe.errors import BackendError, InvalidInputError, OptionError
 from qpmhe.solvers import RawSolution, Solver, SolverOptions, available, create
 
-from .spoil import check, estimator
+from .spoil import check, cost_of, estimator
 
 Y = np.random.default_rng(0).normal(size=(12, 1))
 BOX = qpmhe.Box([-0.5, -0.5], [0.5, 0.5])
@@ -25,11 +25,10 @@ def first(x):
 
 
 def constrained(**options):
-    system = qpmhe.System(step, first, n=2, p=1, states=BOX)
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=5.0 * np.eye(2), noise=np.eye(1))
-    return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([[0.1], [0.1]]), cost, horizon=4, initial_state=[0.1, 0.1],
-        max_qps=2, **options,
+    given = {"horizon": 4, "initial_state": [0.1, 0.1], "max_qps": 2} | options
+    return estimator(
+        qpmhe.System(step, first, n=2, p=1, states=BOX), qpmhe.Luenberger([[0.1], [0.1]]),
+        cost_of(disturbance=5.0 * np.eye(2)), **given,
     )
 
 

@@ -2,8 +2,6 @@
 
 import contextlib
 import math
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -268,14 +266,3 @@ def test_what_cannot_be_traced_is_used_as_it_is_written():
     assert estimate.cost <= estimate.candidate_cost
     with pytest.raises(OptionError, match="asks for the truth"):
         estimator(system, "compiled")
-
-
-def test_a_system_alone_imports_no_casadi():
-    code = (
-        "import sys, qpmhe; s = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1); "
-        "print('casadi' in sys.modules, s.derivatives['f'], 'casadi' in sys.modules)"
-    )
-    answer = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert answer.stdout.split() == ["False", "traced", "True"]
