@@ -72,7 +72,8 @@ class Case:
         return Window(
             lambda x, u: f(x), lambda x, u: h(x), ys, estimate.candidate[0],
             (P, [Q] * count, [R] * count), boxes={
-                name: [one] * (count + 1) for name, one in zip(names, self.sets[kind], strict=True)
+                name: one for name, one in zip(names, self.sets[kind], strict=True)
+                if one is not None
             },
         )
 
