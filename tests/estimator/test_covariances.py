@@ -11,7 +11,7 @@ from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
 
 from .plain import Record, differences, spd
-from .spoil import check, system_of
+from .spoil import check, estimator, observer_alone
 from .systems import swing
 
 RNG = np.random.default_rng(0)
@@ -74,11 +74,8 @@ def test_they_are_the_blocks_of_the_inverse_hessian(horizon, discount, missing, 
 
 def test_there_are_none_without_jacobians_or_along_a_stage_that_failed():
     def root(f=np.sqrt, gain=0.9, start=1.0, **options):
-        return qpmhe.MovingHorizonEstimator(
-            qpmhe.System(f, lambda x: x, n=1, p=1, **options), qpmhe.Luenberger([gain]),
-            qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0),
-            horizon=3, initial_state=[start], max_qps=0,
-        )
+        system = qpmhe.System(f, lambda x: x, n=1, p=1, **options)
+        return observer_alone(system, qpmhe.Luenberger([gain]), [start])
 
     still = {"gain": 0.0, "start": 0.0}
     for given, text, *ys in (
@@ -102,24 +99,21 @@ def test_weights_that_vanish_are_named_and_those_of_noises_are_missing_measureme
         pytest.skip("there is no C compiler")
     weights = {"prior": np.eye(2), "disturbance": np.eye(2), "noise": np.eye(1)}
 
-    def estimator(term, loss):
+    def of_loss(term, loss):
         cost = qpmhe.RobustCost(**weights | {term: loss(weights[term])})
-        return qpmhe.MovingHorizonEstimator(
-            system_of(), qpmhe.Luenberger([0.3, 0.1]), cost, horizon=3, max_qps=0,
-            initial_state=[0.0, 0.0], engine=engine,
-        )
+        return estimator(cost=cost, initial_state=[0.0, 0.0], max_qps=0, engine=engine)
 
     for loss in (
         lambda weight: Barron(weight, -math.inf, 0.3), lambda weight: Cauchy(weight, 0.3),
         lambda weight: Barron(weight, -math.inf, 0.3, per_component=True),
     ):
-        mhe = estimator("disturbance", loss)
+        mhe = of_loss("disturbance", loss)
         run = mhe.run([0.0, 0.0, 1e11, 1e11], covariances=True)
         check(InvalidInputError, ["weights", "undetermined", "Huber"], mhe.covariances)
         known = np.isfinite(run.covariances).all(axis=(1, 2))
         assert known[[0, 1, 3]].tolist() == [True, True, False]
         # After the outlier the observer is far from the last measurement, too.
-        outlier, missing = estimator("noise", loss), estimator("noise", loss)
+        outlier, missing = of_loss("noise", loss), of_loss("noise", loss)
         outlier.run([0.0, 1e11, 0.0])
         missing.run([0.0, None, None])
         np.testing.assert_allclose(

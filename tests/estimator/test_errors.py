@@ -186,10 +186,9 @@ def correction(z, v):
 
 
 def scalar(f=lambda x: 0.9 * x, h=lambda x: x, observer=None, **slopes):
-    return qpmhe.MovingHorizonEstimator(
+    return estimator(
         qpmhe.System(f, h, n=1, p=1, **slopes), observer or qpmhe.Luenberger([0.5]),
-        qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0), horizon=4,
-        initial_state=[1.0],
+        cost_of(1, 1, disturbance=10.0), horizon=4, initial_state=[1.0],
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 import qpmhe
 
 from .same import assert_same
+from .spoil import cost_of, estimator
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 
@@ -41,10 +42,10 @@ def watched(mhe):
 def test_the_candidate_is_that_of_a_replay(where, how, seed):
     generator, start = np.random.default_rng(seed), np.ones(1)
     mhe, full, resumed = (
-        qpmhe.MovingHorizonEstimator(
+        estimator(
             failing_system(where, how), qpmhe.Luenberger([[0.5]]),
-            qpmhe.QuadraticCost(prior=1.0, disturbance=2.0, noise=0.3), horizon=4,
-            initial_state=start, candidate="reinitialized", max_qps=seed, warm_start=bool(seed),
+            cost_of(1, 1, disturbance=2.0, noise=0.3), horizon=4, initial_state=start,
+            candidate="reinitialized", max_qps=seed, warm_start=bool(seed),
         ) for _ in range(3)
     )
     came = watched(mhe)

@@ -125,31 +125,6 @@ def test_a_large_linear_penalty_of_a_ball_is_exact_from_its_centre():
     assert compared
 
 
-def test_hard_constraints_hold_or_are_named():
-    """Rows on missing outputs do not count."""
-    hard, named, kept = {"constraints": [Constraint(ball), Constraint(within, 2)]}, 0, 0
-    ys = record()
-    ys[5:12, 1] = np.nan
-    dropping, keeping = make(hard, max_qps=3), make(hard, infeasible="keep_candidate")
-    for y in ys:
-        estimate = dropping.update(y)
-        first = estimate.time + 1 - len(estimate.disturbances)
-        missed = set()
-        for i, x in enumerate(estimate.trajectory):
-            values = [ball(x)]
-            if i < len(estimate.disturbances) and np.isfinite(estimate.noises[i]).all():
-                values += within(estimate.disturbances[i], estimate.noises[i]).tolist()
-            missed |= {(j, first + i) for j, value in enumerate(values) if value > 1e-6}
-        if estimate.improved:
-            assert missed == {(row.row, row.time) for row in estimate.dropped}
-        named += bool(estimate.dropped)
-        other = keeping.update(y)
-        kept += Status.CANDIDATE_OUTSIDE in other.status and not other.dropped
-    assert min(named, kept) > 0
-    mhe = make({"constraints": [Constraint(lambda v: 0.1 - v[0])]})
-    assert not any(Status.CANDIDATE_OUTSIDE in mhe.update(None).status for _ in range(3))
-
-
 @pytest.mark.parametrize(("bad", "penalty"), [
     ("raise", {}), ("exit", {"linear": 5.0}), ("nan", {"linear": 5.0}), ("shape", {}),
 ])

@@ -12,7 +12,9 @@ from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import EngineWarning, OptionError
 from qpmhe.model.tracing import traced
 
+from . import spoil
 from .same import Interruption
+from .spoil import cost_of
 
 ZOO = qpmhe.models.catalogue()
 ENGINES = ["python", "compiled"] if find_compiler() else ["python"]
@@ -166,10 +168,9 @@ class Plant:
 
 
 def estimator(system, engine="python", **options):
-    cost = qpmhe.QuadraticCost(prior=np.eye(2), disturbance=10.0 * np.eye(2), noise=4.0)
-    return qpmhe.MovingHorizonEstimator(
-        system, qpmhe.Luenberger([0.4, 0.1]), cost, horizon=5, initial_state=[1.0, -1.0],
-        max_qps=2, engine=engine, **options,
+    return spoil.estimator(
+        system, qpmhe.Luenberger([0.4, 0.1]), cost_of(disturbance=10.0 * np.eye(2), noise=4.0),
+        horizon=5, initial_state=[1.0, -1.0], max_qps=2, engine=engine, **options,
     )
 
 
