@@ -161,13 +161,13 @@ class Watcher:
             return ahead + self.gain @ v, None
         if self.kind == "injection":
             return ahead + self.gain @ (v / (1.0 + 0.1 * np.abs(v))), None
+        Q = self.one.G @ np.linalg.inv(sample.disturbance) @ self.one.G.T
         if self.kind == "steady":
             K = np.where(there, self.gain, 0.0)
             closed = self.A - K @ self.C
-            return ahead + self.gain @ v, closed @ P @ closed.T + self.Q + K @ R @ K.T
+            return ahead + self.gain @ v, closed @ P @ closed.T + Q + K @ R @ K.T
         _, cross, S, spread = self._joint(z, P, sample, there)
         K = cross @ np.linalg.inv(S + R[there][:, there])
-        Q = self.one.G @ np.linalg.inv(sample.disturbance) @ self.one.G.T
         return ahead + K @ v[there], spread - K @ cross.T + Q
 
 

@@ -184,9 +184,11 @@ class Problem:
             elif name == "disturbances" and rng.random() < 0.15:
                 low[j] = high[j] = 0.0
             rows, side = np.zeros((0, d)), NONE
-            if "rows" in self.has and rng.random() < 0.5:
+            if "rows" in self.has and rng.random() < 0.5 and d > 1:  # else they are bounds
                 rows = rng.standard_normal((2, d))
-                side = np.quantile(points @ rows.T, 0.9, axis=0)
+                inside = np.clip(middle, low, high) @ rows.T  # so that the set is not empty
+                room = 0.3 * np.abs(rows) @ sizes
+                side = np.maximum(np.quantile(points @ rows.T, 0.9, axis=0), inside + room)
             self.sets[name] = low, high, rows, side
             if "soft" in self.has and rng.random() < 0.6 and (low < high).all():
                 self.prices[name] = self.draw_prices(d + len(side))
@@ -476,12 +478,11 @@ class Problem:
                 W, self.shape, self.threshold * root, **each, graduation=self.graduation
             ),
         }[self.loss]
-        terms = {
-            name: loss(getattr(cost, name)) if name in self.robust else getattr(cost, name)
-            for name in ("prior", "disturbance", "noise")
-        }
-        if self.from_observer:
-            terms["prior"] = cost.observer_prior
+        terms = {"disturbance": cost.disturbance}
+        terms["prior"] = cost.observer_prior if self.from_observer else cost.prior
+        for name in self.robust:
+            if (name, self.from_observer) != ("prior", True):
+                terms[name] = loss(getattr(cost, name))
         return system, observer, qpmhe.RobustCost(**terms, discount=self.discount)
 
     def estimator(self, units=None, **options):

@@ -151,5 +151,5 @@ MISTAKES = {
 def test_a_mistake_is_noticed(monkeypatch, name):
     make, words = MISTAKES[name]
     monkeypatch.setattr(*make())
-    _, failures = fuzz(800, 1, source="numpy", writing="batched", until=words)
+    _, failures = fuzz(800, 2, source="numpy", writing="batched", until=words)
     assert any(words in failure for failure in failures)
