@@ -43,15 +43,13 @@ def fences(page):
 
 def same(found, expected):
     """Equal words, and numbers equal up to 2 % and one unit of the last decimal told."""
-    if NUMBER.sub("#", found).split() != NUMBER.sub("#", expected).split():
-        return False
-    for one, other in zip(NUMBER.findall(found), NUMBER.findall(expected), strict=True):
+    equal = NUMBER.sub("#", found).split() == NUMBER.sub("#", expected).split()
+    for one, other in zip(NUMBER.findall(found), NUMBER.findall(expected), strict=equal):
         mantissa, _, power = other.partition("e")
         decimals = len(mantissa.partition(".")[2])
         unit = 10.0 ** (int(power or 0) - decimals) if decimals else 0.0
-        if not abs(float(one) - float(other)) <= 0.02 * abs(float(other)) + unit:
-            return False
-    return True
+        equal = equal and abs(float(one) - float(other)) <= 0.02 * abs(float(other)) + unit
+    return equal
 
 
 @pytest.fixture
@@ -91,16 +89,14 @@ def test_page_runs(page, tmp_path, monkeypatch, registered_backends):
             continue
         if following and following[0][1] == OUTPUT:
             told = following[0][2]
-        assert same(printed.getvalue(), told), (
-            f"{page}:{line} printed\n{printed.getvalue()}\nand the page says\n{told}"
-        )
+        found = printed.getvalue()
+        assert same(found, told), f"{page}:{line} printed\n{found}\nand the page says\n{told}"
 
 
 def test_outputs_are_compared():
     for found, expected, verdict in (
         ("a 1.00 b", "a 1.01  b\n", True), ("a 1.00", "a 1.05", False), ("a 1", "b 1", False),
-        ("7", "8", False), ("0.3 0.4", "0.3", False), ("x1 0.001", "x1 0.000", True),
-        ("3.0e-09", "1.0e-09", False), ("-0.30", "0.30", False),
+        ("0.3 0.4", "0.3", False), ("x1 0.001", "x1 0.000", True), ("-0.30", "0.30", False),
     ):
         assert same(found, expected) is verdict
 
@@ -116,13 +112,9 @@ def test_links_lead_somewhere_and_every_page_is_in_the_navigation():
     assert sorted(re.findall(r"([\w/-]+\.md)", nav)) == PAGES
 
 
-def referenced():
-    pages = "".join(page.read_text() for page in sorted((DOCS / "reference").glob("*.md")))
-    return re.findall(r"^::: (qpmhe[\w.]*)$", pages, flags=re.MULTILINE)
-
-
 def test_the_reference_holds_every_public_name_and_no_other():
-    names = referenced()
+    pages = "".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
+    names = re.findall(r"^::: (qpmhe[\w.]*)$", pages, flags=re.MULTILINE)
     for name in names:
         module, _, attribute = name.rpartition(".")
         assert hasattr(importlib.import_module(module), attribute), name
@@ -132,9 +124,6 @@ def test_the_reference_holds_every_public_name_and_no_other():
             name for name in module.__all__ if isinstance(getattr(module, name), types.ModuleType)
         }
         assert set(module.__all__) - modules - {"__version__"} <= names
-
-
-FETCHED = {"src", "srcset", "data", "poster"}
 
 
 class Built(HTMLParser):
@@ -147,7 +136,8 @@ class Built(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.formulas += tag == "math"
-        self.fetched += [value for name, value in attrs if name in FETCHED]
+        fetched = ("src", "srcset", "data", "poster")
+        self.fetched += [value for name, value in attrs if name in fetched]
         if tag == "link":
             self.fetched.append(dict(attrs)["href"])
         if tag in ("code", "script", "style"):

@@ -177,7 +177,7 @@ class _Cluster:
 
     def _refused(self, error: Exception) -> StudyError:
         return StudyError(
-            f"the scheduler is {self._address!r}, which gives no Dask workers "
+            f"the scheduler is {shown(self._address)}, which gives no Dask workers "
             f"({str(error) or type(error).__name__}); start one with 'dask scheduler' and workers "
             "with 'dask worker ADDRESS --nthreads 1', and give the address that it shows, such as "
             "tcp://10.0.0.1:8786."

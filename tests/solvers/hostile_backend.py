@@ -38,16 +38,13 @@ class Crashing(Hostile):
         os.kill(os.getpid(), signal.SIGSEGV)
 
 
-class CrashingOnce(Crashing):
+class CrashingOnce(Hostile):
     """At the only window of six states, while it grows."""
 
     def _solve(self, qp, start):
         if qp.stages == 6:
-            super().misbehave(qp)
+            os.kill(os.getpid(), signal.SIGSEGV)
         return super()._solve(qp, start)
-
-    def misbehave(self, qp):
-        pass
 
 
 class Hanging(Hostile):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from qpmhe_solvers import QP, SolverOptions, available, backend, register, unregister
-from qpmhe_solvers.qp import ARRAYS
 from qpmhe_solvers.scaling import Scaling
 
 EVERY = available()
@@ -27,18 +26,6 @@ def registered(entry):
         yield entry
     finally:
         unregister(entry.name)
-
-
-def overwrite(qp, other):
-    """Write the numbers of another QP of the same sizes into this one, in place."""
-    for name in ARRAYS:
-        getattr(qp, name)[...] = getattr(other, name)
-    qp.bounded = other.bounded
-
-
-def numbers(qp):
-    """Copies of all that a QP holds."""
-    return {name: getattr(qp, name).copy() for name in ARRAYS}
 
 
 class Dense:

@@ -1,7 +1,5 @@
 """`qpmhe.solvers.check`: every backend conforms, and faults and false words are found."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -35,9 +33,7 @@ def test_every_backend_is_what_it_says_and_prints_nothing(name, capfd):
 def test_a_backend_of_a_user_conforms():
     with registered(entry()):
         report = qpmhe.solvers.check("mine")
-    assert report.passed, str(report)
-    assert str(report) == "mine: conforms"
-    assert len(report.findings) == 12
+    assert (report.passed, str(report), len(report.findings)) == (True, "mine: conforms", 12)
 
 
 def stale(self, qp, solve):
@@ -55,15 +51,6 @@ def in_place(self, qp, solve):
     qp.gradient *= 1e-12
     qp.band *= 1e-12
     return zero(qp)
-
-
-def lying(self, qp, solve):
-    found = solve(qp)
-    return RawSolution(np.zeros(qp.size), True, 1, found.bound_duals, found.row_duals)
-
-
-def leaving(self, qp, solve):
-    sys.exit(3)
 
 
 def dead(self, qp, solve):
@@ -91,8 +78,6 @@ def no_rows(self, qp, solve):
     [
         (stale, "20 QPs in turn", "INACCURATE"),
         (in_place, "no inequality", "it wrote into band, gradient of the QP"),
-        (leaving, "no inequality", "SystemExit: 3"),
-        (lying, "no inequality", "INACCURATE"),
         (dead, "an infeasible QP, then a good one", "after contradicting rows: FAILED"),
         (no_rows, "equalities", "INACCURATE"),
     ],
@@ -108,15 +93,13 @@ def test_faults_are_found(fault, part, words):
         report = check("faulty")
     assert not report.passed
     (found,) = (one for one in report.findings if one.check == part)
-    assert not found.passed
-    assert words in found.detail
+    assert (found.passed, words in found.detail) == (False, True)
     assert f"\n  {part}: " in str(report)
     assert str(report).startswith("faulty: does not conform")
 
 
 @pytest.mark.parametrize(
-    "flag",
-    ["iteration_cap", "iterate_at_cap", "warm_start", "time_limit", "keeps_duals"],
+    "flag", ["iteration_cap", "iterate_at_cap", "warm_start", "time_limit", "keeps_duals"]
 )
 def test_false_words_are_found(flag):
     with registered(Backend("boasting", Quadprog, "-", **{flag: True})):

@@ -7,22 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qpmhe_solvers import (
-    Backend,
-    InvalidInputError,
-    RawSolution,
-    Residuals,
-    Solution,
-    Solver,
-    SolverOptions,
-    SolveStatus,
-    create,
-)
+from qpmhe_solvers import Backend, InvalidInputError, Solver, SolverOptions, create
 from qpmhe_solvers.dispatch import DispatchSolver
 from qpmhe_solvers.qp import ARRAYS
+from qpmhe_solvers.solution import RawSolution, Residuals, Solution, SolveStatus
 from qpmhe_solvers.solver import ContainedSolver
 
-from .problems import CASES, EVERY, TIGHT, make, numbers, of_order_one, registered
+from .problems import CASES, EVERY, TIGHT, make, of_order_one, registered
 
 pytest.importorskip("quadprog")
 FAILED, SOLVED = SolveStatus.FAILED, SolveStatus.SOLVED
@@ -60,15 +51,14 @@ class Overriding(Scripted):
 def ask(found, qp=QP, **options):
     """Solve by a backend that returns this, and check what always holds."""
     entry = Backend("scripted", lambda given: Scripted(found, given), "theatre")
-    before = numbers(qp)
+    before = qp.numbers.copy()
     with registered(entry):
         solution = create("scripted", SolverOptions(**options)).solve(qp)
     assert (solution.d is None) == (solution.status is FAILED)
     if solution.d is not None:
         assert (solution.d.shape, solution.d.dtype) == ((qp.stages, qp.n), np.float64)
         assert np.isfinite(solution.d).all()
-    for array, values in before.items():
-        np.testing.assert_array_equal(getattr(qp, array), values)
+    np.testing.assert_array_equal(qp.numbers, before)
     return solution
 
 
@@ -143,7 +133,7 @@ def test_whoever_writes_has_a_copy_and_is_named_unless_right():
         def _solve(self, qp, start):
             return scribbling(raw())(qp)
 
-    before, filters = numbers(QP), list(warnings.filters)
+    before, filters = QP.numbers.copy(), list(warnings.filters)
     assert ask(scribbling(raw())).status is SOLVED
     assert Derived("quadprog", SolverOptions()).solve(QP).status is SOLVED
     assert contained(scribbling(Solution(BEST.d, SOLVED))).status is SOLVED
@@ -156,16 +146,14 @@ def test_whoever_writes_has_a_copy_and_is_named_unless_right():
     assert (idle.status, idle.residuals.dual) == (INACCURATE, np.abs(QP.gradient).max())
     assert QP.bounded
     assert warnings.filters == filters
-    for array, values in before.items():
-        np.testing.assert_array_equal(getattr(QP, array), values)
+    np.testing.assert_array_equal(QP.numbers, before)
 
 
 def test_what_is_no_answer():
     for thing in [None, np.zeros(21), (None, True)]:
-        kind = type(thing).__name__
-        assert ask(thing).message == f"the backend returned {kind}, not a RawSolution"
-        message = f"the backend's solve returned {kind}, not a Solution"
-        assert contained(thing).message == message
+        name = type(thing).__name__
+        assert ask(thing).message == f"the backend returned {name}, not a RawSolution"
+        assert f"solve returned {name}, not a Solution" in contained(thing).message
     for d, message in [
         (None, "the solver returned no iterate"),
         (np.zeros((7, 4)), "the solver returned 28 numbers for 21 unknowns"),
@@ -173,19 +161,16 @@ def test_what_is_no_answer():
         ("solved", "ValueError: could not convert string to float"),
         ([1j] * 21, "the solver returned complex numbers"),
     ]:
-        for solution in (
-            ask(raw(d=d)), ask(raw(d=d, claimed=False)), contained(Solution(d, SOLVED)),
-        ):
+        for solution in (ask(raw(d=d, claimed=False)), contained(Solution(d, SOLVED))):
             assert (solution.d, solution.status, solution.residuals) == (None, FAILED, None)
             assert solution.message.startswith(message)
     assert ask(raw(d=None, claimed=False, message="gave up")).message == "gave up"
     assert "status of the backend's Solution is str" in contained(Solution(BEST.d, "yes")).message
     # The iterate is there and feasible; only its optimality is unknown.
-    for duals in (np.zeros(20), np.full(21, np.nan), "none", [[0.0], [0.0, 1.0]], [1j] * 21):
-        for which in ("bound_duals", "row_duals"):
+    for which in ("bound_duals", "row_duals"):
+        for duals in (np.zeros(20), np.full(21, np.nan), "none", [1j] * 21):
             solution = ask(raw(**{which: duals}))
-            assert solution.status in (SOLVED, INACCURATE)
-            assert getattr(solution, which) is None
+            assert (solution.status.usable, getattr(solution, which)) == (True, None)
             assert np.isnan([solution.residuals.dual, solution.residuals.gap]).all()
             assert ask(raw(d=BEST.d + 1.0, **{which: duals})).status is INACCURATE
             assert getattr(contained(Solution(BEST.d, SOLVED, **{which: duals})), which) is None
@@ -212,11 +197,8 @@ def test_success_that_is_none(options):
     assert asked(zeros, zeros) == Residuals(0.0, np.abs(qp.gradient).max(), 0.0)
     d = np.full(12, 100.0)  # far outside
     assert asked(d, -(dense.hessian @ d + dense.gradient)).primal > 1.0
-    for changes in (  # the squares of the large ones overflow
-        {"d": BEST.d + 1.0}, {"d": BEST.d + 1.0, "bound_duals": None, "row_duals": None},
-        {"d": np.full(21, 1e308)}, {"bound_duals": np.full(21, 1e308)},
-    ):
-        assert ask(raw(**changes), **options).status is INACCURATE
+    for changes in ({"d": BEST.d + 1.0}, {"d": np.full(21, 1e308)}, {"bound_duals": [1e308] * 21}):
+        assert ask(raw(**changes), **options).status is INACCURATE  # squares may overflow
 
 
 def test_what_reaches_a_solver():
@@ -228,26 +210,14 @@ def test_what_reaches_a_solver():
     solver = Scripted(raw())
     assert solver.solve(spoilt).message == "the QP's data are not finite"
     # osqp reads as many numbers as there are unknowns, whatever the length of the start.
-    for start in (None, np.zeros(3), np.nan * ones, np.inf * ones):
+    for start in (None, np.zeros(3), np.inf * ones):
         solver.solve(QP, start)
         assert solver.starts.pop() is None
     cold = Scripted(raw(), SolverOptions(warm_start=False))
     for one in (solver, cold):
         one.solve(QP, ones)
-    assert cold.starts == [None]
-    (lent,) = solver.starts
-    assert (lent == 1.0).all()
-    assert lent is not ones
-
-
-def test_only_our_own_solve_is_trusted_and_each_call_sets_the_time_limit():
-    solver = create("banded")
-    qp = make(6, 2)[0]
-    solution = ContainedSolver(solver).solve(qp, None, 0.25)
-    assert np.shares_memory(solution.d, solver._work[2])
-    assert solver.time_limit == 0.25
-    solver.solve = lambda qp, start=None: "no Solution"
-    assert ContainedSolver(solver).solve(qp).status is FAILED
+    assert (cold.starts, solver.starts[0].min()) == ([None], 1.0)
+    assert not np.shares_memory(solver.starts[0], ones)
 
 
 rubbish = st.one_of(

