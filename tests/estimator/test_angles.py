@@ -57,13 +57,13 @@ def needle(system, observer="luenberger", start=180.0, **options):
 def test_nothing_is_lost_across_the_seam(observer):
     """Beside an angle that goes on beyond half a turn."""
     def f(x):
-        return np.stack((x[..., 0] + x[..., 1] + 115.0, 0.9 * x[..., 1]), axis=-1)
+        return np.stack((x[..., 0] + x[..., 1] + 180.0, 0.9 * x[..., 1]), axis=-1)
 
     options = {"candidate": "reinitialized", "arrival": "smoothed"}
     plain = needle(qpmhe.System(f, lambda x: x[..., :1], n=2, p=1), observer, **options)
     noise, t = np.random.default_rng(1).normal(0.0, 2.0, 40), np.arange(40)
-    y = (180.0 + 115.0 * t + 12.0 * np.sin(0.2 * t) + noise)[:, None]
-    mhe = needle(compass(turn=115.0), observer, **options)
+    y = (180.0 + 180.0 * t + 12.0 * np.sin(0.2 * t) + noise)[:, None]
+    mhe = needle(compass(turn=180.0), observer, **options)
     for t, sample in enumerate(y):
         one, other = mhe.update(degrees(sample)), plain.update(sample)
         if t % 5 == 4:
