@@ -108,7 +108,8 @@ def rolled_out(one, trajectory, time):
 
 def broken(one, mhe, estimate):
     """Which parts of the promise a step breaks."""
-    faults, status = broken_promise(one, estimate), estimate.status
+    # Scales are shares of deviations, which `set` may have changed in the estimator.
+    faults, status = broken_promise(one, estimate, 10.0 * FEASIBLE), estimate.status
     if Status.MODEL_FAILED in status or Status.FAILED_STAGE in status:
         return faults
     window = one.window(estimate, mhe.hold)  # `fuzz_independent` finds its weight a second time
@@ -124,7 +125,7 @@ def broken(one, mhe, estimate):
     J, missed = window.judged(estimate.trajectory)
     if abs(J - estimate.cost) > CLOSE * (1e-9 + abs(J)):
         faults.append(f"cost {estimate.cost}, not {J}")
-    if missed > 10.0 * FEASIBLE and not estimate.dropped:  # in other units than the estimator's
+    if missed > 10.0 * FEASIBLE and not estimate.dropped:
         faults.append(f"a hard row violated by {missed} and not dropped")
     return faults
 

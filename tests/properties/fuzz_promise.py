@@ -50,7 +50,7 @@ def misses(one, estimate):
     return found.pop("states"), max(found.values())
 
 
-def broken(one, estimate):
+def broken(one, estimate, feasible=FEASIBLE):
     """Which parts of the promise a step breaks."""
     faults, status, x = [], estimate.status, estimate.trajectory
     count = len(x) - 1
@@ -68,7 +68,7 @@ def broken(one, estimate):
     outside, missed = misses(one, estimate)
     projected = one.options["project_observer"] or (estimate.improved and not estimate.dropped)
     # Where trials are rolled out, none of them can be clipped.
-    if projected and outside > (FEASIBLE if one.how else 0.0):
+    if projected and outside > (feasible if one.how else 0.0):
         faults.append(f"outside of X by {outside}")
     if estimate.improved and one.how == "matrix":
         ahead = np.array([
@@ -80,7 +80,7 @@ def broken(one, estimate):
         d = np.where(np.isfinite(period), d - period * np.round(d / period), d)
         if np.abs(d).max() > 1e-12 * (1.0 + np.abs(x).max()):
             faults.append(f"a disturbance in a direction that has none, {np.abs(d).max()}")
-    if estimate.improved and not estimate.dropped and missed > FEASIBLE:
+    if estimate.improved and not estimate.dropped and missed > feasible:
         faults.append(f"a set violated by {missed} and no row dropped")
     return faults
 

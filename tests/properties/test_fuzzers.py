@@ -87,7 +87,7 @@ def test_every_step_is_what_it_says(pytestconfig, source, writing):
 
 
 @pytest.mark.parametrize(
-    ("source", "writing", "seed"), [("numpy", "batched", 3), ("casadi", "compiled", 2)]
+    ("source", "writing", "seed"), [("numpy", "batched", 4), ("casadi", "compiled", 2)]
 )
 def test_states_are_held_as_the_formulas_say(source, writing, seed):
     pytest.importorskip(source)
