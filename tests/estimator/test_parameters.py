@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from scipy.optimize import least_squares
 
 import qpmhe
 from qpmhe import Box, Luenberger, MovingHorizonEstimator, QuadraticCost
@@ -128,6 +129,54 @@ def test_noisy_inputs_are_the_kalman_filters_with_their_covariance(noisy, horizo
         np.testing.assert_allclose(estimate.state, [*z, *np.zeros(k)], rtol=1e-9, atol=1e-9)
         found, expected = mhe.covariances()[-1], block_diag(S, Qu)
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9)
+
+
+def tank(x, u):
+    """A level with a pump and a valve, both nonlinear; y sees the valve, too."""
+    return x + 0.1 * (np.tanh(u[..., :1]) - u[..., 1:] * np.sqrt(1.0 + x**2))
+
+
+def gauge(x, u):
+    return x + 0.2 * u[..., 1:] ** 2
+
+
+def test_least_squares_finds_the_minimum_with_noisy_inputs_of_a_nonlinear_plant():
+    """The oracle has the errors themselves as variables, not states: x, e and nothing else."""
+    horizon, rng = 6, np.random.default_rng(4)
+    P, Q, R, Qu = 0.5, 0.001, 0.002, np.array([[0.05, 0.01], [0.01, 0.04]])
+    root = np.linalg.cholesky(Qu)
+    system = qpmhe.noisy_inputs(qpmhe.System(tank, gauge, n=1, p=1, m=2))
+    cost = QuadraticCost.from_covariances(
+        prior=block_diag(P, Qu), disturbance=block_diag(Q, Qu), noise=R
+    )
+    mhe = MovingHorizonEstimator(
+        system, Luenberger([0.2, 0.0, 0.0]), cost, horizon=horizon,
+        initial_state=[1.0, 0.0, 0.0], max_qps=None, tolerance=1e-14,
+    )
+    x, ys, us = np.array([1.5]), [], []
+    for t in range(20):
+        us.append([np.sin(0.3 * t), 0.5])
+        acting = us[-1] + root @ rng.standard_normal(2)
+        ys.append(gauge(x, acting) + np.sqrt(R) * rng.standard_normal(1))
+        x = tank(x, acting) + np.sqrt(Q) * rng.standard_normal(1)
+        estimate = mhe.update(ys[-1], us[-1])
+        prior, y, u = estimate.candidate[0], np.array(ys[-horizon:]), np.array(us[-horizon:])
+
+        def residuals(unknown, prior=prior, y=y, u=u):
+            x, e = unknown[: len(y) + 1, None], unknown[len(y) + 1 :].reshape(-1, 2)
+            off = e - np.vstack((prior[1:], np.zeros((len(y) - 1, 2))))
+            return np.concatenate((
+                (x[0] - prior[0]) / np.sqrt(P), np.linalg.solve(root, off.T).ravel(),
+                (x[1:] - tank(x[:-1], u + e)).ravel() / np.sqrt(Q),
+                (y - gauge(x[:-1], u + e)).ravel() / np.sqrt(R),
+            ))
+
+        start = np.concatenate((estimate.candidate[:, 0], estimate.candidate[:-1, 1:].ravel()))
+        best = least_squares(residuals, start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        assert estimate.cost <= estimate.candidate_cost
+        assert estimate.cost == pytest.approx(2.0 * best.cost, rel=1e-8)
+        found = np.concatenate((estimate.trajectory[:, 0], estimate.trajectory[:-1, 1:].ravel()))
+        np.testing.assert_allclose(found, best.x, atol=1e-6)
 
 
 # Parameters that a window does not see are held, without drift and without getting stiff.
