@@ -136,6 +136,7 @@ OWN = {"batch_reactor", "pendulum"}
 STATED = OWN | {"van_der_pol", "cstr", "battery_cell", "vehicle"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(STATED))
 def test_a_model_with_a_stated_region_has_a_bound_that_is_smaller(name, tmp_path):
     report, n = tmp_path / "it.json", qpmhe.models.catalogue()[name]().system.n

@@ -159,6 +159,7 @@ def true_cost(plan, estimate, x, w, v):
     return plan.discount**K * own + plan.discount ** np.arange(K - 1.0, -1.0, -1.0) @ stages
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 @pytest.mark.parametrize(
     "make", [scalar, swap, bent_output], ids=lambda make: make.__name__

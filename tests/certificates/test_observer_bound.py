@@ -42,6 +42,7 @@ def corners(sides):
     return np.array(list(itertools.product(*zip(sides.lower, sides.upper, strict=True))))
 
 
+@pytest.mark.slow
 def test_no_adversary_exceeds_the_bound(four, pytestconfig):
     """Each takes the w and v, of all extreme ones, that take the error farthest in P."""
     bound, system = four

@@ -75,6 +75,7 @@ def estimates(one, samples, folder, flags, real="double"):
 SOME = [name for table in FEATURES.values() for name in list(table)[::7]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(6))
 def test_the_compiled_step_is_clean(part, tmp_path):
     """Under sanitizers, in a process that loads them first: samples of all sorts, and wild ones."""
@@ -120,6 +121,7 @@ def test_compiles_without_warnings(name, tmp_path):
     assert set(re.findall(r"^#include (.*)", source.read_text(), re.M)) <= HEADERS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mixed losses", "states in both"])
 def test_levels_differ_by_contraction_only(name, tmp_path):
     """Without contraction of a * b + c to one rounding, all levels give the same bits.

@@ -39,6 +39,7 @@ def run(folder):
     return (folder / "page.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_page_is_filled_from_cells_that_are_run_once(tmp_path):
     from choice_studies import studies
     from choice_tables import Figures
