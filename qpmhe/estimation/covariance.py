@@ -10,8 +10,8 @@ from ..errors import InvalidInputError
 from ..model.system import System
 
 Array = NDArray[np.float64]
-# Of the variance before smoothing: below this share, fewer than three digits are left of it.
-_LEAST = 1e-13
+# Of the variance before smoothing: below this share, hardly a digit is left of it.
+_LEAST = 1e-14
 _LOST = (
     "the covariances are not defined along the estimate: the weights of prior, disturbance and "
     "noise there leave a direction of the states (nearly) undetermined. A redescending loss "
