@@ -41,9 +41,8 @@ class Jacobian:
     """The Jacobian with respect to x of a `BatchedFunction` with vector values.
 
     Steps are fractions of the states' magnitudes, which are 1 until `use_scales` sets them; a given
-    Jacobian is compared with differences only from then on. Where it is not finite, as that of a
-    square root on the bound 0 is not, it is taken a small step inside the bounds of X, as
-    differences are.
+    Jacobian is compared with differences only from then on. Where it is not finite on a bound of X
+    (a square root's at 0, for example), it is taken a small step inside.
 
     Attributes
     ----------
