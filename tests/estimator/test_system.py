@@ -69,6 +69,16 @@ def test_inputs():
         check_values(system.h, lambda x, u: np.array([x[0] * u[0] + u[1]]), 2, 2)
 
 
+def test_rounding_in_odd_units_hides_no_batch():
+    """A state of size 1 is far off for a model in nanometres, and a sine of sums all rounding."""
+    weights = np.random.default_rng(3).standard_normal((40, 40))
+    system = qpmhe.System(lambda x: np.sin(1e9 * (x @ weights)), lambda x: x[:1], n=40, p=1)
+    x = np.random.default_rng(4).uniform(-1e-9, 1e-9, (5, 40))
+    assert system.f.mode == "batched"
+    np.testing.assert_allclose(
+        system.f.batch(x, np.zeros((5, 0))), [np.sin(1e9 * (one @ weights)) for one in x], 1e-12)
+
+
 def test_what_is_no_clear_input_is_refused():
     for f, words in (
         (lambda x: x, "neither f nor h takes an input"),
