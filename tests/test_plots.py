@@ -68,6 +68,8 @@ def test_estimates_of_angles_are_drawn_on_the_turn_of_the_truth():
     panel = plots.states(run, truth=record.states, residual=system.state_residual)[2]
     drawn = lines(panel)
     assert np.abs(drawn["estimate"][:, 1] - drawn["truth"][:, 1]).max() < 1.0
+    low, high = extents(panel.collections[0])[:, 1]
+    assert low < drawn["estimate"][1:, 1].min() < drawn["estimate"][1:, 1].max() < high
 
 
 def test_time_is_in_seconds_where_the_step_is_known(case, monkeypatch):

@@ -13,6 +13,7 @@ import pytest
 import qpmhe
 from adapters import twins
 from adapters.twins import LANGUAGES, STEPS, THETA, M, N, P, made, plain, points
+from qpmhe import Status
 from qpmhe.errors import InvalidInputError
 
 # Those that evaluate by code of another package, and those whose functions pickle.
@@ -70,6 +71,25 @@ def test_parameters_and_noisy_inputs_as_states(language, kind, way):
     if way != "discrete":
         longer = np.hstack((us, np.full((len(us), 1), 0.25)))
         twins.check(system.timed, lambda z, v: values(z, v[:-1], v[-1].real), zs, longer)
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_angles_go_along(language):
+    turn, estimates = 2.0 * np.pi, []
+    angles = {"state_residual": qpmhe.angles([2]), "output_residual": qpmhe.angles([1])}
+    system = LANGUAGES[language](**twins.TIMING["rk4"], **angles)
+    assert {name: getattr(system, name) for name in angles} == angles
+    for turns in (0, 3):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger(np.full((N, P), 0.05)),
+            qpmhe.QuadraticCost(prior=np.eye(N), disturbance=np.eye(N), noise=np.eye(P)),
+            horizon=4, initial_state=[0.0, 0.1, 0.3, 0.2], max_qps=2,
+        )
+        for k, u in enumerate(points(8)[1]):
+            estimate = mhe.update([0.1 * k, 0.2 + turns * turn * (k % 2)], u)
+        estimates.append(estimate)
+    assert Status.IMPROVED in estimates[0].status
+    np.testing.assert_allclose(estimates[1].state, estimates[0].state, 0.0, 1e-9)
 
 
 @pytest.mark.parametrize("language", FOREIGN)

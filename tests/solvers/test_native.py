@@ -1,7 +1,9 @@
 """Solvers that keep workspaces and arrays: set up once for a structure, and nothing left over."""
 
 import copy
+import gc
 import pickle
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -199,3 +201,21 @@ def test_a_wrong_active_set_does_not_stop_daqp():
     best = solution.d
     for start in (best + 100.0, np.where(best > 0, 1e6, -1e6)):
         np.testing.assert_allclose(solver.solve(qp, start).d, best, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*NATIVE, *{"qpsolvers:daqp", "quadprog"} & set(EVERY)])
+def test_a_solve_leaves_no_memory_behind(name):
+    solver, (qp, _) = create(name), make(**CASES["boxes"])
+
+    def held_after(solves):
+        for _ in range(solves):
+            assert solver.solve(qp).d is not None
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    try:
+        before = held_after(60)
+        assert held_after(300) - before < 40_000  # bytes: no array a solve
+    finally:
+        tracemalloc.stop()

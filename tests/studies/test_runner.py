@@ -16,6 +16,7 @@ from solvers.problems import registered
 import qpmhe_solvers
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.studies import Store, StoreError, Study, StudyError, run, runner
+from qpmhe.studies import store as store_module
 from qpmhe.studies.store import Writer
 
 from .report_study import command
@@ -67,6 +68,26 @@ def test_a_study_runs_once_and_more_cells_are_added(path, handed):
     assert list(more["finished"])[:4] == list(frame["finished"])
 
 
+def test_a_full_disk_is_reported_and_the_same_call_goes_on(path, monkeypatch):
+    plain = store_module._create
+
+    def small(connection):
+        plain(connection)
+        (pages,) = connection.execute("PRAGMA page_count").fetchone()
+        connection.execute(f"PRAGMA max_page_count = {pages + 3}")
+
+    study = Study(**{**SMALL, "seeds": 20})
+    with monkeypatch.context() as patched:
+        patched.setattr(store_module, "_create", small)
+        with pytest.raises(StoreError, match="disk is full; all cells that were stored are safe"):
+            run(study, path, progress=False)
+    before = Store(path).frame()
+    assert 0 < len(before) < 40
+    after = run(study, path, progress=False).frame()
+    assert sorted(after["key"]) == sorted(cell.key for cell in study.cells())
+    assert list(after["finished"][: len(before)]) == list(before["finished"])
+
+
 def test_a_backend_that_crashes_is_isolated_and_the_qp_is_kept(path, tmp_path):
     banded = qpmhe_solvers.backend("banded")
     mine = qpmhe_solvers.Backend("mine", lambda options: banded.factory(options), "banded")
@@ -94,6 +115,7 @@ def test_a_backend_that_crashes_is_isolated_and_the_qp_is_kept(path, tmp_path):
 _WRITE = """
 import sys, time
 from qpmhe.studies import Study, run
+from qpmhe.studies import store as store_module
 from qpmhe.studies.store import Writer
 
 put = Writer.put
