@@ -241,7 +241,8 @@ def main() -> None:
     }
     axes = trajectories(
         DT * np.arange(1.0, arguments.steps + 1), truth[:, [3, 5, 8]], drawn,
-        ("speed of disc 1 (rad/s)", "of disc 3 (rad/s)", "inertia (1e-4 kg m²)"), "time t (s)",
+        ("speed of disc 1 (rad/s)", "speed of disc 3 (rad/s)", "inertia (1e-4 kg m²)"),
+        "time t (s)",
     )
     for path in save(axes[0].figure, arguments.out / "do_mpc_masses"):
         console.print(f"wrote {path}")
