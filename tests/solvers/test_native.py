@@ -203,7 +203,7 @@ def test_a_wrong_active_set_does_not_stop_daqp():
         np.testing.assert_allclose(solver.solve(qp, start).d, best, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", [*NATIVE, *{"qpsolvers:daqp", "quadprog"} & set(EVERY)])
+@pytest.mark.parametrize("name", [*NATIVE, *sorted({"qpsolvers:daqp", "quadprog"} & {*EVERY})])
 def test_a_solve_leaves_no_memory_behind(name):
     solver, (qp, _) = create(name), make(**CASES["boxes"])
 
