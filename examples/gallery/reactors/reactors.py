@@ -218,15 +218,18 @@ def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Fi
             by_name = {one.estimator: one for one in found}
             which = by_name["EKF"].which
             truth = problem.records[which].truth
+            tops = np.max(truth, axis=0)
+            # A filter that is lost leaves the panels, instead of filling them with its swings.
+            drawn = {name: by_name[name].estimates[which] for name in SHOWN}
+            drawn = {name: np.where(abs(x) < 20.0 * tops, x, np.nan) for name, x in drawn.items()}
             panels = list(axes[: len(reactor.species)])
             trajectories(
                 reactor.dt * np.arange(float(reactor.steps)), truth,
-                {name: by_name[name].estimates[which] for name in SHOWN},
-                [f"{name} ({reactor.unit})" for name in reactor.species],
+                drawn, [f"{name} ({reactor.unit})" for name in reactor.species],
                 "time t (unit of the rate constants)", axes=panels,
             )
             panels[0].set_title(reactor.title)
-            for panel, top in zip(panels, np.max(truth, axis=0), strict=True):
+            for panel, top in zip(panels, tops, strict=True):
                 panel.set_ylim(-1.5 * top, 2.5 * top)
                 panel.axhspan(-1.5 * top, 0.0, color="0.92", zorder=0)
             panels[0].get_legend().remove()
