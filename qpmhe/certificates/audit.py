@@ -13,7 +13,7 @@ from ..observers import Observer
 from .branch_and_bound import lipschitz
 from .contraction import gain_if_constant
 from .deadline import Deadline
-from .evidence import CertificateError, Evidence
+from .evidence import CertificateError, Evidence, at_most
 from .inequalities import Matrices, eigenvalue_bounds, norm_bound
 from .regions import Region
 
@@ -52,7 +52,7 @@ def about_slope(
     name, label = {
         "h": ("output Lipschitz", "ass:lipschitz"), "f": ("model Lipschitz", "in place of eq:kappa")
     }[function]
-    text = f"L_{function} = {slope.value:.6g}, {slope.note}"
+    text = f"L_{function} = {at_most(slope.value, 6)}, {slope.note}"
     return Assumption(name, label, True, slope.evidence, text, slope.value)
 
 
@@ -66,7 +66,7 @@ def about_corrections(system: System, observer: Observer) -> tuple[Assumption, A
         return none(True, Evidence.ASSUMED, stated), bound(None, None, stated)
     kappa = float(norm_bound(Matrices.exact(gain[None]))[0])
     return none(True, Evidence.PROVED, "L(z, v) = L v vanishes with v"), bound(
-        True, Evidence.PROVED, f"kappa = |L| = {kappa:.6g}, of a constant gain", kappa
+        True, Evidence.PROVED, f"kappa = |L| = {at_most(kappa, 6)}, of a constant gain", kappa
     )
 
 

@@ -174,7 +174,8 @@ def lipschitz(
             cells.halve(low[left], high[left], _scores(enclosure, left), each[left])
     bound = max(bound, float(cells.inherited.max(initial=0.0)))
     if np.isfinite(bound):
-        return LipschitzConstant(bound, Evidence.PROVED, f"bounded on {cells.taken} cells")
+        note = f"bounded cell by cell, {cells.taken} in all"
+        return LipschitzConstant(bound, Evidence.PROVED, note)
     why = model.reason or f"no bound was found with {cells.taken} cells{model.unknown}"
     note = f"largest of {len(jacobians)} gradients; {why}"
     return LipschitzConstant(seen, Evidence.SAMPLED, note)

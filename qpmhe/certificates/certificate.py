@@ -93,7 +93,10 @@ class Certificate:
     @property
     def failures(self) -> list[str]:
         """What could not be certified, in words."""
-        return [f"{what}: {each}" for what, each in self.errors.items()]
+        return [
+            str(each) if str(each).startswith(what) else f"{what}: {each}"
+            for what, each in self.errors.items()
+        ]
 
     def bound(
         self, run: Run, disturbances: Size | None = None, noises: Size | None = None, *,

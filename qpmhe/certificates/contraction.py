@@ -13,7 +13,7 @@ from ..model.system import System, checked_system
 from ..observers import Luenberger, Observer
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .enclosures import evaluated
-from .evidence import CertificateError, NotCertifiedError
+from .evidence import CertificateError, NotCertifiedError, at_most
 from .inequalities import Matrices, euclidean_constants, norm_bound
 from .properties import Detectability, ObserverStability, sealed
 from .regions import Region, bounded_region
@@ -91,8 +91,8 @@ def certify_detectability(
     )
 
 
-def _undetectable(search: Search, text: str) -> NotCertifiedError:
-    """Why no rate is feasible."""
+def _unseen_mode(search: Search) -> NotCertifiedError | None:
+    """A mode at one of the states that neither decays nor appears in the output, if there is."""
     n, states, outputs = search.n, search.scales.states, search.scales.outputs
     for point, jacobian in zip(search.points, search.jacobians, strict=True):
         A = jacobian[:n] * states / states[:, None]
@@ -114,6 +114,14 @@ def _undetectable(search: Search, text: str) -> NotCertifiedError:
                 ("measure an output that this mode affects",
                  "leave the mode out of the model if it is not to be estimated"),
             )
+    return None
+
+
+def _undetectable(search: Search, text: str) -> NotCertifiedError:
+    """Why no rate is feasible."""
+    unseen = _unseen_mode(search)
+    if unseen is not None:
+        return unseen
     steep = _steepest(search)
     return NotCertifiedError(
         f"{text}: no constant P shows detectability on the whole region, although every single "
@@ -272,7 +280,7 @@ def _radii(search: Search, gain: Array | None = None) -> Array:
 def _unstable(search: Search, text: str) -> NotCertifiedError:
     """Why no rate is feasible."""
     if search.gain is None:
-        return NotCertifiedError(
+        return _unseen_mode(search) or NotCertifiedError(
             "no constant gain is shown to contract on the whole region: the semidefinite program "
             "is infeasible for every rate below 1",
             ("a smaller region", "other coordinates, in which the model is closer to linear"),
@@ -296,10 +304,11 @@ class Synthesis:
     stability: ObserverStability
 
     def __str__(self) -> str:
-        gain = " ".join(np.array2string(self.observer.gain, precision=4, separator=", ").split())
+        gain = [[float(f"{each:.4g}") for each in row] for row in self.observer.gain]
         return (
-            f"Constant gain {gain}: the error contracts at the rate {self.stability.rho:.4g} a "
-            f"sample ({self.stability.evidence}); {'; '.join(self.stability.notes)}."
+            f"Constant gain {gain}: the error contracts at the rate "
+            f"{at_most(self.stability.rho, 4)} a sample, or faster ({self.stability.evidence}); "
+            f"{'; '.join(self.stability.notes)}."
         )
 
 

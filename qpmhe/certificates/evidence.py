@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from decimal import ROUND_CEILING, Context
 from enum import Enum
 from typing import Any
 
@@ -73,6 +74,15 @@ class NotCertifiedError(QpmheError):
 
 class OutOfTimeError(NotCertifiedError):
     """A search that was stopped before it found anything: nothing is known about the property."""
+
+
+def at_most(value: float, digits: int) -> str:
+    """An upper bound with so many digits: a shown bound holds as well as the stored one.
+
+    A number that has no more digits, such as 0.9, is shown as it is.
+    """
+    short = Context(digits, ROUND_CEILING).create_decimal(repr(float(value)))
+    return f"{float(short):.{digits}g}"
 
 
 def json_ready(value: Any) -> Any:

@@ -121,6 +121,12 @@ class Monitor:
                 f"certified is of type {type(certified).__name__}; expected a Certificate or an "
                 "ObserverBound, such as certificate.observer_bound."
             )
+        if not isinstance(estimator, MovingHorizonEstimator):
+            raise InvalidInputError(
+                f"estimator is of type {type(estimator).__name__}; expected the "
+                "MovingHorizonEstimator whose estimates are to be checked; for a run, "
+                "certificate.bound(run, initial_error=...)."
+            )
         self._system = estimator.system
         own = certified.system if isinstance(certified, Certificate) else bound.stability.system
         if own not in (None, self._system):

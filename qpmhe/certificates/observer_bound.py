@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import Array, numbers
+from .._checks import Array, count, numbers
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.estimate import Status
@@ -33,7 +33,7 @@ from ..model.system import System
 from ..observers import Observer
 from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
-from .evidence import Evidence, MismatchError, json_ready
+from .evidence import Evidence, MismatchError, at_most, json_ready
 from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region
 from .properties import ObserverStability
@@ -133,7 +133,11 @@ class ObserverBound:
 
     @property
     def rate(self) -> float:
-        """The contraction per step in the norm of `metric`."""
+        """rho, an upper bound on the factor per step in the norm of `metric`.
+
+        One rho serves both inequalities, and a smaller limit may take a larger rho: the error may
+        contract much faster.
+        """
         return self.stability.rho
 
     @property
@@ -219,7 +223,7 @@ class ObserverBound:
         noises: Size | None = None,
     ) -> Array:
         """b(0), ..., b(T), (T + 1,), from the arguments of `along`."""
-        entering = self.entering(disturbances, noises)
+        entering, steps = self.entering(disturbances, noises), count("steps", steps, 0)
         if entering.ndim > 1 and len(entering) != steps:
             raise ShapeError(
                 f"disturbances and noises have {len(entering)} samples; expected {steps}."
@@ -248,7 +252,7 @@ class ObserverBound:
 
     def components(self, radius: ArrayLike) -> Array:
         """Upper bounds on |x_i - z_i| where |x - z|_P <= radius: (..., n) for (...)."""
-        return np.multiply.outer(np.asarray(radius, np.float64), self.slopes) * OUTWARD
+        return np.multiply.outer(numbers("radius", radius, finite=False), self.slopes) * OUTWARD
 
     def around(self, radius: ArrayLike, observer: Array) -> tuple[Array, Array]:
         """Sides (..., n) of a box that holds the true state: around z, and within the region."""
@@ -380,16 +384,16 @@ class ObserverBound:
 
     @property
     def headline(self) -> str:
-        """The bound in the limit, in the states' units, and after how many samples, in one line."""
+        """The bound in the limit, in the states' units, and how soon it is reached, in one line."""
         limit, after = self.components(self.limit()), self.settling_samples
-        each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {size:.2g}" for i, size in enumerate(limit))
-        when = f" after {after} samples" if after else ""
+        each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {at_most(b, 3)}" for i, b in enumerate(limit))
+        when = f" and at most 10 % more from sample {after} on" if after else ""
         wide = " x ".join(f"{width:.3g}" for width in self._widths)
         vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self._widths))
         nothing = f": it says nothing about {vacuous}" if vacuous else ""
         stays = self.invariance is not None and self.invariance.holds
-        condition = "" if stays else " while x stays in the region"
-        return f"{each}{when} ({self.evidence}{condition}), on a region {wide} wide{nothing}"
+        how = f"{self.evidence}{'' if stays else ' while x stays in the region'}"
+        return f"{each} in the limit{when} ({how}), on a region {wide} wide{nothing}"
 
     @property
     def condition(self) -> str:

@@ -36,6 +36,7 @@ class Report(NamedTuple):
     certificate: Certificate
     simulated: str
     replaced: str  # which observer took the place of the model's own, and why
+    tried: str  # why there is no gain made for the region, where one was looked for in vain
 
 
 def certify_model(
@@ -47,7 +48,7 @@ def certify_model(
     record = None if scenario is None else scenario.simulate(seed)
     place = region_of(system, scenario, region, inputs, record=record)
     horizons, sizes = horizons_of(horizon), sizes_of(system, cost, scenario)
-    observer, stability, replaced = _proved_observer(
+    observer, stability, replaced, tried = _proved_observer(
         system, observer, place, sizes, deadline.part(_OBSERVER)
     )
     certificate = examined(
@@ -65,13 +66,16 @@ def certify_model(
             f"seed {seed}: the largest |x - x_hat| is {errors[held].max():.3g}, and the largest "
             f"bound {band.error[held].max():.3g}; {band}"
         )
-    return Report(certificate, simulated, replaced)
+    return Report(certificate, simulated, replaced, tried)
 
 
 def _proved_observer(
     system: System, observer: Observer, region: Region, sizes: Sizes, deadline: Deadline
-) -> tuple[Observer, ObserverStability | None, str]:
-    """The observer or, where its bound says nothing, one with a gain made for the region; why."""
+) -> tuple[Observer, ObserverStability | None, str, str]:
+    """The observer or, where its bound says nothing, one with a gain made for the region; why.
+
+    And why there is none, where one was looked for in vain.
+    """
     widths, own = (region.upper - region.lower)[: system.n], None
 
     def limits(stability: ObserverStability) -> tuple[Any, bool]:
@@ -85,30 +89,30 @@ def _proved_observer(
         )
         limit, says = limits(own)
         if says:
-            return observer, own, ""
+            return observer, own, "", ""
         why = f"its bound, {np.round(limit, 3).tolist()}, is vacuous in some state"
     except (NotCertifiedError, CertificateError) as error:
         why = str(error.args[0]).split(". ")[0].split(" What may help")[0]
     try:
         made = synthesise_gain(system, region, sizes=sizes.typical(system), seconds=deadline)
-    except (NotCertifiedError, CertificateError):
-        return observer, own, ""
+    except (NotCertifiedError, CertificateError) as error:
+        return observer, own, "", str(error)
     if own is not None and not limits(made.stability)[1]:
-        return observer, own, ""
+        return observer, own, "", "the bound of the one found is vacuous, too"
     return made.observer, made.stability, (
         f"Luenberger({made.observer.gain.tolist()}, metric=P) with the certified P, made for the "
         f"region in place of the model's own: {why}"
-    )
+    ), ""
 
 
 def region_of(
     system: System, scenario: Scenario | None, region: ConvexSet | Region | None = None,
-    inputs: Box | None = None, *, record: Record | None = None, option: str = "region",
+    inputs: Box | None = None, *, record: Record | None = None, option: str = "--box",
 ) -> Region:
     """The set that a model is certified on, and bounds on its inputs.
 
     What is left out is the scenario's; else the system's own X if that is bounded, or a box around
-    the simulated record, and the box around its inputs. Errors name the region by ``option``.
+    the simulated record, and the box around its inputs. Errors name the region's ``option``.
     """
     if record is None and scenario is not None:
         record = scenario.simulate(0)
@@ -117,6 +121,12 @@ def region_of(
     bounded = inputs is not None or isinstance(region, Region)
     if not bounded and record is not None and record.inputs is not None:
         inputs = Box(record.inputs.min(axis=0), record.inputs.max(axis=0))
+    if system.m and inputs is None and not isinstance(region, Region):
+        raise OptionError(
+            f"{option.replace('box', 'input-box')} is missing, and the model has no scenario with "
+            f"inputs; give low:high for each of its {system.m} inputs: certificates hold only for "
+            "inputs within bounds."
+        )
     if region is not None:
         return bounded_region(system, region, inputs)
     if system.states is not None:

@@ -13,7 +13,7 @@ from rich.table import Table
 from .._checks import make_folder
 from ..certificates.certificate import ASSUMED, Certificate
 from ..certificates.deadline import Deadline
-from ..certificates.evidence import NotCertifiedError, json_ready
+from ..certificates.evidence import NotCertifiedError, at_most, json_ready
 from ..certificates.lyapunov import Design, design
 from ..certificates.regions import Region
 from ..certificates.report import Report, certify_model
@@ -104,14 +104,15 @@ def _findings(found: Report) -> Rows:
     rows = [("states", _words(certificate.region))]
     if found.replaced:
         rows.append(("observer", found.replaced))
+    if found.tried:
+        rows.append(("gain", f"none was found for the region: {found.tried}"))
     if proved is not None:
         rows += [("sizes", str(proved.sizes)), ("region", proved.condition)]
         if certificate.system.states is not None and not proved.projects:
-            metric = np.array2string(proved.metric, separator=", ", floatmode="unique")
             rows.append((
                 "projection", "the observer is projected onto X in another metric than the "
-                "certified one, which ends the bound at that sample. Use Luenberger(gain, metric="
-                f"{metric})".replace("\n", "") + " to keep it",
+                "certified one, which ends the bound at that sample. To keep it, use "
+                f"qpmhe.Luenberger({proved.gain.tolist()}, metric={proved.metric.tolist()})",
             ))
     if found.simulated:
         rows.append(("simulated", found.simulated))
@@ -120,8 +121,8 @@ def _findings(found: Report) -> Rows:
         if not limit < certificate.diameter:
             vacuous = f": vacuous, the region's diameter is {certificate.diameter:.3g}"
         rows.append((
-            f"N = {each.horizon}", f"|x - x_hat| <= {limit:.4g} in the limit by the paper's "
-            f"constants ({certificate.evidence}){vacuous}",
+            f"N = {each.horizon}", f"|x - x_hat| <= {at_most(limit, 4)} in the limit by the "
+            f"paper's constants ({certificate.evidence}){vacuous}",
         ))
     return rows
 
@@ -137,8 +138,9 @@ def _details(certificate: Certificate) -> Rows:
     ]
 
     def add(name: str, sums: DecayingSums, symbols: tuple[str, ...], end: str = "") -> None:
-        values = zip(symbols, (*sums.constants, sums.rate), strict=True)
-        rows.append((name, ", ".join(f"{symbol} {value:.4g}" for symbol, value in values) + end))
+        values = (at_most(value, 4) for value in (*sums.constants, sums.rate))
+        pairs = zip(symbols, values, strict=True)
+        rows.append((name, ", ".join(f"{symbol} {value}" for symbol, value in pairs) + end))
 
     for name, part, symbols in (
         ("e-IOSS (eq:eIOSS)", certificate.detectability, ("c_p", "c_w", "c_v", "eta")),
@@ -170,10 +172,12 @@ def _designed(
     rows = [
         ("sizes", str(made.sizes)),
         ("contraction", f"a window of N = {made.horizon} that starts at an estimate shrinks the "
-         f"error by {made.contraction():.3g}, if J(estimate) <= J(truth), as for a global "
-         f"minimiser; the least N is {made.least_horizon()}"),
+         f"error to {at_most(made.contraction(), 3)} of itself, if J(estimate) <= J(truth), as "
+         f"for a global minimiser; the least N is {made.least_horizon()}"),
         ("limit", "then "
-         + ", ".join(f"|x{i + 1} - x_hat{i + 1}| <= {each:.3g}" for i, each in enumerate(limits))
+         + ", ".join(
+             f"|x{i + 1} - x_hat{i + 1}| <= {at_most(each, 3)}" for i, each in enumerate(limits)
+         )
          + (f": it says nothing about {nothing}" if nothing else "")),
         ("any QPs", "Design.along bounds the error by the J(estimate) that each step returns"),
         *(("note", each) for each in made.notes),

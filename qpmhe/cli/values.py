@@ -18,10 +18,10 @@ def read_box(option: str, text: str, width: int | None = None, kind: str = "comp
             raise ValueError("the number of components")
         low, high = zip(*[(float(a), float(b)) for a, b in pairs], strict=True)
     except ValueError as error:
-        whom = "each component" if width is None else f"each of {width} {kind}"
+        such = ",".join(["0.1:9", "-1:9", "0:1"][k % 3] for k in range(width or 2))
         raise OptionError(
-            f"{option} is {text!r}; expected low:high for {whom}, separated by commas, as in "
-            "0.1:9,-1:9."
+            f"{option} is {text!r}; expected low:high for each of the {kind}"
+            f"{'' if width is None else f' ({width})'}, separated by commas, as in {such}."
         ) from error
     return Box(low, high)
 

@@ -1,6 +1,7 @@
 """The observer's bound against adversaries, and against plain computations of the same."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import qpmhe
 from qpmhe import certificates
 from qpmhe.certificates import Evidence, Sizes, certify
 from qpmhe.certificates import certificate as certification
+from qpmhe.certificates.evidence import at_most
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.sizes import lengths_of
 from qpmhe.errors import OptionError, SetError, ShapeError
@@ -101,6 +103,11 @@ def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
     assert bound.components(bound.radii(0, [-2.0])[0])[0] == pytest.approx(2.0)
     whole = bound.radii(bound.settling_samples, box(-18.0, 18.0))
     assert whole[-1] <= 1.1 * bound.limit() < whole[-2]
+    # What is shown is no smaller than what is proved.
+    shown = re.fullmatch(r"\|x1 - z1\| <= (\S+) in the limit and .* on \(proved.*", bound.headline)
+    for value, text in ((0.4031, "0.404"), (0.9, "0.9"), (99.91, "100"), (np.inf, "inf")):
+        assert at_most(value, 3) == text
+    assert 0.0 <= float(shown[1]) / bound.components(bound.limit())[0] - 1.0 < 0.01
 
 
 def plain(vectors, weight):
