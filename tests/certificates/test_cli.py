@@ -89,7 +89,8 @@ def test_the_report_holds_what_the_terminal_shows(shown):
     assert content["simulated"].endswith("the bound holds at all 20 samples")
     for each in content["paper"]:
         for value in (*each["C"], each["lam"], each["limit"]):
-            assert re.search(rf" {re.escape(at_most(value, 4))}[ ,\n]", text), (each["horizon"], value)
+            shown = re.escape(at_most(value, 4))
+            assert re.search(rf" {shown}[ ,\n]", text), (each["horizon"], value)
 
 
 def test_an_unstable_observer_is_replaced_and_an_undetectable_mode_is_named(shown):

@@ -95,6 +95,25 @@ def test_a_roll_out_that_fails_is_named(raises):
     assert ("too low" if raises else "roll-out") in estimate.message
 
 
+@pytest.mark.parametrize("seed", [39, 72])
+def test_where_no_step_from_the_observer_helps_the_search_goes_on_from_its_roll_out(seed):
+    rng = np.random.default_rng(seed)
+    a, bent, c = (rng.standard_normal((2, 2)) for _ in range(3))
+    a *= 0.8 / np.abs(np.linalg.eigvals(a)).max()
+    mhe = spoil.estimator(
+        qpmhe.System(
+            lambda x: x @ a.T + np.sin(x) @ bent.T, lambda x: x @ c.T, n=2, p=2,
+            disturbance_matrix=[[1.0], [0.3]],
+        ),
+        qpmhe.Luenberger(0.5 * rng.standard_normal((2, 2))),
+        spoil.cost_of(2, 2, disturbance=1.0), horizon=8, initial_state=[0.0, 0.0], max_qps=None,
+    )
+    for y in rng.standard_normal((30, 2)):
+        estimate = mhe.update(y)
+        assert estimate.improved
+        assert estimate.cost < estimate.candidate_cost
+
+
 def test_designed_gains_take_the_matrix():
     start = np.zeros(3)
     full = qpmhe.design_luenberger(system(None), start, disturbance=G @ Q @ G.T, noise=R).gain

@@ -256,6 +256,29 @@ def branching(x):
     return x if x[0] > 12.0 else 0.5 * x
 
 
+@pytest.mark.skipif(len(ENGINES) < 2, reason="there is no C compiler")
+@pytest.mark.parametrize("call", ["update", "run"])
+def test_a_batch_goes_on_in_python_where_a_closure_has_changed(call):
+    """Each member as a single estimator, and no sample is lost."""
+    plant, ys = Plant(), YS[:180].reshape(3, 60)
+    start = np.array([[1.0, -1.0]]) + 0.1 * np.arange(3)[:, None]
+    singles = [estimator(plant.system(), "compiled") for _ in start]
+    batch = qpmhe.BatchEstimator(
+        plant.system(), singles[0].observer, singles[0].cost, members=3, initial_states=start,
+        horizon=5, max_qps=2, engine="compiled",
+    )
+    for one, own in zip(singles, start, strict=True):
+        one.reset(own)
+    for mhe, records in zip((batch, *singles), (ys.T, *ys), strict=True):
+        update_all(mhe, records[:20])
+    plant.gain = 0.3
+    for mhe, records in zip((batch, *singles), (ys[:, 20:], *ys[:, 20:]), strict=True):
+        with has_changed():
+            mhe.run(records) if call == "run" else update_all(mhe, records.T)
+    assert (batch.engine, batch.mode, batch.time) == ("python", "looped", 60)
+    np.testing.assert_allclose(batch.states, [one.state for one in singles], 1e-9, 1e-12)
+
+
 def test_what_cannot_be_traced_is_used_as_it_is_written():
     system = qpmhe.System(branching, lambda x: np.sin(x[..., :1]), n=2, p=1)
     assert system.derivatives == {"f": "complex step", "h": "traced"}
