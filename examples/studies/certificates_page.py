@@ -27,6 +27,7 @@ from adversary import Array, Setting, Signals, against_estimates, against_observ
 
 import qpmhe
 from qpmhe.certificates import Certificate, Design, Sizes, certify, design, synthesise_gain
+from qpmhe.certificates.evidence import at_most
 
 DOCS = Path(__file__).parents[2] / "docs"
 STEPS = (5, 10, 20, 40, 80)
@@ -271,11 +272,12 @@ def renew_picture(page: str, drawn: str, picture: str) -> None:
         shutil.copy(drawn, DOCS / "img" / picture)
 
 
-def short(value: float) -> str:
-    """Two digits; a dash for what is not bounded."""
+def short(value: float, *, bound: bool = False) -> str:
+    """Two digits, of a bound rounded up; a dash for what is not bounded."""
     if not np.isfinite(value):
         return "-"
-    return f"{float(f'{value:.2g}'):,.0f}" if value >= 100 else f"{value:.2g}"
+    text = at_most(value, 2) if bound else f"{value:.2g}"
+    return f"{float(text):,.0f}" if value >= 100 else text
 
 
 def first_line(row: Row) -> str:
@@ -289,8 +291,8 @@ def first_line(row: Row) -> str:
     own = "" if case.observer is not None else " †"
     return (
         f"| {case.name}{own} | {sides} | {sizes.disturbance:g}, {sizes.noise:g} "
-        f"| {row.seconds:.1f} s | {short(row.bound)} | {short(row.observed)} "
-        f"| **{row.bound / row.observed:.1f}** | {short(row.around)} | {short(row.estimated)} "
+        f"| {row.seconds:.1f} s | {short(row.bound, bound=True)} | {short(row.observed)} "
+        f"| **{row.bound / row.observed:.1f}** | {short(row.around, bound=True)} | {short(row.estimated)} "
         f"| **{row.around / row.estimated:.1f}** |"
     )
 
@@ -299,13 +301,12 @@ def second_line(row: Row) -> str:
     plan, certificate = row.plan, row.certificate
     cells = ["-"] * 3
     if plan is not None:
-        cells = [str(plan.horizon), *(
-            short(each) for each in (float(plan.length(plan.limit())), row.designed)
-        )]
+        limit = float(plan.length(plan.limit()))
+        cells = [str(plan.horizon), short(limit, bound=True), short(row.designed)]
     paper = ["-", "-"]
     if certificate.constants:
         limit = certificate.of().result.limit(*certificate.sizes.largest)
-        paper = [str(row.case.horizon), short(limit)]
+        paper = [str(row.case.horizon), short(limit, bound=True)]
     return f"| {row.case.name} | {' | '.join((*cells, *paper))} | {certificate.diameter:.3g} |"
 
 
