@@ -167,6 +167,7 @@ def test_what_does_not_fit_is_refused(case):
         (plots.states, [run], {"sigmas": -2.0}, OptionError, "sigmas is -2.0"),
         (plots.states, [run], {"axes": 3}, InvalidInputError, "axes contain 3; expected matplotl"),
         (plots.states, [run], {"band": (rows, rows[1:])}, ShapeError, r"band\[1\] has shape"),
+        (plots.states, [run], {"band": (rows + 1, rows - 1)}, InvalidInputError, "is 1 and band"),
         (plots.states, [estimate], {}, InvalidInputError, r"type Estimate; .*plots\.window"),
         (plots.window, [run], {}, InvalidInputError, r"estimate is of type Run; .*plots\.states"),
         (plots.step_times, [run], {"deadline": -0.001}, OptionError, r"deadline is .*> 0"),

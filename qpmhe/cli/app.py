@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from typer.core import TyperGroup
 
 from qpmhe_solvers import backends
 
@@ -40,9 +41,40 @@ _SHORT = {
     "banded, then a QP": "banded, then QP",
 }
 
+# What typer's checks of numbers expect, by the name of what pydantic found.
+_EXPECTED = {
+    "int_parsing": "an integer", "float_parsing": "a number",
+    "greater_than_equal": "an integer >= {ge}",
+}
+
+
+class _Group(TyperGroup):
+    """Commands whose errors name the value that an option has, in plain words."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            error.message = _plain(error)
+            raise
+
+
+def _plain(error: typer.BadParameter) -> str:
+    """The message of a bad value, without pydantic's words, which only newer typers have."""
+    find = getattr(error.__cause__, "errors", None)
+    if find is None:
+        return error.message
+    found = find()[0]
+    if found["type"] in _EXPECTED:
+        expected = _EXPECTED[found["type"]].format(**found.get("ctx", {}))
+        return f"{found['input']}; expected {expected}."
+    return error.message.removeprefix("Value error, ")
+
+
 app = typer.Typer(
-    name="qpmhe", help="Suboptimal moving horizon estimation by sequences of convex QPs.",
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    cls=_Group, name="qpmhe",
+    help="Suboptimal moving horizon estimation by sequences of convex QPs.", no_args_is_help=True,
+    add_completion=False, pretty_exceptions_enable=False,
 )
 
 

@@ -17,7 +17,7 @@ from ..studies.grid import READING, WORDS, Measure
 from ..studies.report import check_libraries
 from . import options
 from .report import show_report
-from .values import read_numbers
+from .values import named_as_options, read_numbers
 
 _JOBS = typer.Option(min=1, help="Cells to run in parallel, default all cores; to measure "
                                  "times, give 1.")
@@ -106,16 +106,19 @@ def compare(
     reading = {key: given[key] for key in READING if given[key] is not None} if record else {}
     if model is None and steps is None and record is None:
         steps = 100  # all backends at all caps are to be done within ten minutes
-    what = Study(
-        models=model or ("batch_reactor",), records=record or (), reading=reading,
-        backends=backend or None,
-        qps=_numbers("qps", qps),
-        solver_iterations=_numbers("solver_iterations", solver_iterations),
-        horizons=_numbers("horizons", horizons),
-        noise_levels=read_numbers("--noise-levels", noise_levels).tolist(),
-        starts=start or ("candidate",), seeds=seeds, steps=steps, measure=measure,
-        deadline=deadline, covariances=covariances, cell_timeout=cell_timeout,
-    )
+    with named_as_options(
+        "noise_levels", "seeds", "steps", "deadline", "cell_timeout", starts="--start"
+    ):
+        what = Study(
+            models=model or ("batch_reactor",), records=record or (), reading=reading,
+            backends=backend or None,
+            qps=_numbers("qps", qps),
+            solver_iterations=_numbers("solver_iterations", solver_iterations),
+            horizons=_numbers("horizons", horizons),
+            noise_levels=read_numbers("--noise-levels", noise_levels).tolist(),
+            starts=start or ("candidate",), seeds=seeds, steps=steps, measure=measure,
+            deadline=deadline, covariances=covariances, cell_timeout=cell_timeout,
+        )
     _run(
         what, store, out, jobs=jobs, scheduler=scheduler, retry_failed=retry_failed,
         keep_failing=keep_failing,
@@ -153,7 +156,8 @@ def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
     # As after Ctrl-C, worker processes and progress bar end before this process.
     before = signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     try:
-        frame = run(what, Store(store), progress=console, **options).frame()
+        with named_as_options("jobs"):
+            frame = run(what, Store(store), progress=console, **options).frame()
     except (KeyboardInterrupt, SystemExit):
         console.print(
             f"stopped; all finished cells are in {store}, and the same command resumes the study."

@@ -156,9 +156,11 @@ def _cache() -> tuple[bool, str, str]:
     for folder in cache_folders():
         files = [path for path in folder.glob("*.so") if path.is_file()]
         steps = sum(path.name.startswith("mhe-") for path in files)
+        models = len(files) - steps
         size = sum(path.stat().st_size for path in files) / 2**20
         texts.append(
-            f"{folder}: {steps} steps, {len(files) - steps} models, {size:.1f} MiB"
+            f"{folder}: {steps} step{'s' * (steps != 1)}, {models} model{'s' * (models != 1)}, "
+            f"{size:.1f} MiB"
             + ("" if os.access(folder, os.W_OK) else ", read-only")
         )
     return bool(texts), "cache", "; ".join(texts) or f"{wanted}, not there yet"

@@ -37,7 +37,7 @@ def reproduce(
     width: options.Width = None,
 ) -> None:
     """Reproduce the paper's example: tables on screen, figure and CSV files on disk."""
-    console = Console()
+    console, figures = Console(), read_width(width)
     with Progress(
         TextColumn("paper's example"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
         console=console, transient=True,
@@ -45,7 +45,7 @@ def reproduce(
         task = bar.add_task("")
         found = studies.reproduce(
             out, seed=seed, seeds=seeds, steps=steps, method=method, backend_name=backend,
-            ipopt=ipopt, width=read_width(width),
+            ipopt=ipopt, width=figures,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     console.print(_paper_table(found))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,10 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from .._checks import make_folder
-from ..errors import OptionError, QpmheError
+from ..errors import OptionError
 from ..models.loading import ModelSource, find
 from . import options
-from .values import arguments_of, read_state, with_arguments
+from .values import arguments_of, named_as_options, read_state, with_arguments
 
 
 def tune(
@@ -105,7 +102,10 @@ def tune(
         for path, each in zip(record, read, strict=True)
     ]
     try:
-        with _named_as_options():
+        with named_as_options(
+            "held_out", "initial_state", "structure", "objective", "threshold", "horizon",
+            "starts", "seed", "jobs",
+        ):
             tuning = run(
                 _maker(source) if started else mhe.system, records,
                 **covariances_of(mhe.observer, mhe.cost), horizon=mhe.horizon,
@@ -140,26 +140,6 @@ def _maker(source: ModelSource) -> Any:
     from ..records.record_model import load_system
 
     return lambda **parameters: load_system(replace(source, arguments=arguments_of(parameters)))
-
-
-@contextmanager
-def _named_as_options() -> Iterator[None]:
-    """Errors of `qpmhe.tune` with its arguments as options of the command."""
-    names = (
-        "held_out", "initial_state", "structure", "objective", "threshold", "horizon", "starts",
-        "seed", "jobs",
-    )
-    try:
-        yield
-    except QpmheError as error:
-        text = str(error)
-        for name in names:
-            option = f"--{name.replace('_', '-')}"
-            text = re.sub(rf"\b{name}=(['\"]?)(\w[\w.]*)\1", rf"{option} \2", text)
-            text = re.sub(rf"\b{name}(?= is\b)", option, text)
-        text = re.sub(r"\bparameters\['(\w+)'\]", r"--parameter \1", text)
-        error.args = (text,)
-        raise
 
 
 def _starts(given: list[str] | None) -> dict[str, float]:

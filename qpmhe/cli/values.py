@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ModelError, OptionError
+from ..errors import ModelError, OptionError, QpmheError
 from ..model.sets import Box
+from ..plots.style import inches_of
 
 
 def read_box(option: str, text: str, width: int | None = None, kind: str = "components") -> Box:
@@ -41,10 +46,29 @@ def read_numbers(option: str, text: str) -> NDArray[np.float64]:
 
 def read_width(text: str | None) -> str | float | None:
     """The width of figures: a name, or inches."""
+    width: str | float | None = text
+    if text is not None:
+        with suppress(ValueError):
+            width = float(text)
+    with named_as_options("width"):
+        inches_of(width)
+    return width
+
+
+@contextmanager
+def named_as_options(*names: str, **others: str) -> Iterator[None]:
+    """Errors with a function's arguments as options: ``--name``, or what ``others`` say."""
+    known = {name: f"--{name.replace('_', '-')}" for name in names} | others
     try:
-        return None if text is None else float(text)
-    except ValueError:
-        return text
+        yield
+    except QpmheError as error:
+        text = str(error)
+        for name, option in known.items():
+            text = re.sub(rf"\b{name}=(['\"]?)(\w[\w.]*)\1", rf"{option} \2", text)
+            text = re.sub(rf"\b{name}(?= is\b)", option, text)
+        text = re.sub(r"\bparameters\['(\w+)'\]", r"--parameter \1", text)
+        error.args = (text,)
+        raise
 
 
 def arguments_of(parameters: dict[str, float]) -> str:

@@ -161,8 +161,8 @@ def load(source: ModelSource) -> Example:
     name, parts = source.name, build(source)
     if not isinstance(parts, tuple) or len(parts) != 4:
         raise ModelError(
-            f"model {name!r} gave {type(parts).__name__}; expected (system, observer, cost, "
-            "scenario), as qpmhe.models.Example."
+            f"model {name!r} returned {_kind(parts)}; expected (system, observer, cost, scenario), "
+            "as qpmhe.models.Example holds them."
         )
     options = isinstance(parts[3], dict)
     check_parts(
@@ -176,9 +176,17 @@ def check_parts(name: str, parts: Sequence[Any], remedy: str = "") -> None:
     for part, (kind, what) in zip(parts, _PARTS, strict=False):
         if not isinstance(part, kind):
             raise ModelError(
-                f"model {name!r} gave a {type(part).__name__} for its {what}; expected "
+                f"model {name!r} returned {_kind(part)} for its {what}; expected "
                 f"qpmhe's {kind.__name__}.{remedy}"
             )
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "None"
+    name = type(value).__name__
+    words = f"a{'n' * (name[0] in 'aeiouAEIOU')} {name}"
+    return f"{words} of {len(value)}" if isinstance(value, tuple) else words
 
 
 def code_place(error: BaseException, file: Path | None) -> str:
@@ -235,7 +243,7 @@ def _function(source: ModelSource) -> Callable[..., Any]:
     try:
         module, now = imported(place)
     except (Exception, SystemExit) as error:
-        raise _failure(source, f": cannot import {place}", error) from error
+        raise _failure(source, " cannot be imported", error) from error
     if source.fingerprint and now != source.fingerprint:
         raise ModelError(
             f"model {name!r}: {place}, or a file that it imports, differs from the one that the "
@@ -254,6 +262,9 @@ def _failure(source: ModelSource, what: str, error: BaseException) -> ModelError
         said = "it ends the program; put what is not the model behind if __name__ == '__main__'"
     elif isinstance(error, QpmheError):
         said = str(error)
+    elif isinstance(error, SyntaxError):  # its text would repeat file and line
+        where = f" in {error.text.strip()!r}" if error.text else ""
+        said = f"{type(error).__name__}: {error.msg}{where}"
     else:
         said = f"{type(error).__name__}: {error}"
     place = code_place(error, source.file)

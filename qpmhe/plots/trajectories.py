@@ -98,7 +98,7 @@ def states(
     Raises
     ------
     InvalidInputError
-        If run is not a `Run`, labels are not strings or axes not Axes.
+        If run is not a `Run`, labels are not strings, axes not Axes, or sides of the band swapped.
     ShapeError
         If labels, truth, axes or band do not fit the run's states and times.
     OptionError
@@ -124,6 +124,7 @@ def states(
         lower, upper = (
             curve(f"band[{side}]", values, count, n) for side, values in enumerate(_pair(band))
         )
+        _check_sides(lower, upper)
         for j, panel in enumerate(drawn):
             panel.fill_between(
                 times, lower[:, j], upper[:, j], color=PROVED, linewidth=0.0, zorder=0.5,
@@ -142,6 +143,17 @@ def _pair(band: Any) -> tuple[ArrayLike, ArrayLike]:
             "(band.lower, band.upper) of certificate.observer_bound.along(run, ...)."
         )
     return band[0], band[1]
+
+
+def _check_sides(lower: Array, upper: Array) -> None:
+    """Refuse a band whose lower side is above its upper one; a NaN is its end."""
+    crossed = np.argwhere(lower > upper)
+    if crossed.size:
+        k, j = crossed[0]
+        raise InvalidInputError(
+            f"band[0] is {lower[k, j]:.6g} and band[1] {upper[k, j]:.6g} for state {j + 1} at "
+            f"time {k}; expected (lower, upper), with no lower side above the upper one."
+        )
 
 
 def window(

@@ -96,7 +96,7 @@ def model_parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
         return (made.system, made.observer, made.cost), options
     if not isinstance(made, (tuple, list)) or not 3 <= len(made) <= 5:
         shape = f" of {len(made)}" if isinstance(made, (tuple, list)) else ""
-        raise ModelError(f"model {name!r} gave a {type(made).__name__}{shape}; {_EXPECTED}.")
+        raise ModelError(f"model {name!r} returned a {type(made).__name__}{shape}; {_EXPECTED}.")
     check_parts(name, made[:3], f" In all, {_EXPECTED}.")
     options = {}
     for extra in made[3:]:
@@ -110,7 +110,7 @@ def model_parts(name: str, made: Any) -> tuple[tuple[Any, ...], dict[str, Any]]:
             options |= {str(key): value for key, value in extra.items()}
         else:
             raise ModelError(
-                f"model {name!r} gave a {type(extra).__name__} after its cost; "
+                f"model {name!r} returned a {type(extra).__name__} after its cost; "
                 "expected a qpmhe.models.Scenario or a dict of options."
             )
     return tuple(made[:3]), options

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from .._checks import checked_path, need
+from .._checks import checked_path, make_folder, need
 from ..errors import InvalidInputError, OptionError
 from .environment import environment_words
 from .report.answers import cases
 from .report.words import cap_words, qps_words
-from .store import Store
+from .store import Store, opened
 from .summary import student, summarise
 
 # Column of the summary, heading, and the factor to what is shown.
@@ -36,14 +36,14 @@ def export(store: Store | str | Path, path: str | Path) -> Path:
 
     ``.csv`` and ``.parquet`` files hold all cells, with versions and machine in ``environment``;
     in CSV, lists and ``reasons`` are JSON texts; in Parquet, only ``reasons`` is. A ``.tex`` file
-    holds the tables of `Study.to_latex`, of all cells. An existing file is replaced. Raises
-    `OptionError` if the name ends differently, `StoreError` if the store cannot be read,
-    `InvalidInputError` if the file cannot be written or a package is missing.
+    holds the tables of `Study.to_latex`, of all cells. The folder is made, an existing file
+    replaced. Raises `OptionError` if the name ends differently, `StoreError` if the store cannot be
+    read, `InvalidInputError` if the file cannot be written or a package is missing.
     """
     target = checked_path("the file", path)
     if target.suffix not in (".csv", ".parquet", ".tex"):
         raise OptionError(f"the file is {str(path)!r}; expected a name in .csv, .parquet or .tex.")
-    held = store if isinstance(store, Store) else Store(store)
+    held = opened(store)
     frame, places = held.frame(), held.meta()["environments"]
     frame["environment"] = [
         environment_words(places[k], [backend])
@@ -52,6 +52,7 @@ def export(store: Store | str | Path, path: str | Path) -> Path:
     lists = ("rmse_states", "rmse_settled_states", "times") if target.suffix == ".csv" else ()
     for name in ("reasons", *lists):
         frame[name] = frame[name].map(_text)
+    make_folder(target.parent)
     try:
         if target.suffix == ".tex":
             target.write_text(tables(held), encoding="utf-8")
@@ -73,7 +74,7 @@ def _text(value: Any) -> str | None:
 
 def tables(store: Store | str | Path, keys: Set[str] | None = None) -> str:
     """One table per model and horizon, of the cells with these keys; of all if left out."""
-    held = store if isinstance(store, Store) else Store(store)
+    held = opened(store)
     frame = held.frame()
     if keys is not None:
         frame = frame[frame["key"].isin(keys)]
@@ -97,17 +98,22 @@ def with_error(mean: float, error: float) -> str:
     size = max(abs(mean), error if math.isfinite(error) else 0.0)
     if size == 0.0:
         return "$0$"
-    exponent = math.floor(math.log10(size))
+    exponent = _exponent(size, 4)
     if not -3 <= exponent < 5:
         inner = with_error(mean / 10.0**exponent, error / 10.0**exponent).strip("$")
         return rf"$({inner}) \cdot 10^{{{exponent}}}$"
-    places = 2 - exponent
+    places = (3 if math.isfinite(error) else 2) - exponent
     if math.isfinite(error) and error > 0.0:
-        places = min(3 - exponent, 1 - math.floor(math.log10(error)))
+        places = min(places, 1 - _exponent(error, 2))
     rounded = f"{error:.{max(0, places)}f}"
     # Where the seeds agree to all digits, or there is one only, the mean stands alone.
     known = math.isfinite(error) and float(rounded) > 0.0
     return f"${mean:.{max(0, places)}f}" + (rf" \pm {rounded}$" if known else "$")
+
+
+def _exponent(value: float, digits: int) -> int:
+    """The power of ten of a number rounded to these digits: 0 for 0.99996, which is 1.000."""
+    return int(f"{value:.{digits - 1}e}".partition("e")[2])
 
 
 def _table(title: str, rows: Any, machines: list[str]) -> str:

@@ -16,9 +16,11 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+import numpy as np
+
 from qpmhe_solvers import available, backend
 from qpmhe_solvers.errors import report_unknown_options
-from qpmhe_solvers.values import integer, shown
+from qpmhe_solvers.values import shown
 
 from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, InvalidInputError, ModelError, OptionError
@@ -139,7 +141,7 @@ class Study:
         if self.records and self.noise_levels != (1.0,):
             raise StudyError(
                 f"noise_levels is {list(self.noise_levels)}, but the noise of measured records "
-                "cannot be scaled; leave noise_levels or records out."
+                "cannot be scaled; leave either out."
             )
         sources = tuple(Source(model) for model in models) if not self.records else tuple(
             Source.measured(model, str(record), self.reading, folder)
@@ -342,7 +344,7 @@ def _starts(value: Any) -> tuple[str, ...]:
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
-    if integer(value) is not None or isinstance(value, str):
+    if isinstance(value, str) or not np.iterable(value):
         return tuple(range(dimension("seeds", value, 1)))
     items = _several("seeds", value, "give a number of seeds, or some of them")
     return _distinct(count("seeds", item, 0) for item in items)

@@ -13,8 +13,10 @@ from urllib.parse import quote
 
 import numpy as np
 
+from qpmhe_solvers.values import shown
+
 from .._checks import checked_path, need
-from ..errors import QpmheError
+from ..errors import InvalidInputError, QpmheError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -182,6 +184,17 @@ class Store:
                     raise ValueError(answer)
                 _create(connection)
             yield Writer(self.path, connection)
+
+
+def opened(store: Any) -> Store:
+    """A store, or the one in a file of this name."""
+    if isinstance(store, Store):
+        return store
+    if not isinstance(store, (str, Path)):
+        raise InvalidInputError(
+            f"the store is {shown(store)}; expected a qpmhe.studies.Store, or the name of its file."
+        )
+    return Store(store)
 
 
 class Writer:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import numbers
 from ..errors import InvalidInputError, ShapeError
 
@@ -84,10 +86,14 @@ def summarise(frame: DataFrame) -> DataFrame:
     Raises
     ------
     InvalidInputError
-        If a column is missing.
+        If it is no data frame, or a column is missing.
     """
     import pandas as pd
 
+    if not isinstance(frame, pd.DataFrame):
+        raise InvalidInputError(
+            f"frame is {shown(frame)}; expected a pandas.DataFrame, as the store's frame() returns."
+        )
     missing = [name for name in _NEEDED if name not in frame.columns]
     if missing:
         raise InvalidInputError(

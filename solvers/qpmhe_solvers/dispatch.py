@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,8 @@ class DispatchSolver(NativeSolver):
     def __init__(self, name: str, options: SolverOptions) -> None:
         super().__init__(options)
         self.name = name
+        if name == "highs":
+            _silence_highs()
         self._translation = how = TRANSLATIONS[name]
         self.style = how.style
         self._keywords = how.keywords(options)
@@ -60,6 +62,19 @@ class DispatchSolver(NativeSolver):
         return Answer(
             answer.x, _multipliers(layout, answer), bool(answer.found), True, iterations, message
         )
+
+
+@cache
+def _silence_highs() -> None:
+    """Let HiGHS write the banner that it writes once a process to nowhere.
+
+    It does so where its first solver is made, before qpsolvers can turn it off.
+    """
+    from highspy._core import _Highs
+
+    first = _Highs()
+    first.setOptionValue("log_to_console", False)
+    first.run()
 
 
 def qpsolvers_arguments(layout: Layout, keep_empty: bool = False) -> tuple[Any, ...]:

@@ -54,12 +54,12 @@ def test_what_the_function_may_return(here):
 def test_models_that_do_not_fit(here, monkeypatch):
     monkeypatch.syspath_prepend(here)
     for function, begin, *words in (
-        ("return observer, system, cost", BEGIN, "gave a Luenberger for its system"),
+        ("return observer, system, cost", BEGIN, "returned a Luenberger for its system"),
         (f"{PARTS}, dict(horzon=3)", BEGIN, "'horzon'", "horizon"),
         (f"{PARTS}, dict(horizon=3, initial_state=0, states=['a', 'b'])", BEGIN,
          "names its states", "1 different names"),
         ("raise SystemExit(0)", BEGIN, "line 8: ", "ends the program"),
-        ("return 1", "x = 1\ny = (", "line 2", "SyntaxError"),
+        ("return 1", "x = 1\ny = (", "line 2: ", "SyntaxError: '(' was never closed in 'y = ('."),
         (f"f = lambda x: x * gain\n    system = qpmhe.System(f, f, n=1, p=1)\n    {PARTS}, "
          "dict(horizon=3, initial_state=1.0)", BEGIN,
          "line 8: ", "f raised NameError: name 'gain' is not defined"),

@@ -223,6 +223,7 @@ def test_latex_tables_have_means_with_standard_errors_and_say_so(tmp_path):
         Study(backends=["daqp"], qps=[3], seeds=1).to_latex(stored())
     for mean, error, words in (
         (0.3236, 0.0164, r"$0.324 \pm 0.016$"), (0.5, np.nan, "$0.500$"),
+        (1.00003, 4e-6, "$1.000$"), (0.99996, 4e-6, "$1.000$"), (1.0, 0.0, "$1.000$"),
         (3.24e-7, 1.2e-8, r"$(3.24 \pm 0.12) \cdot 10^{-7}$"), (np.nan, 1.0, "--"),
     ):
         assert with_error(mean, error) == words

@@ -17,7 +17,7 @@ from ...errors import InvalidInputError
 from ...plots import COLORS, save, trajectories
 from ...plots.style import inches_of
 from ..environment import environment_words
-from ..store import Store
+from ..store import Store, opened
 from ..summary import PROBLEM, RANKED_BY, TOLERANCE, cells_of, pareto_front, summarise
 from . import figures
 from .answers import Case, cases, chosen, failures, file_name, limitations
@@ -151,7 +151,7 @@ def write_report(
     inches = inches_of(width)
     held: Any = source
     if not (isinstance(held, tuple) or hasattr(held, "frame")):
-        held = Store(held)
+        held = opened(held)
     frame, meta = held if isinstance(held, tuple) else (held.frame(), held.meta())
     if not len(frame):
         raise InvalidInputError(
