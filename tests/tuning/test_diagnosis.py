@@ -207,7 +207,8 @@ BAD = [
      lambda: RUN._replace(measurements=RUN.measurements[:29]).run(), {}),
     (InvalidInputError, r"all measurements .* missing; check the columns",
      lambda: RUN._replace(measurements=np.full((50, 1), np.nan)).run(), {}),
-    (InvalidInputError, "no measurements: it was loaded from a file", lambda: qpmhe.Run.of(np.zeros(2), []), {}),
+    (InvalidInputError, "no measurements: it was loaded from a file",
+     lambda: qpmhe.Run.of(np.zeros(2), []), {}),
     (ShapeError, r"labels is .* expected 2 strings", RUN.run, {"labels": ["a"]}),
     (OptionError, "time_unit is 3; expected a string", RUN.run, {"time_unit": 3}),
 ]
