@@ -410,6 +410,8 @@ class Tuning:
         axes.legend(fontsize="small", loc="best", frameon=False)
 
     def _draw_blocks(self, axes: Axes) -> None:
+        from matplotlib.ticker import MaxNLocator
+
         means = np.array([
             self._block_means(self._score.samples(weights))
             for weights in (self._structure.first, self.weights)
@@ -422,7 +424,7 @@ class Tuning:
             axes.axvspan(k - 0.5, k + 0.5, color="0.93", zorder=0,
                          label="held out" if k == int(np.argmax(held)) else None)
         axes.set_xlabel("block")
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         what = "error" if self._score.truth else f"error {self._score.ahead} ahead"
         axes.set_ylabel(f"mean square {what}, scaled")
         axes.set_ylim(bottom=0.0)
