@@ -108,7 +108,13 @@ def test_costs_outcomes_and_times_of_steps(case, monkeypatch):
     assert [text.get_text() for text in panel.get_yticklabels()] == [
         "improved (100%)", "missing data (10%)"
     ]
-    assert panel.lines[1].get_xdata() == pytest.approx([1.3, 1.4, 1.5])
+    improved, data = panel.lines
+    drawn = data.get_xydata()
+    assert drawn[np.isfinite(drawn[:, 1]), 0] == pytest.approx([1.3, 1.4, 1.5])
+    assert data.get_markevery() == [12, 14]
+    # Unbroken, it looks so: markers are at its ends only.
+    assert np.isfinite(improved.get_ydata()).all()
+    assert improved.get_markevery() == [0, 29]
     flags = run.flags.copy()
     flags[4] ^= Status.IMPROVED.value | Status.CANDIDATE.value
     monkeypatch.setattr(run, "flags", flags)

@@ -66,7 +66,9 @@ def costs(
 def outcomes(
     run: Run, *, dt: float | None = None, time_label: str | None = None, axes: Any = None
 ) -> Any:
-    """Marks of what happened at each step, a row for each kind of event: improved, kept, and why.
+    """What happened at each step, a row for each kind of event: improved, kept, and why.
+
+    A line stands for steps in a row.
 
     Parameters
     ----------
@@ -83,9 +85,12 @@ def outcomes(
         value = flag.value | (failed if flag is Status.SOLVER_STOPPED else 0)
         there = (run.flags & value) != 0
         if there.any():
-            panel.plot(
-                times[there], np.full(there.sum(), len(rows)), marker, color=color, markersize=5.0
-            )
+            # Markers of neighbours overlap to a pattern: only the ends of a line have one.
+            goes_on = there[1:] & there[:-1]
+            ends = there & ~(np.append(False, goes_on) & np.append(goes_on, False))
+            panel.plot(times, np.where(there, len(rows), np.nan), marker, color=color,
+                       markersize=5.0, markevery=np.flatnonzero(ends).tolist(), linestyle="-",
+                       linewidth=3.0, solid_capstyle="butt")
             rows.append(f"{label} ({there.mean():.0%})")
     panel.set_yticks(range(len(rows)), rows)
     panel.set_ylim(max(len(rows), 1) - 0.5, -0.5)

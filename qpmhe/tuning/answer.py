@@ -34,6 +34,8 @@ _CRUDE = 0.3
 _WIDEST_LOG, _WIDEST = float(np.log(10.0)), 1.0
 # Uncertainties that are as correlated as this are named in one sentence.
 _TOGETHER = 0.8
+# An axis whose ends are further apart has only powers of ten.
+_MANY_LABELS = 50.0
 # Eigenvalues of the Hessian below this count as it; an interval is infinite then.
 _FLAT = 1e-6
 
@@ -396,7 +398,11 @@ class Tuning:
                       label="after" if row == 0 else None)
         axes.axvline(1.0, color=blue, linestyle="--", linewidth=1.2, label="before")
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        low, high = axes.get_xlim()
+        # Over several decades there is room for the powers of ten alone.
+        axes.xaxis.set_major_locator(
+            LogLocator(subs=(1.0, 2.0, 5.0) if high < _MANY_LABELS * low else (1.0,))
+        )
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set_yticks(range(len(shown)), list(reversed(shown)))
@@ -404,6 +410,8 @@ class Tuning:
         axes.legend(fontsize="small", loc="best", frameon=False)
 
     def _draw_blocks(self, axes: Axes) -> None:
+        from matplotlib.ticker import MaxNLocator
+
         means = np.array([
             self._block_means(self._score.samples(weights))
             for weights in (self._structure.first, self.weights)
@@ -416,6 +424,7 @@ class Tuning:
             axes.axvspan(k - 0.5, k + 0.5, color="0.93", zorder=0,
                          label="held out" if k == int(np.argmax(held)) else None)
         axes.set_xlabel("block")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         what = "error" if self._score.truth else f"error {self._score.ahead} ahead"
         axes.set_ylabel(f"mean square {what}, scaled")
         axes.set_ylim(bottom=0.0)

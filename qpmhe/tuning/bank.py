@@ -19,6 +19,8 @@ Loss = Callable[[Array], tuple[Array, Array]]
 _SHARE, _WIDTH = 0.02, 8.0
 # Beyond this an innovation in its own deviations is an outlier rather than noise.
 _OUTLIER = 4.0
+# Of a sensor's samples, those that can be outliers at most.
+_MOST_OUTLIERS = 0.5
 # Samples without any measurement that make a gap, and measured ones after it that are no evidence.
 _GAP = 10
 
@@ -116,17 +118,34 @@ class FilterBank:
         return np.column_stack((inputs, lengths))
 
     def errors(self, measured: Array, expected: Array) -> Array:
-        """Measured minus expected outputs, the shorter way round where they are angles."""
-        found = measured - expected
-        if self.system.output_residual is not None:
-            self.system.output_residual.wrap(found, measured)
+        """Measured minus expected outputs, the shorter way round where they are angles.
+
+        NaN where a residual function of the user's raises.
+        """
+        found, residual = measured - expected, self.system.output_residual
+        if residual is not None:
+            try:
+                residual.wrap(found, measured)
+            except Exception:
+                for error, y in zip(found, np.broadcast_to(measured, found.shape), strict=True):
+                    try:
+                        residual.wrap(error, y)
+                    except Exception as raised:
+                        self.error, error[...] = self.error or raised, np.nan
         return found
+
+    def expected(self, states: Array, inputs: Array) -> Array:
+        """Outputs (T, p) at states (T, n); NaN where the model raises."""
+        return self._values(self.model.h.batch, states, inputs, (self.system.p,))
+
+    def following(self, states: Array, inputs: Array) -> Array:
+        """States (T, n) after a step from states (T, n); NaN where the model raises."""
+        return self._values(self.model.f.batch, states, inputs, (self.system.n,))
 
     def moves(self, states: Array, inputs: Array) -> tuple[Array, Array]:
         """Expected outputs (T, p) at states (T, n), and how far they move within a step."""
-        expected = self._values(self.model.h.batch, states, inputs, (self.system.p,))
-        following = self._values(self.model.f.batch, states, inputs, (self.system.n,))
-        later = self._values(self.model.h.batch, following, inputs, (self.system.p,))
+        expected = self.expected(states, inputs)
+        later = self.expected(self.following(states, inputs), inputs)
         return expected, self.errors(later, expected)
 
     def _values(self, function: Function, x: Array, u: Array, shape: tuple[int, ...]) -> Array:
@@ -166,6 +185,7 @@ class FilterBank:
         first = Filtered(logs, *(np.empty((total, *shape)) for shape in shapes))
         extreme = np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi))  # beside a normal distribution
         usual, any_outliers = np.log1p(-_SHARE), outliers.any()
+        left_out = np.zeros((count, p))
         for t in range(total):
             now, seen = u[:, t], there[:, t]
             c = self._values(model.h_jacobian.batch, x, now, (p, n)) / unit[:, None]
@@ -176,7 +196,7 @@ class FilterBank:
                 own = np.einsum("hii->hi", spread + noise)
                 far = outliers[:, None] & seen & (e * e > _OUTLIER**2 * own)
                 tail = np.log1p(e * e / own / _WIDTH**2) + 0.5 * np.log(own)
-                seen = seen & ~far
+                seen, left_out = seen & ~far, left_out + far
                 logs[t] += np.where(far, extreme - tail, 0.0).sum(axis=1)
                 logs[t] += usual * (outliers * seen.sum(axis=1))
             spread = spread + noise
@@ -201,7 +221,7 @@ class FilterBank:
                 move = np.einsum("hij,hjk,hk->hi", gain, factor, used)
             logs[t] -= cost + 0.5 * np.linalg.slogdet(spread)[1]
             first.states[t], first.outputs[t], first.gains[t] = x[0], c[0], gain[0]
-            first.innovations[t] = np.where(seen[0], e[0], np.nan)
+            first.innovations[t] = np.where(seen[0] & alive[0], e[0], np.nan)
             first.spreads[t], first.weights[t] = spread[0], inverse[0]
             if self._loss is None:
                 x = self._bounded(x + move)
@@ -227,6 +247,8 @@ class FilterBank:
         if self._loss is None:
             recovers = _recovering(there[0].any(axis=1))
             logs[recovers], first.innovations[recovers] = 0.0, np.nan
+        # What leaves out most of a sensor does not explain it.
+        alive &= (left_out <= _MOST_OUTLIERS * there.sum(axis=1)).all(axis=1)
         logs[:, ~alive | ~np.isfinite(logs).all(axis=0)] = -np.inf
         first.innovations[...] *= unit
         first.spreads[...] *= np.multiply.outer(unit, unit)

@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 from .._checks import positive
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.run import Run, RunSource
-from .examination import Examination
+from .examination import LEAST_SAMPLES, Examination
 from .findings import Finding, Names
 
 Array = NDArray[np.float64]
 
-# Fewer measurements than this say nothing about a covariance.
-_LEAST_SAMPLES = 30
 _WIDTH = 92  # of the text
 
 
@@ -185,8 +183,9 @@ def _source(run: Run) -> RunSource:
     source = run.source
     if source is None:
         raise InvalidInputError(
-            "the run has no measurements: it was assembled from single estimates, or unpickled. "
-            "Diagnose a run that MovingHorizonEstimator.run returns."
+            "the run has no measurements: it was loaded from a file, unpickled, or assembled from "
+            "single estimates, and such a run has no record, model and weights. Run the estimator "
+            "over the record again, and diagnose the run that MovingHorizonEstimator.run returns."
         )
     seen = np.isfinite(source.measurements).any(axis=1)
     if not seen.any():
@@ -194,10 +193,10 @@ def _source(run: Run) -> RunSource:
             f"all measurements of the {len(run)} samples are missing; check the columns and units "
             "of the record: a diagnosis needs measurements."
         )
-    if seen.sum() < _LEAST_SAMPLES:
+    if seen.sum() < LEAST_SAMPLES:
         raise InvalidInputError(
             f"the run has {seen.sum()} samples with measurements; expected at least "
-            f"{_LEAST_SAMPLES}, as fewer say nothing about noise. Diagnose a longer run."
+            f"{LEAST_SAMPLES}, as fewer say nothing about noise. Diagnose a longer run."
         )
     return source
 

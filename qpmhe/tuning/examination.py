@@ -14,13 +14,16 @@ from ..estimation.estimate import Status
 from ..estimation.observability import observability, prior_shares, prior_units
 from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
-from .bank import Array, FilterBank, Hypothesis, Mask
+from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
 from .faults import search
 from .findings import Finding, Names, listed, number, percent
 from .stuck import stuck
 
 # The search takes at most so many samples: of a longer record, those least like the model.
 _MOST_SAMPLES = 6000
+# Fewer samples with measurements say nothing about a covariance. Where the model fails, so many of
+# the longest stretches between are tried.
+LEAST_SAMPLES, _STRETCHES = 30, 3
 _LAGS = 20
 # In deviations of the innovations.
 _OUTLIER = 4.0
@@ -76,6 +79,7 @@ class Examination:
         self.prior = inverse(np.asarray(cost.prior)) if given is None else given
         self.first = min(max(source.settings.horizon, _START), total // 5)
         self.inputs = _held(np.zeros((total, 0)) if source.inputs is None else source.inputs)
+        self.is_judged = True
         self._filter(disturbance)
         length, same = source.settings.horizon, len(self.best.states) == len(self.null.states)
         # What the windows see is examined along the states of the filter that explains the record.
@@ -133,27 +137,57 @@ class Examination:
         self.base = base = replace(base, measurements=y[part])
         self.null = null = self.bank.run([base])
         self.normalised = null.normalised
-        bank, begin, total = self.bank, 0, len(base.measurements)
-        if total > _MOST_SAMPLES:
-            sums = np.append(0.0, np.cumsum(np.nan_to_num(self.normalised**2).sum(axis=1)))
-            begin = int(np.argmax(sums[_MOST_SAMPLES:] - sums[:-_MOST_SAMPLES]))
-            part = slice(begin, begin + _MOST_SAMPLES)
-            bank = FilterBank(
-                source.system, None if steps is None else steps[part], self.first + begin
-            )
-            base = replace(base, measurements=base.measurements[part], inputs=base.inputs[part],
-                           start=run.states[self.first + begin])
-            null = bank.run([base])
+        bank, base, null, begin = self._searched()
         self.faults, self.best = search(bank, base, null, self._starts())
+        if not self.is_judged and not all(one.is_wrong_unit for one in self.faults):
+            self.faults, self.best = [], null
+        whole = 0, len(base.measurements) - 1
+        self.searched = begin + self.first if begin else 0, begin + self.first + whole[1]
         if begin:
             self.faults = [
-                replace(one, span=(0, len(base.measurements) - 1) if one.span is None else one.span)
+                replace(one, span=whole) if one.span is None and not one.is_wrong_unit else one
                 for one in self.faults
             ]
         for k, one in enumerate(self.faults):
             if one.span is not None:  # before the filter began there is no evidence, nor an end
                 low, high = one.span[0] + begin, one.span[1] + begin + self.first
                 self.faults[k] = replace(one, span=(low + self.first if low else 0, high))
+
+    def _searched(self) -> tuple[FilterBank, Hypothesis, Filtered, int]:
+        """What is searched for faults, from which sample on: all that has to be, or can be."""
+        base, null, total = self.base, self.null, len(self.base.measurements)
+        failed = (self.run.flags[self.first :] & Status.MODEL_FAILED.value) != 0
+        fails = bool(failed.any()) and not np.isfinite(null.logs).all()
+        if fails:
+            # Any fault with which the model does not fail would look like the cause.
+            # Nor is the filter far from failing just before and after.
+            failures = np.flatnonzero(failed)
+            begins, ends = np.append(0, failures + _START), np.append(failures - _START, total)
+            for k in np.argsort(begins - ends, kind="stable")[:_STRETCHES].tolist():
+                first = int(begins[k])
+                part = slice(first, max(first, min(int(ends[k]), first + _MOST_SAMPLES)))
+                seen = np.isfinite(base.measurements[part]).any(axis=1)
+                if seen.sum() >= LEAST_SAMPLES:
+                    found = self._part(part)
+                    if np.isfinite(found[2].logs).all():
+                        return found
+            self.is_judged = False
+        elif total > _MOST_SAMPLES:
+            sums = np.append(0.0, np.cumsum(np.nan_to_num(self.normalised**2).sum(axis=1)))
+            first = int(np.argmax(sums[_MOST_SAMPLES:] - sums[:-_MOST_SAMPLES]))
+            return self._part(slice(first, first + _MOST_SAMPLES))
+        return self.bank, base, null, 0
+
+    def _part(self, part: slice) -> tuple[FilterBank, Hypothesis, Filtered, int]:
+        first, steps = self.first + part.start, self.source.steps
+        bank = FilterBank(
+            self.source.system, None if steps is None else steps[self.first :][part], first
+        )
+        base = replace(
+            self.base, measurements=self.base.measurements[part], inputs=self.base.inputs[part],
+            start=self.run.states[first],
+        )
+        return bank, base, bank.run([base]), part.start
 
     def _starts(self) -> list[Array]:
         """The user's own estimate, and where the model moves it until the filter begins."""
@@ -192,7 +226,7 @@ class Examination:
             if one.kind != "outliers" or not isinstance(self.source.cost, RobustCost):
                 told.append(finding)
         yield from self.stuck
-        wrong_units = [one for one in told[:1] if one.kind in ("gain", "input")]
+        wrong_units = [one for one in told[:1] if self.faults[0].is_wrong_unit]
         yield from wrong_units
         for flag, what, remedy in (
             (Status.MODEL_FAILED, "The model failed", "Bound the states, or make the model "
@@ -203,7 +237,8 @@ class Examination:
             if share > _FAILING:
                 yield Finding("failing", f"{what} at {share:.0%} of the samples.", remedy)
         yield from told[len(wrong_units) :]
-        yield from self._unseen()
+        if np.isfinite(self.along.logs).all():
+            yield from self._unseen()
 
     def _correlations(self, normalised: Array) -> Correlations:
         """Correlations of innovations; outliers count as the limit that they exceed."""
@@ -316,6 +351,10 @@ class Examination:
                 deviations = np.sqrt(self.noise.diagonal())
                 told = one.in_words(names, deviations, self.outliers)
                 yield note(one.kind, told.text, "The cost is robust.")
+        is_followed = bool(np.isfinite(self.along.logs).all())
+        judged = self._judged(is_followed)
+        if judged:
+            yield note("failing", judged)
         yield note(
             "innovations",
             f"The mean NIS of a measurement is {number(self.nis_mean)}; expected {low:.2f} to "
@@ -325,7 +364,8 @@ class Examination:
         some = [f"{share:.0%} of {names.outputs[j]}" for j, share in enumerate(missing) if share]
         if some:
             yield note("record", f"Missing: {listed(some)}.")
-        yield self._prior_note()
+        if is_followed:
+            yield self._prior_note()
         if not self.findings and self.source.cost.observer_prior is None:
             yield from self._prior_weight_note()
         kept = run.share(Status.CANDIDATE)
@@ -345,6 +385,15 @@ class Examination:
         yield from self._drifts()
         if not self.findings:
             yield from self._input_notes()
+
+    def _judged(self, is_followed: bool) -> str:
+        """What was not judged because the filter fails; blank if nothing."""
+        if not self.is_judged:
+            return "Only wrong units were looked for: at other faults the model fails too often."
+        where = self.names.between(*self.searched)
+        if is_followed or not where:
+            return ""
+        return f"Faults were looked for{where} only: elsewhere the model fails."
 
     def _rejection_notes(self) -> Iterator[Finding]:
         """What the observer's gate has rejected; this filter has no gate."""
@@ -413,7 +462,7 @@ class Examination:
     def _drifts(self) -> Iterator[Finding]:
         """Parameters, which the model keeps, that move nevertheless."""
         along, states = self.along, self.run.states
-        reached = self.bank.model.f.batch(
+        reached = self.bank.following(
             along.corrected, self.bank.full_inputs(self.base.inputs)
         )
         kept = (reached == along.corrected).all(axis=0)

@@ -21,6 +21,10 @@ _GAINS, _CLOSELY = np.linspace(-7.0, 7.0, 29), 0.001
 # They are tried where the mean square of a sensor's normalised innovations is not within these, on
 # so many samples; the best ones are searched closely.
 _SUSPICIOUS, _FEW, _BEST = (0.5, 2.0), 100, 3
+# A factor, and an offset in deviations of the noise, that another unit explains.
+_UNIT, _UNIT_OFFSET = 3.0, 30.0
+# Offsets are first what so many samples say, and then found again so many times.
+_SOON, _AGAIN = 5, 4
 # More components than this have no factors or pairs of their own.
 _MOST = 8
 # What a fault must gain in log likelihood: in all, up to twice that where measurements are missing;
@@ -58,8 +62,8 @@ _KINDS = {
         "Check the units of the record and of the model's outputs, or correct the gain.",
     ),
     "bias": _Kind(
-        0.5, "{sensors} is off by {sigmas} sigma ({value}){stretch}.",
-        "Calibrate it, or estimate its bias as a further state.", local=True,
+        0.5, "{sensors} {is} off by {sigmas} sigma ({value}){stretch}.",
+        "{Calibrate} it, or estimate its bias as a further state.", local=True,
     ),
     "swapped": _Kind(0.0, "{sensors} are swapped.", "Exchange their columns."),
     "step": _Kind(
@@ -111,7 +115,8 @@ class Fault:
         if self.kind == "disturbance" and subject:
             of = f" of {listed([names.states[i] for i in subject])}"
         elif subject and self.kind not in ("disturbance", "sign", "input"):
-            sensors = f"sensor {' and '.join(names.outputs[j] for j in subject)}"
+            several = "s" * (len(subject) > 1)
+            sensors = f"sensor{several} {listed([names.outputs[j] for j in subject])}"
             of = f" of {sensors}"
         first, last = self.span or (0, len(names.times) - 1)
         stretch = names.between(first, last)
@@ -124,6 +129,9 @@ class Fault:
             "Multiply": "Multiply" if grows else "Divide",
             "input": names.inputs[subject[0]] if self.kind in ("sign", "input") else "",
             "sigmas": number(abs(value) / deviations[subject[0]]) if self.kind == "bias" else "",
+            "is": "is" if len(subject) == 1 else "are",
+            "Calibrate": "Check the unit and its zero (degrees C or K?), calibrate"
+                         if self.is_wrong_unit else "Calibrate",
             "stretch": f" for {names.duration(first, last)},{stretch}" if stretch else "",
             "samples": names.samples(abs(value)), "late": "late" if value > 0.0 else "early",
             "ahead": "ahead of" if value > 0.0 else "behind",
@@ -134,6 +142,14 @@ class Fault:
         return Finding(
             self.kind, text[:1].upper() + text[1:], kind.remedy.format(**words), "fault", where
         )
+
+    @property
+    def is_wrong_unit(self) -> bool:
+        """Whether it is so large that a unit explains it: then much else may follow from it."""
+        if self.kind == "bias":
+            variance = float(self.hypothesis.noise[self.subject[0], self.subject[0]])
+            return self.span is None and abs(self.value) > _UNIT_OFFSET * np.sqrt(variance)
+        return self.kind in ("gain", "input") and not 1.0 / _UNIT < self.value < _UNIT
 
     @property
     def matters(self) -> bool:
@@ -181,6 +197,7 @@ def _best(
     tried = [
         *_scaled(base), *_exchanged(base), *_shifted(base), *_drifted(bank, base, null),
         *_linear(bank, base, null), *_gains(bank, base, null, starts),
+        *_offsets(bank, base, null, starts),
     ]
     logs = bank.run([base, *(one.hypothesis for one in tried)]).logs
     refined = list(_refined(base, tried, logs.sum(axis=0)))
@@ -202,7 +219,8 @@ def _best(
         if (gain > least if _KINDS[one.kind].local else enough[k]) and one.matters:
             best = replace(one, gain=gain)
             break
-    return best if best is None or best.kind != "bias" else _with_ends(bank, base, null, best)
+    has_no_ends = best is None or best.kind != "bias" or best.span is None
+    return best if best is None or has_no_ends else _with_ends(bank, base, null, best)
 
 
 def _times(covariance: Array, part: tuple[int, ...], factor: float) -> Array:
@@ -267,20 +285,68 @@ def _refined(base: Hypothesis, tried: list[Fault], values: Array) -> Iterator[Fa
             yield _with_factor(base, kind, part, float(np.exp(-0.5 * curve[1] / curve[0])))
 
 
+def _is_suspicious(null: Filtered) -> bool:
+    """Whether innovations are so large or small that a sensor or an input may have another unit."""
+    sizes = np.nanmean(null.normalised**2, axis=0)
+    usual = (sizes > _SUSPICIOUS[0]) & (sizes < _SUSPICIOUS[1]) | np.isnan(sizes)
+    return not (np.isfinite(null.logs).all() and usual.all())
+
+
+def _beginnings(base: Hypothesis, starts: Sequence[Array]) -> tuple[Hypothesis, list[Hypothesis]]:
+    """The first samples, and the same from each start.
+
+    A wrong unit shows everywhere, also in the estimates from which the filters would begin.
+    """
+    short = replace(base, measurements=base.measurements[:_FEW], inputs=base.inputs[:_FEW])
+    return short, [replace(short, start=one) for one in starts] or [short]
+
+
+def _offsets(
+    bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array]
+) -> Iterator[Fault]:
+    """Sensors with another zero, as of another unit, alone and together.
+
+    Where it is far off, bounds or a lost linearisation hold the filter: the size is first what the
+    start says, and then what filters of the corrected record say.
+    """
+    if not _is_suspicious(null):
+        return
+    total, p = base.measurements.shape
+    parts: list[tuple[int, ...]] = [(j,) for j in range(p)]
+    if 1 < p <= _MOST:
+        parts += combinations(range(p), 2)
+    if p > 2:
+        parts.append(tuple(range(p)))
+    for begin in _beginnings(base, starts)[1]:
+        y, inputs = begin.measurements, bank.full_inputs(begin.inputs, begin.step)
+        expected = bank.expected(np.tile(begin.start, (len(y), 1)), inputs)
+        first = bank.errors(y, expected)[:_SOON]
+        for part in parts:
+            outputs = np.zeros((total, p))
+            outputs[:, part] = 1.0
+            whole = _Signature("bias", part, outputs, np.zeros((total, bank.system.n)))
+            one = replace(whole, outputs=outputs[:_FEW], states=whole.states[:_FEW])
+            size = float(np.nanmedian(first[:, part]))
+            if not abs(size) > _UNIT_OFFSET * np.sqrt(base.noise[part[0], part[0]]):
+                continue  # smaller ones need no such start
+            for _ in range(_AGAIN):
+                found = bank.run([_removed(begin, one, size).hypothesis])
+                against, own = _moments([one], found)
+                size += float(against[0] / own[0, 0])
+            if np.isfinite(size):
+                yield _removed(replace(base, start=begin.start), whole, size)
+
+
 def _gains(
     bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array]
 ) -> Iterator[Fault]:
     """Sensors and inputs in other units: of each, the factor that makes the record likeliest."""
-    sizes = np.nanmean(null.normalised**2, axis=0)
-    usual = (sizes > _SUSPICIOUS[0]) & (sizes < _SUSPICIOUS[1]) | np.isnan(sizes)
-    if np.isfinite(null.logs).all() and usual.all():
+    if not _is_suspicious(null):
         return
     p, m = base.measurements.shape[1], base.inputs.shape[1]
     parts: list[tuple[str, tuple[int, ...]]] = [("input", (j,)) for j in range(m)]
     parts += [("gain", (j,)) for j in range(p)] + [("gain", ())] * (p > 1)
-    # A wrong unit shows everywhere, also in the estimates from which the filters would begin.
-    short = replace(base, measurements=base.measurements[:_FEW], inputs=base.inputs[:_FEW])
-    begins = [replace(short, start=one) for one in starts] or [short]
+    short, begins = _beginnings(base, starts)
     places = {(part, k): _GAINS for part in parts for k in range(len(begins))}
     spacing = _GAINS[1] - _GAINS[0]
     while True:
@@ -373,13 +439,13 @@ def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[
     if 1 < p <= _MOST:
         for j in range(p):
             yield _Signature("shift", (j,), -moves * (np.arange(p) == j), none_x)
-    reached = bank.model.f.batch(null.corrected, inputs)
+    reached = bank.following(null.corrected, inputs)
     for j in range(base.inputs.shape[1]):
         without = inputs.copy()
         without[:, j] = 0.0
         yield _Signature(
-            "input", (j,), expected - bank.model.h.batch(null.states, without),
-            reached - bank.model.f.batch(null.corrected, without),
+            "input", (j,), expected - bank.expected(null.states, without),
+            reached - bank.following(null.corrected, without),
         )
     blocks = max(1, min(32 if p <= _MOST else 8, total // 4))
     edges = np.linspace(0, total, blocks + 1).astype(int).tolist()

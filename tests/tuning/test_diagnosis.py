@@ -87,6 +87,44 @@ def simple(system, y, noise=0.01, settings=None, **options):
     ).run(y)
 
 
+def heated(change=lambda following, x, u: following, offset=0.0):
+    """A run of a tank's temperature within bounds, with its model changed."""
+    generator, total = np.random.default_rng(0), 150
+    u, x = np.where(np.arange(total) // 50 == 1, 300.0, 320.0)[:, None], np.full(total, 320.0)
+    for t in range(1, total):
+        x[t] = 0.9 * x[t - 1] + 0.1 * u[t - 1, 0] + 0.03 * generator.standard_normal()
+    system = qpmhe.System(
+        lambda x, u: change(0.9 * x + 0.1 * u, x, u), lambda x: x, n=1, p=1, m=1,
+        states=qpmhe.Box([280.0], [400.0]))
+    covariances = {"prior": [[4.0]], "disturbance": [[0.03**2]], "noise": [[0.2**2]]}
+    return qpmhe.MovingHorizonEstimator(
+        system, qpmhe.ExtendedKalman(**covariances),
+        qpmhe.QuadraticCost.from_covariances(**covariances), horizon=5, initial_state=[318.0],
+        engine="python",
+    ).run(x[:, None] + 0.2 * generator.standard_normal((total, 1)) - offset, u)
+
+
+def test_a_model_that_fails_comes_first_and_never_ends_the_diagnosis():
+    def raises_without_input(following, x, u):
+        if x.ndim == 1 and u[0] == 0.0:
+            raise ValueError("no table")
+        return following
+
+    found = qpmhe.diagnose(heated(raises_without_input))
+    assert found.is_healthy, str(found)
+    found = qpmhe.diagnose(heated(lambda following, x, u: np.where(x < 305.0, np.nan, following)))
+    assert kinds(found) == ["failing"]
+    texts = [one.text for one in found.notes if one.kind == "failing"]
+    assert len(texts) == 1
+    assert "elsewhere the model fails" in texts[0]
+
+
+def test_a_sensor_with_another_zero_has_no_outliers():
+    (one,) = qpmhe.diagnose(heated(offset=273.15)).findings
+    assert (one.kind, one.text) == ("bias", "Sensor y1 is off by 1366 sigma (-273).")
+    assert "degrees C or K?" in one.remedy
+
+
 def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_noted():
     system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
     y = 0.5 * np.round(3.0 * 0.8 ** np.arange(100) / 0.5)
@@ -169,7 +207,8 @@ BAD = [
      lambda: RUN._replace(measurements=RUN.measurements[:29]).run(), {}),
     (InvalidInputError, r"all measurements .* missing; check the columns",
      lambda: RUN._replace(measurements=np.full((50, 1), np.nan)).run(), {}),
-    (InvalidInputError, "no measurements", lambda: qpmhe.Run.of(np.zeros(2), []), {}),
+    (InvalidInputError, "no measurements: it was loaded from a file",
+     lambda: qpmhe.Run.of(np.zeros(2), []), {}),
     (ShapeError, r"labels is .* expected 2 strings", RUN.run, {"labels": ["a"]}),
     (OptionError, "time_unit is 3; expected a string", RUN.run, {"time_unit": 3}),
 ]

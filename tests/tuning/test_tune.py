@@ -75,6 +75,9 @@ def test_known_covariances_are_within_the_intervals_of_a_table():
     left, right = tuning.plot()
     assert [label.get_text() for label in left.get_yticklabels()][-1] == "disturbance x1"
     assert right.get_xlabel() == "block"
+    assert all(tick == round(tick) for tick in right.get_xticks())
+    tuning.intervals["disturbance x1"] = (0.0, 3.0)  # drawn over many decades, with few labels
+    assert len(tuning.plot()[0].get_xticks()) < 10
 
 
 def test_neither_start_nor_units_matter():
