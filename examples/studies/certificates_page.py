@@ -292,8 +292,8 @@ def first_line(row: Row) -> str:
     return (
         f"| {case.name}{own} | {sides} | {sizes.disturbance:g}, {sizes.noise:g} "
         f"| {row.seconds:.1f} s | {short(row.bound, bound=True)} | {short(row.observed)} "
-        f"| **{row.bound / row.observed:.1f}** | {short(row.around, bound=True)} | {short(row.estimated)} "
-        f"| **{row.around / row.estimated:.1f}** |"
+        f"| **{row.bound / row.observed:.1f}** | {short(row.around, bound=True)} "
+        f"| {short(row.estimated)} | **{row.around / row.estimated:.1f}** |"
     )
 
 
