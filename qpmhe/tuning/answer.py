@@ -36,6 +36,8 @@ _WIDEST_LOG, _WIDEST = float(np.log(10.0)), 1.0
 _TOGETHER = 0.8
 # An axis whose ends are further apart has only powers of ten.
 _MANY_LABELS = 50.0
+# Standard errors by which a gain is beyond chance.
+_CHANCE = 2.0
 # Eigenvalues of the Hessian below this count as it; an interval is infinite then.
 _FLAT = 1e-6
 
@@ -110,7 +112,14 @@ class Tuning:
             structure.values, (structure.start, self._theta, theta)
         )
         self._find_intervals(theta, hessian)
+        outside = [
+            name for name, (low, high) in self.intervals.items()
+            if self._theta is refined and not low <= self.values[name] <= high
+        ]
         self.notes = tuple(
+            f"{name} is outside of its interval: the estimator is better with weights that are "
+            "less likely, so the model's error is not white noise." for name in outside
+        ) + tuple(
             f"input {j + 1} is constant in all records, so its effect cannot be identified; vary "
             "it." for j in constant
         ) + ((f"the model failed at some points of the search ({likelihood.failure}), which were "
@@ -179,9 +188,9 @@ class Tuning:
             return float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(count))
 
         share, doubt = gain(1, 2)
-        best = 2 if share > doubt else 1
+        best = 2 if share > _CHANCE * doubt else 1
         loss, spread = gain(best, 0)
-        if loss > spread:
+        if loss > _CHANCE * spread:
             return points[0], (
                 f"as at the start: the estimator's mean square {what} on {blocks} is larger with "
                 "the tuned weights. The model's error is not white noise, or the records are too "
@@ -272,7 +281,7 @@ class Tuning:
         samples = sum(int(mask.sum()) for mask in self._judged)
         before, after = (
             self._likelihood.value(at, self._judged) / samples
-            for at in (structure.start, self._likeliest)
+            for at in (structure.start, self._theta)
         )
         found = {"negative log likelihood per sample": (before, after)}
         sizes = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,10 @@ _MOST = 8
 _GAIN, _GAIN_EACH, _MOST_EACH = 12.0, 0.035, 3.0
 # A further fault must gain this share of what the first did: what that has left may be its shadow.
 _BESIDE = 0.05
+# Factors of covariances are searched together until the logarithms' steps are this small, in so
+# many runs at most. Where this factor more costs less than that in log likelihood, a factor has no
+# upper end.
+_FINE, _RUNS, _BEYOND, _COSTS = 0.04, 12, 16.0, 2.0
 
 
 class _Kind(NamedTuple):
@@ -43,18 +47,21 @@ class _Kind(NamedTuple):
     local: bool = False
 
 
+_SCALED = ("noise", "disturbance")
 # Effects: logarithms of factors, shares of a step or an input, deviations of a bias, samples.
 _KINDS = {
     "noise": _Kind(
         np.log(2.0),
-        "R{of} is too {small} by about {factor}: the measurements scatter {more} than it says.",
-        "{Multiply} the covariance of the noise by {factor}, or let qpmhe.tune choose the weights.",
+        "R{of} is too {small} by {about} {factor}: the measurements scatter {more} than it says.",
+        "{Multiply} the covariance of the noise{of} by {factor}{or_more}, or let qpmhe.tune choose "
+        "the weights.",
     ),
     "disturbance": _Kind(
         np.log(2.0),
-        "Q{of} is too {small} by about {factor}: the states move {more} than the model and Q say.",
-        "{Multiply} the covariance of the disturbance by {factor}, or let qpmhe.tune choose the "
-        "weights; look for what the model lacks.",
+        "Q{of} is too {small} by {about} {factor}: the states move {more} than the model and Q "
+        "say.",
+        "{Multiply} the covariance of the disturbance{of} by {factor}{or_more}, or let qpmhe.tune "
+        "choose the weights; look for what the model lacks.",
     ),
     "gain": _Kind(
         np.log(1.5),
@@ -98,7 +105,8 @@ _KINDS = {
 class Fault:
     """A fault that explains the record better than none.
 
-    The value is a factor; for a shift or a clock, samples; for a bias, in the sensor's unit.
+    The value is a factor, the least one if there is no `upper` end; for a shift or a clock,
+    samples; for a bias, in the sensor's unit.
     """
 
     kind: str
@@ -107,6 +115,7 @@ class Fault:
     subject: tuple[int, ...] = ()  # sensors, inputs or disturbances; all if empty
     span: tuple[int, int] | None = None  # first and last sample, if not the whole record
     gain: float = 0.0  # how much more likely the record is with it, as a logarithm
+    upper: bool = True
 
     def in_words(self, names: Names, deviations: Array, outliers: Array) -> Finding:
         """The finding, with the noise's deviations and the shares of outliers of each sensor."""
@@ -124,7 +133,9 @@ class Fault:
         grows = value > 1.0
         words = {
             "of": of, "sensors": sensors, "s": "s" * bool(subject), "value": number(value),
-            "factor": number(max(value, 1.0 / value)) if value > 0.0 else "",
+            "factor": number(float(f"{max(value, 1.0 / value):.2g}")) if value > 0.0 else "",
+            "about": "about" if self.upper else "a factor of more than",
+            "or_more": "" if self.upper else " or more",
             "small": "small" if grows else "large", "more": "more" if grows else "less",
             "Multiply": "Multiply" if grows else "Divide",
             "input": names.inputs[subject[0]] if self.kind in ("sign", "input") else "",
@@ -155,7 +166,7 @@ class Fault:
     def matters(self) -> bool:
         """Whether its effect is large enough to report."""
         size, noise = self.value, self.hypothesis.noise
-        if self.kind in ("noise", "disturbance", "gain"):
+        if self.kind in (*_SCALED, "gain"):
             size = np.log(size)
         elif self.kind in ("step", "input"):
             size -= 1.0
@@ -188,7 +199,82 @@ def search(
             best = replace(best, value=found[k].value * best.value, gain=found[k].gain + best.gain)
         found = [one for k, one in enumerate(found) if k not in same]
         found.insert(same[0] if same else len(found), best)
-    return found, null
+    return _together(bank, base, null, found)
+
+
+def _together(
+    bank: FilterBank, base: Hypothesis, null: Filtered, found: list[Fault]
+) -> tuple[list[Fault], Filtered]:
+    """Factors of covariances as the record is likeliest with all of them.
+
+    Each was found given those before it alone: it may have made up for one that came later.
+    """
+    some = [k for k, one in enumerate(found) if one.kind in _SCALED]
+    if not some or not np.isfinite(null.logs).all():
+        return found, null
+    logs = np.log([found[k].value for k in some])
+
+    def changed(moves: Sequence[float] | Array) -> Hypothesis:
+        hypothesis = base
+        for k, move in zip(some, moves, strict=True):
+            one = found[k]
+            hypothesis = _with_factor(
+                hypothesis, one.kind, one.subject, float(np.exp(move))
+            ).hypothesis
+        return hypothesis
+
+    def likelihoods(moves: Array) -> Array:
+        values = bank.run([base, *map(changed, moves)]).likelihoods[1:]
+        return np.where(np.isfinite(values), values, -np.inf)
+
+    at, steps = np.zeros(len(some)), 0.25 * np.abs(logs)
+    # From none to all of each, and then around the best.
+    tried = np.array(list(product(np.linspace(-1.0, 0.0, 5), repeat=len(some)))) * logs
+    around = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(some))))
+    for _ in range(_RUNS):
+        before, at = at, tried[int(np.argmax(likelihoods(tried)))]
+        if np.array_equal(before, at):
+            steps = 0.5 * steps
+        if steps.max() < _FINE:
+            break
+        tried = at + steps * around
+    signs, shares = np.sign(logs + at), np.linspace(0.0, 1.0, 17)
+    ends, count = np.eye(len(some)), len(shares)
+    tried = np.array([
+        at,
+        *(at + np.log(_BEYOND) * sign * end for sign, end in zip(signs, ends, strict=True)),
+        *(at - share * (logs + at) * end for end in ends for share in shares),
+    ])
+    values = likelihoods(tried)
+    fits = values[0] - values[1:] < _COSTS
+    told = list(found)
+    for i, k in enumerate(some):
+        total, upper = float(logs[i] + at[i]), not fits[i]
+        if not upper:  # the least one that fits
+            rows = fits[len(some) + i * count :][:count]
+            total *= 1.0 - float(shares[np.flatnonzero(rows)[-1]])
+        told[k] = replace(found[k], value=float(np.exp(total)), upper=upper)
+    base = changed(at)
+    told = [one for one in _disjoint(told, base) if one.kind not in _SCALED or one.matters]
+    return told, bank.run([base])
+
+
+def _disjoint(found: list[Fault], base: Hypothesis) -> list[Fault]:
+    """A factor of all components and one of some of them as factors of these and of the others."""
+    told = list(found)
+    for k, whole in enumerate(found):
+        if whole.kind not in _SCALED or whole.subject:
+            continue
+        parts = [j for j, one in enumerate(found) if one.kind == whole.kind and one.subject]
+        for j in parts:
+            told[j] = replace(found[j], value=found[j].value * whole.value)
+        covariance = base.noise if whole.kind == "noise" else base.disturbance
+        named = {i for j in parts for i in found[j].subject}
+        others = [i for i in np.flatnonzero(covariance.diagonal()).tolist() if i not in named]
+        if parts:
+            # None are left where each component has its own.
+            told[k] = replace(whole, subject=tuple(others), value=whole.value if others else 1.0)
+    return told
 
 
 def _best(

@@ -37,12 +37,19 @@ class Score:
     def __init__(
         self, data: list[Data], make: Callable[[dict[str, float]], System],
         kind: Callable[..., Observer], start: Weights, *, ahead: int, truth: bool,
-        options: dict[str, Any],
+        begins: bool, options: dict[str, Any],
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
         #: Steps ahead, and whether the truth is compared with.
         self.ahead, self.truth = ahead, truth
         self._robust, self._options, self._start = start.threshold is not None, options, start
+        # While the initial error lasts, the score depends on all weights against the prior: where
+        # that is given, Q and R would make up for it. So the first block does not tune, if there
+        # are others.
+        later = [~one.held & (begins | (one.block > one.block[0])) for one in data]
+        self._used = [
+            mask if mask.any() else ~one.held for mask, one in zip(later, data, strict=True)
+        ]
 
     @cached_property
     def scale(self) -> Array:
@@ -83,14 +90,12 @@ class Score:
         return [self._of_record(system, weights, one) for one in self._data]
 
     def total(self, weights: Weights) -> float:
-        """The mean score of the samples that are not held out; infinite where the model fails."""
+        """The mean score of the samples that tune; infinite where the model fails."""
         try:
             found = self.samples(weights)
         except (QpmheError, np.linalg.LinAlgError, FloatingPointError):
             return np.inf
-        used = np.concatenate([
-            each[~one.held] for each, one in zip(found, self._data, strict=True)
-        ])
+        used = np.concatenate([each[mask] for each, mask in zip(found, self._used, strict=True)])
         value = float(np.nanmean(used)) if np.isfinite(used).any() else np.inf
         return value if np.isfinite(value) else np.inf
 

@@ -17,17 +17,17 @@ from .._checks import Array, need
 from ..errors import ModelError, QpmheError
 from .likelihood import Likelihood
 from .score import Score
-from .structures import Structure
 
-_FORMAT = 1
+_FORMAT = 2
 # Seconds from checkpoint to checkpoint.
 _EVERY = 1.0
 _ITERATIONS, _REFINEMENTS = 200, 12
 # In place of infinity, which no line search survives: far above any cost per sample.
 _FAILED = 1e6
-# What a change of all standard deviations by e costs beside the score, which is about 1: where
-# the score says nothing, the likelihood's weights stay.
-_STAY = 1e-3
+# What costs beside the score, which is about 1: a measurement that is less likely by a factor of e,
+# and a change of all standard deviations by e. Where the score says little, as on a factor of all
+# covariances, the likelihood decides; where that says nothing either, the weights stay.
+_LIKELY, _STAY = 3e-2, 1e-3
 #: Of a normal variable, within 95 %.
 NORMAL = 1.959964
 # Step of the score's differences; the estimator's iterations make it less smooth than a filter.
@@ -268,34 +268,41 @@ def limit(
 
 
 def refine(
-    score: Score, structure: Structure, theta: Array, checkpoint: Checkpoint,
+    score: Score, likelihood: Likelihood, theta: Array, checkpoint: Checkpoint,
     advance: Callable[[str], None],
 ) -> Array:
-    """The minimum of the estimator's score, by differences of runs.
+    """The minimum of the estimator's score, by differences of runs, with a share of the likelihood.
 
     It starts at the likelihood's weights or, if these are worse, at the start weights.
     """
     known, value, done = checkpoint.known("estimator")
     if done and known is not None:
         return known
+    structure, least = likelihood.structure, likelihood.value(theta)
+    share = _LIKELY / sum(
+        int(one.observed[mask].sum())
+        for one, mask in zip(likelihood.data, likelihood.tuned, strict=True)
+    )
 
     def plain(point: Array) -> float:
         return score.total(structure.weights(structure.bounded(point)))
 
-    anchor = min((theta, structure.start), key=plain)
-    best: list[Any] = [anchor if known is None else known, value]
-
     def total(point: Array) -> float:
         return min(plain(point) + _STAY * float(np.sum((point - anchor) ** 2)), _FAILED)
 
+    anchor = min((theta, structure.start), key=plain)
+    best: list[Any] = [anchor if known is None else known, value]
+
     def cost(point: Array) -> tuple[float, Array]:
-        value, slope = total(point), np.zeros(len(point))
+        value, (unlikely, slope) = total(point), likelihood.gradient(point)
+        value = min(value + share * (unlikely - least), _FAILED)
         if value == _FAILED:
-            return _FAILED, slope
+            return _FAILED, np.zeros(len(point))
         if value < best[1]:
             best[:] = point.copy(), value
+        slope = share * slope
         for k, move in enumerate(_STEP * np.eye(len(point))):
-            slope[k] = (total(point + move) - total(point - move)) / (2 * _STEP)
+            slope[k] += (total(point + move) - total(point - move)) / (2 * _STEP)
             advance(f"estimator, score {best[1]:.5g}")
         checkpoint.note("estimator", best[0], best[1], False)
         return value, slope

@@ -69,8 +69,9 @@ def tune(
     First it maximises the likelihood of the innovations of an extended Kalman filter: that gives
     the size of each covariance, its 95 % interval, and what the records do not identify. Then it
     lowers the error of the estimator itself: of its predictions, or of its states where the
-    records have the truth. Some blocks of the records are held out of both; they judge, and a
-    change that does not improve on them by more than its standard error is rejected.
+    records have the truth; what this hardly depends on, as a factor of all covariances, stays as
+    likely as it was. Some blocks of the records are held out of both; they judge, and a change
+    that does not improve on them by two standard errors is rejected.
 
     Parameters
     ----------
@@ -197,7 +198,8 @@ def tune(
             "another initial_state or other parameters, or bound the states by System(states=...)."
         )
     score = Score(
-        data, make, observer, start, ahead=ahead, truth=objective == "truth", options=options
+        data, make, observer, start, ahead=ahead, truth=objective == "truth",
+        begins=any(name.startswith("prior ") for name in plan.names), options=options,
     )
     if objective != "likelihood":
         if sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
@@ -215,7 +217,7 @@ def tune(
         found, hessian = polish(likelihood, found)
         seconds, refined = {"likelihood": perf_counter() - began}, None
         if objective != "likelihood":
-            refined = refine(score, plan, found, kept, advance)
+            refined = refine(score, likelihood, found, kept, advance)
             seconds["estimator"] = perf_counter() - began - seconds["likelihood"]
         tuning = Tuning(likelihood, score, found, hessian, refined, seconds, labels, constant)
     kept.remove()

@@ -13,6 +13,7 @@ from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 from qpmhe.estimation.observability import prior_shares
 from qpmhe.tuning import observability
 from qpmhe.tuning.bank import FilterBank, Hypothesis
+from qpmhe.tuning.faults import Fault, _disjoint
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "studies"))
 
@@ -123,6 +124,56 @@ def test_a_sensor_with_another_zero_has_no_outliers():
     (one,) = qpmhe.diagnose(heated(offset=273.15)).findings
     assert (one.kind, one.text) == ("bias", "Sensor y1 is off by 1366 sigma (-273).")
     assert "degrees C or K?" in one.remedy
+
+
+def weighted_wrongly(noise, disturbance, moving=0.3):
+    """Two states that are measured, with covariances that are wrong by these factors."""
+    generator, a = np.random.default_rng(2), np.array([[0.9, 0.3], [0.0, 0.8]])
+    true = {"noise": np.array([0.01, 0.25]), "disturbance": np.array([0.01, moving**2])}
+    w, v = (np.sqrt(true[kind]) * generator.standard_normal((400, 2)) for kind in sorted(true))
+    x, u = np.zeros((401, 2)), generator.standard_normal((400, 1))
+    for t in range(400):
+        x[t + 1] = a @ x[t] + u[t] + w[t]
+    given = {"noise": np.diag(true["noise"] * noise), "prior": np.eye(2),
+             "disturbance": np.diag([0.01, 0.09] * np.array(disturbance))}
+    return qpmhe.diagnose(qpmhe.MovingHorizonEstimator(
+        qpmhe.System(lambda x, u: x @ a.T + u, lambda x: x, n=2, p=2, m=1),
+        qpmhe.ExtendedKalman(**given), qpmhe.QuadraticCost.from_covariances(**given), horizon=10,
+        initial_state=np.zeros(2),
+    ).run(x[:-1] + v, u))
+
+
+def factors(diagnosis):
+    return {one.text.split(" is ")[0]: float(one.text.split(" by about ")[1].split(":")[0])
+            for one in diagnosis.findings}
+
+
+def test_factors_of_covariances_that_are_wrong_together():
+    for noise in (50.0, 200.0):
+        assert factors(weighted_wrongly([1.0, noise], [1.0, 1.0])) == {
+            "R of sensor y2": pytest.approx(noise, rel=0.1)}
+    found = weighted_wrongly([0.25, 50.0], [1.0, 120.0])
+    assert factors(found) == {
+        "R of sensor y2": pytest.approx(50.0, rel=0.1), "Q of x2": pytest.approx(120.0, rel=0.3),
+        "R of sensor y1": pytest.approx(4.0, rel=0.4)}
+    (remedy,) = (one.remedy for one in found.findings if "y2" in one.text)
+    assert remedy.startswith("Divide the covariance of the noise of sensor y2 by ")
+
+
+def test_a_factor_of_all_sensors_beside_one_of_a_single_sensor():
+    base = Hypothesis(*np.zeros((2, 9, 3)), np.eye(3), np.eye(3), np.zeros(3), np.eye(3))
+    faults = [Fault("noise", 1 / 200, base, (1,)), Fault("disturbance", 9.0, base),
+              Fault("noise", 4.0, base)]
+    told = [(one.kind, one.subject, one.value) for one in _disjoint(faults, base)]
+    assert told == [("noise", (1,), 1 / 50), ("disturbance", (), 9.0), ("noise", (0, 2), 4.0)]
+
+
+def test_a_factor_without_an_upper_end():
+    """The second state is not disturbed at all."""
+    (one,) = weighted_wrongly([1.0, 1.0], [1.0, 30.0], moving=0.0).findings
+    least = one.text.removeprefix("Q of x2 is too large by a factor of more than ").split(":")[0]
+    assert 5.0 < float(least) < 4000.0
+    assert f"Divide the covariance of the disturbance of x2 by {least} or more," in one.remedy
 
 
 def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_noted():

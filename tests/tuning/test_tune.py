@@ -190,6 +190,41 @@ def test_the_estimators_own_error_is_lowered(objective):
         assert after < before
 
 
+@pytest.mark.parametrize("objective", ["prediction", "truth"])
+def test_the_estimators_own_error_leaves_the_scale_to_the_likelihood(objective):
+    """The initial error is larger than the prior says: smaller Q and R would make up for that."""
+    record = simulated(2, 300, truth=objective == "truth")
+    options = {"prior": 0.3 * np.eye(2), "initial_state": [8, -8], "horizon": 5, "max_qps": 1}
+    tuning = tuned([record], objective=objective, **options)
+    changes = [tuning.values[name] / tuning.likeliest[name] for name in tuning.values]
+    assert np.prod(changes) == pytest.approx(1.0, rel=0.4)
+    assert tuning.values["noise y1"] == pytest.approx(tuning.likeliest["noise y1"], rel=0.2)
+
+
+@pytest.mark.parametrize("errors", [1.5, 3.0])
+def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors, monkeypatch):
+    """The second search's weights are less likely, and better by so many standard errors."""
+    likely = tuned(structure="scalar", held_out=0.0)
+    gains = 0.01 * (errors + np.sqrt(11.0) * np.resize([-1.0, 1.0], 12))
+    means = iter([np.full(12, 2.0), np.ones(12), 1.0 - gains])
+    monkeypatch.setattr(qpmhe.tuning.Tuning, "_block_means", lambda *_: next(means))
+    monkeypatch.setattr(tuning_module, "refine", lambda score, structure, theta, *_: theta + 0.7)
+    tuning = tuned(structure="scalar", held_out=0.0, objective="prediction", max_qps=1)
+    found, least = (
+        one.scores["negative log likelihood per sample"][1] for one in (tuning, likely)
+    )
+    if errors < 2.0:
+        assert tuning.values == tuning.likeliest
+        assert "no gain beyond chance" in tuning.judgement
+        assert found == pytest.approx(least, rel=1e-6)
+        assert not tuning.notes
+    else:
+        assert tuning.values["noise level"] == pytest.approx(
+            np.exp(0.7) * tuning.likeliest["noise level"])
+        assert found > least + 0.1
+        assert "noise level is outside of its interval: the estimator is better" in str(tuning)
+
+
 def test_what_was_found_makes_an_estimator_and_compares_horizons():
     y, u = simulated(steps=300)
     tuning = tuned([(y, u)], horizon=6)
