@@ -25,7 +25,7 @@ from .kept_run import KeptRun
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
 from .record_model import RecordModel, load_record_model
-from .steps import Step, Steps
+from .steps import MAX_GAP, Step, Steps
 from .tables import RecordError
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def estimate_record(
         loaded = load_record_model(model, before, **options)
         steps = Steps(
             loaded.estimator.system, usual=loaded.dt if dt is None else dt, scale=time_scale,
-            equal=equal_steps, max_gap=max_gap,
+            equal=equal_steps, max_gap=MAX_GAP if max_gap is None else max_gap,
         )
         bounds, asked = None, {}
         if bound:
@@ -538,6 +538,8 @@ class _Session:
                 f"{summary.inserted} samples were inserted into gaps, more than were measured; "
                 "give --time-scale if the record's unit of time is not the model's."
             )
+        if self._steps.note:
+            summary.notes.append(self._steps.note)
         if reader.cut is not None:
             summary.notes.append(
                 f"the last line of {reader.name}, {reader.cut}, has no end of line and may be cut "
