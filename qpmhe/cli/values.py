@@ -23,6 +23,12 @@ def read_box(option: str, text: str, width: int | None = None, kind: str = "comp
             f"{option} is {text!r}; expected low:high for {whom}, separated by commas, as in "
             "0.1:9,-1:9."
         ) from error
+    for k, (least, most) in enumerate(zip(low, high, strict=True), start=1):
+        if least > most:
+            raise OptionError(
+                f"pair {k} of {option} is {least:g}:{most:g}; expected low:high, the lower "
+                "number first."
+            )
     return Box(low, high)
 
 

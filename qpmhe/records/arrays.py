@@ -31,8 +31,8 @@ class RecordArrays(NamedTuple):
 def read_record(
     path: str, model: RecordModel, *, time: str | None = None, outputs: str | None = None,
     inputs: str | None = None, truth: str | None = None, dt: float | None = None,
-    time_scale: float = 1.0, max_gap: int | None = None, report: Callable[[str], None] | None = None,
-    **table: Any,
+    time_scale: float = 1.0, max_gap: int | None = None,
+    report: Callable[[str], None] | None = None, **table: Any,
 ) -> RecordArrays:
     """Read a record of a model; the options are those of ``qpmhe estimate``, and ``truth``.
 

@@ -18,10 +18,10 @@ from .tables import RecordError, Row, open_table
 
 _TIMES = ("time", "t", "timestamp", "datetime", "date_time", "zeit", "zeitstempel")
 # Units with which a column called "t" is the time, and no temperature.
-_TIME_UNITS = frozenset(
-    "ns us \u00b5s \u03bcs ms s sec second seconds min minute minutes h hr hour hours d day days "
-    "sample samples step steps".split()
-)
+_TIME_UNITS = frozenset((
+    "ns", "us", "\u00b5s", "\u03bcs", "ms", "s", "sec", "second", "seconds", "min", "minute",
+    "minutes", "h", "hr", "hour", "hours", "d", "day", "days", "sample", "samples", "step", "steps",
+))
 # By option: the letter of its signals, and what one of them is.
 _KINDS = {
     "outputs": ("y", "output"), "inputs": ("u", "input"), "truth": ("x", "true state"),
@@ -259,7 +259,7 @@ class _Header:
 
     def find_time(self, taken: Iterable[int]) -> int:
         """The column with one of the usual names; not an output, input or temperature."""
-        others = {i: "is used already" for i in taken}
+        others = dict.fromkeys(taken, "is used already")
         for i, name in enumerate(self.names):
             bare = _UNIT.sub("", name)
             if bare.lower() == "t" and i not in others:

@@ -261,11 +261,13 @@ def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
         return None
     if resume:
         return found
-    state = "a finished estimation" if found.finished else "an estimation that was interrupted"
+    if found.finished:
+        state, resumed = "a finished estimation", "if the record has grown, estimate the rest"
+    else:
+        state, resumed = "an estimation that was interrupted", "continue it"
     raise CheckpointError(
-        f"{output.name} holds {state} (its checkpoint was taken after {found.samples} samples); "
-        "continue with --resume (a finished one, if the record has grown), start again with "
-        "--overwrite, or give another --out."
+        f"{output.name} holds {state}; {resumed} with --resume, start again with --overwrite, or "
+        "give another --out."
     )
 
 
@@ -465,10 +467,13 @@ class _Session:
         summary.failed += 1
         if summary.failed > 1:
             return
-        remedy = (
-            "Correct the model." if is_mistake
-            else "Bound the states, or make the model defined on all of them."
-        )
+        remedy = "Bound the states, or make the model defined on all of them."
+        if is_mistake:
+            remedy = "Correct the model."
+        elif estimate.message.startswith("the observer"):
+            remedy = "Check the observer's covariances or gain, and the units."
+        elif self._mhe.system.states is not None:
+            remedy = "Make the model defined on all states within their bounds, or narrow these."
         summary.failure = f"{self._reader.place(sample)}: {estimate.message} {remedy}"
         if self._report is not None:
             self._report(

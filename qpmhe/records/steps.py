@@ -64,7 +64,8 @@ class Steps:
             raise ValueError(
                 f"a gap of {length:.6g} is {number} steps of {self.usual:.6g}; at most "
                 f"{self.max_gap} samples in a row may be missing. Split the record there, "
-                f"{self._raise_it}or give --time-scale if the record's unit of time is not the model's"
+                f"{self._raise_it}or give --time-scale if the record's unit of time is not the "
+                "model's"
             )
         each = length / number
         rounding = _ROUNDING * self.usual + 4e-16 * magnitude * self._scale
