@@ -95,10 +95,7 @@ def estimate(
         bool,
         typer.Option("--equal-steps", help="Require equal steps; each row is written at once."),
     ] = False,
-    max_gap: Annotated[
-        int | None,
-        typer.Option(min=0, help="Largest number of missing samples in a row; default 500."),
-    ] = None,
+    max_gap: options.MaxGap = 500,
     skip_repeated: options.SkipRepeated = False,
     separator: options.Separator = None,
     decimal: options.Decimal = "auto",

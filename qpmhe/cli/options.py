@@ -25,6 +25,9 @@ Step = Annotated[
 ]
 TimeScale = Annotated[float, typer.Option(help="The record's unit of time in the model's: 0.001 "
                                                "for a record in ms and a model in s.")]
+MaxGap = Annotated[
+    int, typer.Option(min=0, help="Largest number of missing samples in a row.")
+]
 Engine = Annotated[
     str | None,
     typer.Option(help="python, compiled, or auto: the compiled step if qpmhe compile has made it."),

@@ -63,6 +63,14 @@ def tune(
     engine: options.Engine = None,
     dt: options.Step = None,
     time_scale: options.TimeScale = 1.0,
+    max_gap: options.MaxGap = 500,
+    skip_repeated: options.SkipRepeated = False,
+    separator: options.Separator = None,
+    decimal: options.Decimal = "auto",
+    encoding: options.Encoding = "utf-8",
+    skip_lines: options.SkipLines = 0,
+    time_format: options.TimeFormat = None,
+    missing: options.Missing = None,
     overwrite: options.Overwrite = False,
     picture: Annotated[
         Path | None, typer.Option(help="PNG of the weights and the held-out scores.")
@@ -94,7 +102,9 @@ def tune(
     read = [
         read_record(
             path, loaded, time=time, outputs=outputs, inputs=inputs, truth=truth, dt=dt,
-            time_scale=time_scale,
+            time_scale=time_scale, max_gap=max_gap, skip_repeated=skip_repeated,
+            separator=separator, decimal=decimal, encoding=encoding, skip_lines=skip_lines,
+            time_format=time_format, missing=missing or (), report=_note,
         ) for path in record
     ]
     records = [
@@ -133,6 +143,12 @@ def tune(
     console.print(
         f"{sum(tuning.seconds.values()):.1f} s; wrote {escape(str(out))}. Use it: qpmhe estimate "
         f"{escape(model)} RECORD --weights {escape(str(out))}", highlight=False, soft_wrap=True,
+    )
+
+
+def _note(text: str) -> None:
+    Console(stderr=True).print(
+        f"[yellow]note:[/] {escape(text)}", highlight=False, soft_wrap=True
     )
 
 

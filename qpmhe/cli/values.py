@@ -28,6 +28,12 @@ def read_box(option: str, text: str, width: int | None = None, kind: str = "comp
             f"{option} is {text!r}; expected low:high for each of the {kind}"
             f"{'' if width is None else f' ({width})'}, separated by commas, as in {such}."
         ) from error
+    for k, (least, most) in enumerate(zip(low, high, strict=True), start=1):
+        if least > most:
+            raise OptionError(
+                f"pair {k} of {option} is {least:g}:{most:g}; expected low:high, the lower "
+                "number first."
+            )
     return Box(low, high)
 
 

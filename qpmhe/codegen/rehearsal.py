@@ -13,6 +13,7 @@ from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -47,6 +48,11 @@ _MANY_STATES, _FEW_SAMPLES = 40, 12
 _NO_SQUARE = 1e150
 # Of a record on which the nudge has grown to this share of J, rounding decides.
 _LOST = 1e-2
+# Of one whose numbers grow to so many times the record's, too.
+_AWAY = 1e8
+# Where fewer samples could be compared, another record is tried, from elsewhere and with inputs
+# that are smaller by this factor: with large ones, some models run away at once.
+_ENOUGH, _RECORDS, _SMALLER = 5, 3, 1e-2
 # So many steps, of which the Python step halves the cost and C none, are no chance.
 _MISSED = 3
 # Where the terms of J are so much larger than J, not every factorisation of H succeeds.
@@ -93,11 +99,14 @@ def estimator_fault(
             if varied is None:
                 weighed, options = cost, usual
                 varied = library.varied(system, observer, cost, usual) or library
-            fault = _Rehearsal(
-                varied, interpreter, system, observer, weighed, options, is_wild
-            ).fault()
-            if fault:
-                return fault
+            for attempt in range(_RECORDS):
+                rehearsal = _Rehearsal(
+                    varied, interpreter, system, observer, weighed, options, is_wild, attempt
+                )
+                if fault := rehearsal.fault():
+                    return fault
+                if rehearsal.compared >= _ENOUGH:
+                    break
     return ""
 
 
@@ -226,15 +235,21 @@ class _Sample(NamedTuple):
 
 
 class _Rehearsal:
-    """One record run through the library and the Python step."""
+    """One record run through the library and the Python step.
+
+    ``compared`` is the number of samples before rounding decided or numbers ran away.
+    """
 
     def __init__(
         self, library: EstimatorLibrary, interpreter: Interpreter, system: System,
         observer: Observer, cost: Cost, settings: Settings, is_wild: bool,
+        attempt: int,
     ) -> None:
         n, p = system.n, system.p
+        self.compared = 0
         self._library, self._generator = library, np.random.default_rng(int(is_wild))
-        first = next(points(interpreter, system.states, int(is_wild)))[0][0]
+        batches = points(interpreter, system.states, int(is_wild))
+        first = next(islice(batches, attempt, None))[0][0]
         start = first * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
         with suppress(ModelError):  # of a model that has no finite values there
             start = check_start(system, observer, cost, start)
@@ -250,17 +265,22 @@ class _Rehearsal:
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
         count = min(settings.horizon + _BY_RUN + _BY_MEMBERS, most)
         self._own = _own_conditions(system, cost, settings)
+        states = self._states(first, count, interpreter, _SMALLER**attempt)
+        self._size = max(abs(x).max() for x in (start, *(x for x, _ in states)))
         self._record = [
-            self._sample(t, x, u, interpreter, is_wild)
-            for t, (x, u) in enumerate(self._states(first, count, interpreter))
+            self._sample(t, x, u, interpreter, is_wild) for t, (x, u) in enumerate(states)
         ]
+        # What residuals as large as the states and measurements themselves would cost.
+        sizes = np.full(len(cost.stage_weight), self._size)
+        sizes[-p:] = max(np.nan_to_num(abs(one.y)).max() for one in self._record)
+        self._cost = float(cost.stage_weight.diagonal() @ sizes**2)
 
     def _states(
-        self, first: Array, count: int, interpreter: Interpreter
+        self, first: Array, count: int, interpreter: Interpreter, scale: float
     ) -> list[tuple[Array, Array]]:
         """Noisy states that stay near the first, and inputs."""
         model, generator, x, found = interpreter.model, self._generator, first, []
-        for u in generator.uniform(0.2, 1.0, (count, model.m)):
+        for u in scale * generator.uniform(0.2, 1.0, (count, model.m)):
             found.append((x, u))
             x = interpreter.value("f", x, u, model.dt or 0.0)
             x = x * (1 + 0.05 * generator.standard_normal(model.n))
@@ -298,20 +318,31 @@ class _Rehearsal:
             self._python.guide.found = self._nudged.guide.found = found
             expected = self._python.step(*sample, 0.0)
             nudged = self._nudged.step(sample.y * self._nudge_y, *sample[1:], 0.0)
-            if abs(expected.candidate).max() > _NO_SQUARE or self._is_lost(expected, nudged):
+            if self._is_lost(expected, nudged):
+                estimates.pop()
                 break
             fault = self._step_fault(found, expected, nudged, sample.y)
             if fault:
                 return fault
             if not math.isfinite(expected.candidate_cost):
                 break
+            self.compared += 1
         guide = self._python.guide
         if guide.missed >= _MISSED and not guide.improved:
             return "it improves no estimate where the Python step does"
         return self._many_fault(estimates)
 
     def _is_lost(self, expected: Estimate, nudged: Estimate) -> bool:
-        """Whether the record is chaotic by now: two that nearly agreed have separate ways."""
+        """Whether the record is chaotic by now: two that nearly agreed have separate ways.
+
+        Or its numbers have run away, so that they soon will.
+        """
+        largest = max(abs(expected.candidate).max(), abs(expected.observer_state).max())
+        apart = abs(nudged.candidate - expected.candidate).max()
+        if not (
+            largest <= _AWAY * self._size and apart <= _LOST * abs(expected.candidate).max()
+        ) or _AWAY**2 * self._cost < expected.candidate_cost < math.inf:
+            return True
         size = abs(expected.candidate_cost) + self._python.guide.magnitudes["candidate_cost"]
         return abs(nudged.candidate_cost - expected.candidate_cost) > _LOST * size
 
@@ -345,12 +376,14 @@ class _Rehearsal:
             got, true, other = (getattr(one, name) for one in (found, expected, nudged))
             allowed = _WEIGHT * np.nan_to_num(abs(other - true)) + ROUNDING * sizes
             if _differs(got, true, allowed):
-                return f"{name} of an estimate differ from those by CasADi's interpreter"
+                return f"an estimate has other numbers in {name!r} than by CasADi's interpreter"
         return ""
 
     def _many_fault(self, estimates: list[Estimate]) -> str:
         """Whether the functions for many samples give what those for one have given."""
         library, count = self._library, min(_BY_RUN, len(estimates))
+        if not count:
+            return ""
         ys, us = (np.array([getattr(one, name) for one in self._record]) for name in ("y", "u"))
         memory, workspace = library.estimators(self._start[None]), library.workspace()
         log, out = library.log((count,)), np.zeros(1, library.estimate_type)

@@ -216,7 +216,12 @@ class Cost(ABC):
         self._kept = max(_KEPT_LEAST, _KEPT_BYTES // self.stage_weight.nbytes)
 
     def __repr__(self) -> str:
-        return representation(self)
+        factor = self.disturbance_factor
+        if factor is None:
+            return representation(self)
+        # The weight alone belongs to the factor's directions.
+        covariance = factor @ inverse(self.disturbance) @ factor.T
+        return representation(self, disturbance=None, disturbance_covariance=covariance)
 
     @property
     def r(self) -> int:

@@ -57,12 +57,13 @@ _TEXTS = {
         "The QP solver returned no usable iterate; see the estimate's message."
     ),
     Status.SOLVER_STOPPED: (
-        "A QP was not solved to tolerance; its iterate was evaluated anyway. Raise "
-        "max_solver_iterations if the cost stays too far from the converged cost."
+        "A QP was not solved to tolerance (by backend='banded': without the inequalities that "
+        "its solution misses); its iterate was evaluated anyway. If the cost stays too far from "
+        "the converged cost, raise max_solver_iterations, or use another backend, such as 'auto'."
     ),
     Status.MODEL_FAILED: (
-        "A model function raised or was not finite; bound the states, or define the "
-        "model for all states."
+        "A function of the model, the observer or the cost raised or was not finite; bound the "
+        "states, define the model for all of them, or check the observer's gain or covariances."
     ),
     Status.FAILED_STAGE: (
         "The model failed at an earlier stage that is still in the window: the candidate has "

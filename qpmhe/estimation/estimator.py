@@ -438,13 +438,16 @@ class MovingHorizonEstimator:
             self._partial[index] = given
         return self._partial, own
 
-    def _input(self, u: ArrayLike | None, parameters: ArrayLike | None = None) -> Array:
+    def _input(
+        self, u: ArrayLike | None, parameters: ArrayLike | None = None, call: str = "update(y, u)"
+    ) -> Array:
         """u(t), the parameters behind the rest."""
         count, full = self._inputs, self._full_input
         if u is None:
             if count:
                 raise InvalidInputError(
-                    f"u is missing; the system has {count} input{'s' * (count != 1)}: update(y, u)."
+                    f"{call[-2]} is missing; the system has {count} "
+                    f"input{'s' * (count != 1)}: {call}."
                 )
         elif count == 0:
             beside = " beside its parameters" if self.system.m else ""
@@ -550,7 +553,7 @@ class MovingHorizonEstimator:
                     f"inputs has {len(us)} samples; expected {len(ys)}, one for each measurement."
                 )
         elif self._inputs:
-            self._input(None)
+            self._input(None, call="run(Y, U)")
         whole = self._with_parameters(us, len(ys))
         at_once = None
         try:

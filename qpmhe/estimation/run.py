@@ -280,8 +280,11 @@ class Run:
         except (
             OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile
         ) as error:
+            what = f"{type(error).__name__}: {error}"
+            if "allow_pickle" in what:  # what NumPy says of any file that is none of its own
+                what = "it is no .npz file of numbers"
             raise InvalidInputError(
-                f"{path} cannot be read as a run ({type(error).__name__}: {error}); expected a "
+                f"{path} cannot be read as a run ({what}); expected a "
                 "file that Run.save wrote."
             ) from error
         return run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -317,19 +318,39 @@ class Window(Stages):
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
         model_failed = not math.isfinite(cost)
+        jacobian_failed = not model_failed and self.has_terms and not self._jacobians_finite
+        if (model_failed or jacobian_failed) and not self.failure:
+            what = self._not_finite(k, time, observed)
+            self.failure = f"{what} at x = {self._stage_views[k].z.tolist()}."
         if model_failed:
             self._fill_failed(k)
         self._stage_costs[k] = cost
-        jacobian_failed = not model_failed and self.has_terms and not self._jacobians_finite
-        if (model_failed or jacobian_failed) and not self.failure:
-            what = "the model, the observer or the cost" if model_failed else "a Jacobian"
-            self.failure = f"{what} is not finite at x = {self._stage_views[k].z.tolist()}."
         if observed is not None and self._is_missing(time, observed):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
         if self._rejects:
             self._report_rejected(k)
+
+    def _not_finite(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> str:
+        """What is not finite at stage k: evaluates the model again to find out."""
+        view = self._stage_views[k]
+        with suppress(Exception), np.errstate(all="ignore"):
+            model, u = self._fill_sample(k, time, observed)
+            for name, function in (("f", model.f), ("h", model.h)):
+                value = np.asarray(function(view.z, u))
+                used = value if observed is None or name == "f" else value[observed]
+                if not np.isfinite(used).all():
+                    return f"{name} is {value.tolist()}"
+            if self._with_jacobians:
+                for name, jacobian in (("f", model.f_jacobian), ("h", model.h_jacobian)):
+                    if not np.isfinite(jacobian(view.z, u)).all():
+                        return f"the Jacobian of {name} is not finite"
+            if not np.isfinite(view.terms.disturbance).all():
+                return "the observer's correction is not finite"
+            if not np.isfinite(view.z_next).all():
+                return "the observer's next state is not finite"
+        return "the observer or the cost is not finite"
 
     @property
     def rejected(self) -> NDArray[np.bool_] | None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._checks import Array
-from ..model.system import System
 from .measurements import ColumnNames, Measurement, RecordReader, seconds_between
 from .record_model import RecordModel
 from .steps import Steps
@@ -30,23 +31,28 @@ class RecordArrays(NamedTuple):
 def read_record(
     path: str, model: RecordModel, *, time: str | None = None, outputs: str | None = None,
     inputs: str | None = None, truth: str | None = None, dt: float | None = None,
-    time_scale: float = 1.0, **table: Any,
+    time_scale: float = 1.0, max_gap: int | None = None,
+    report: Callable[[str], None] | None = None, **table: Any,
 ) -> RecordArrays:
-    """Read a record of a model; the options are those of ``qpmhe estimate``, and ``truth``."""
+    """Read a record of a model; the options are those of ``qpmhe estimate``, and ``truth``.
+
+    What the user should know of its steps goes to `report`.
+    """
     system, usual = model.estimator.system, model.dt if dt is None else dt
     columns = ColumnNames(model.outputs, model.inputs, time, outputs, inputs)
-    found = _read(path, columns, system, usual, time_scale, table)
+    make_steps = partial(Steps, system, usual=usual, scale=time_scale, max_gap=max_gap)
+    steps = make_steps()
+    found = _read(path, columns, steps, table)
+    if report is not None and steps.note:
+        report(f"{path}: {steps.note}")
     if truth is None:
         return found
     columns = ColumnNames(model.states, (), time, truth, option="truth")
-    return found._replace(states=_read(path, columns, system, usual, time_scale, table)[0])
+    return found._replace(states=_read(path, columns, make_steps(), table)[0])
 
 
-def _read(
-    path: str, columns: ColumnNames, system: System, usual: float | None, scale: float,
-    table: dict[str, Any],
-) -> RecordArrays:
-    reader, steps = RecordReader(path, columns, **table), Steps(system, usual=usual, scale=scale)
+def _read(path: str, columns: ColumnNames, steps: Steps, table: dict[str, Any]) -> RecordArrays:
+    reader = RecordReader(path, columns, **table)
     ys: list[Array] = []
     us: list[Array] = []
     lengths: list[float | None] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
@@ -16,13 +16,19 @@ from .._checks import Array, count
 from ..errors import InvalidInputError, OptionError
 from .tables import RecordError, Row, open_table
 
-_TIMES = ("time", "t", "timestamp", "datetime", "date_time")
+_TIMES = ("time", "t", "timestamp", "datetime", "date_time", "zeit", "zeitstempel")
+# Units with which a column called "t" is the time, and no temperature.
+_TIME_UNITS = frozenset((
+    "ns", "us", "\u00b5s", "\u03bcs", "ms", "s", "sec", "second", "seconds", "min", "minute",
+    "minutes", "h", "hr", "hour", "hours", "d", "day", "days", "sample", "samples", "step", "steps",
+))
 # By option: the letter of its signals, and what one of them is.
 _KINDS = {
     "outputs": ("y", "output"), "inputs": ("u", "input"), "truth": ("x", "true state"),
 }
 # "Voltage (V)", "Voltage [V]", "Voltage / V"
 _UNIT = re.compile(r"\s*(\([^()]*\)|\[[^\[\]]*\]|/\s*\S+)$")
+_TIME, _NAME_TIME = "the time", "name it with --time COLUMN."
 # An error shows so many names, and so much of each.
 _NAMES_SHOWN, _LETTERS_SHOWN = 40, 60
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "null", "none"})
@@ -206,15 +212,17 @@ class ColumnNames:
     def find(self, header: Sequence[str], file: str, line: int | None = None) -> Columns:
         """The columns in a header; RecordError where one is missing or ambiguous."""
         table = _Header([name.strip() for name in header], file, line)
-        times = _TIMES if self.time is None else (self.time,)
-        time = table.find(times, "the time", "name it with --time COLUMN.")
         outputs = _find(table, self.option, self.outputs, self.output_columns)
         inputs = _find(table, "inputs", self.inputs, self.input_columns)
         if all(position < 0 for position in outputs):
             kind = _KINDS[self.option][1]
             raise OptionError(f"--{self.option} leaves out all {kind}s; expected a column for at "
                               "least one.")
-        if time in (*outputs, *inputs):
+        taken = frozenset((*outputs, *inputs))
+        if self.time is None:
+            return Columns(table.find_time(taken), outputs, inputs)
+        time = table.find((self.time,), _TIME, _NAME_TIME)
+        if time in taken:
             raise OptionError(
                 f"column {header[time]!r} is both the time and something else; choose a different "
                 f"column for each with --time, --{self.option} and --inputs."
@@ -249,8 +257,31 @@ class _Header:
     file: str
     line: int | None
 
-    def find(self, wanted: Sequence[str], what: str, remedy: str) -> int:
-        """The column of the first of these names; case does not matter, nor a unit behind it."""
+    def find_time(self, taken: Iterable[int]) -> int:
+        """The column with one of the usual names; not an output, input or temperature."""
+        others = dict.fromkeys(taken, "is used already")
+        for i, name in enumerate(self.names):
+            bare = _UNIT.sub("", name)
+            if bare.lower() == "t" and i not in others:
+                unit = name[len(bare):].strip("()[]/ ").lower()
+                if unit and unit not in _TIME_UNITS:
+                    others[i] = "has no unit of time"
+                elif bare == "T" and not unit:
+                    others[i] = "may be a temperature"
+        reasons = "; ".join(
+            f"{self.names[i]!r} {reason}" for i, reason in others.items()
+            if _UNIT.sub("", self.names[i]).lower() in _TIMES
+        )
+        remedy = f"{_NAME_TIME} Not taken: {reasons}." if reasons else _NAME_TIME
+        return self.find(_TIMES, _TIME, remedy, others)
+
+    def find(
+        self, wanted: Sequence[str], what: str, remedy: str, others: Container[int] = ()
+    ) -> int:
+        """The column of the first of these names; case does not matter, nor a unit behind it.
+
+        Columns in `others` are something else.
+        """
         lower = [name.lower() for name in self.names]
         bare = [_UNIT.sub("", name) for name in lower]
         for name in wanted:
@@ -258,7 +289,7 @@ class _Header:
             for names, one in (
                 (self.names, name), (lower, small), (bare, small), (bare, _UNIT.sub("", small)),
             ):
-                found = [i for i, each in enumerate(names) if each == one]
+                found = [i for i, each in enumerate(names) if each == one and i not in others]
                 if len(found) == 1:
                     return found[0]
                 if found:

@@ -25,7 +25,7 @@ from .kept_run import KeptRun
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
 from .record_model import RecordModel, load_record_model
-from .steps import Step, Steps
+from .steps import MAX_GAP, Step, Steps
 from .tables import RecordError
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def estimate_record(
         loaded = load_record_model(model, before, **options)
         steps = Steps(
             loaded.estimator.system, usual=loaded.dt if dt is None else dt, scale=time_scale,
-            equal=equal_steps, max_gap=max_gap,
+            equal=equal_steps, max_gap=MAX_GAP if max_gap is None else max_gap,
         )
         bounds, asked = None, {}
         if bound:
@@ -261,11 +261,13 @@ def _found(output: Output, resume: bool, overwrite: bool) -> Checkpoint | None:
         return None
     if resume:
         return found
-    state = "a finished estimation" if found.finished else "an estimation that was interrupted"
+    if found.finished:
+        state, resumed = "a finished estimation", "if the record has grown, estimate the rest"
+    else:
+        state, resumed = "an estimation that was interrupted", "continue it"
     raise CheckpointError(
-        f"{output.name} holds {state} (its checkpoint was taken after {found.samples} samples); "
-        "continue with --resume (a finished one, if the record has grown), start again with "
-        "--overwrite, or give another --out."
+        f"{output.name} holds {state}; {resumed} with --resume, start again with --overwrite, or "
+        "give another --out."
     )
 
 
@@ -465,10 +467,13 @@ class _Session:
         summary.failed += 1
         if summary.failed > 1:
             return
-        remedy = (
-            "Correct the model." if is_mistake
-            else "Bound the states, or make the model defined on all of them."
-        )
+        remedy = "Bound the states, or make the model defined on all of them."
+        if is_mistake:
+            remedy = "Correct the model."
+        elif estimate.message.startswith("the observer"):
+            remedy = "Check the observer's covariances or gain, and the units."
+        elif self._mhe.system.states is not None:
+            remedy = "Make the model defined on all states within their bounds, or narrow these."
         summary.failure = f"{self._reader.place(sample)}: {estimate.message} {remedy}"
         if self._report is not None:
             self._report(
@@ -538,6 +543,8 @@ class _Session:
                 f"{summary.inserted} samples were inserted into gaps, more than were measured; "
                 "give --time-scale if the record's unit of time is not the model's."
             )
+        if self._steps.note:
+            summary.notes.append(self._steps.note)
         if reader.cut is not None:
             summary.notes.append(
                 f"the last line of {reader.name}, {reader.cut}, has no end of line and may be cut "

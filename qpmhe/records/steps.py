@@ -14,7 +14,9 @@ _JITTER = 0.3
 # Steps that differ by less are equal: times are rounded.
 _ROUNDING = 1e-6
 # Milliseconds taken for seconds are gaps of 999.
-_MAX_GAP = 500
+MAX_GAP = 500
+# Seconds taken for milliseconds are such a share of the usual step, or less.
+_SHORT = 1 / 200
 
 
 class Step(NamedTuple):
@@ -25,14 +27,19 @@ class Step(NamedTuple):
 
 
 class Steps:
-    """The steps of a record: of any length (`any_length`), or multiples of the usual one."""
+    """The steps of a record: of any length (`any_length`), or multiples of the usual one.
+
+    Without `max_gap`, gaps have the usual limit and no message names an option for it.
+    """
 
     def __init__(
         self, system: System, *, usual: float | None = None, scale: float = 1.0,
         equal: bool = False, max_gap: int | None = None,
     ) -> None:
         self._scale = positive("--time-scale", scale)
-        self.max_gap = _MAX_GAP if max_gap is None else count("--max-gap", max_gap, 0)
+        self.max_gap = MAX_GAP if max_gap is None else count("--max-gap", max_gap, 0)
+        self._raise_it = "" if max_gap is None else "raise --max-gap, "
+        self._steps = self._short = 0
         self.any_length = not equal and _takes_lengths(system)
         self.usual = system.dt if usual is None else positive("--dt", usual)
         if system.dt is not None and not math.isclose(
@@ -56,11 +63,14 @@ class Steps:
         if number - 1 > self.max_gap:
             raise ValueError(
                 f"a gap of {length:.6g} is {number} steps of {self.usual:.6g}; at most "
-                f"{self.max_gap} samples in a row may be missing. Split the record there, raise "
-                "--max-gap, or give --time-scale if the record's unit of time is not the model's"
+                f"{self.max_gap} samples in a row may be missing. Split the record there, "
+                f"{self._raise_it}or give --time-scale if the record's unit of time is not the "
+                "model's"
             )
         each = length / number
         rounding = _ROUNDING * self.usual + 4e-16 * magnitude * self._scale
+        self._steps += 1
+        self._short += each < _SHORT * self.usual
         if self.any_length:
             return Step(None if abs(each - self.usual) <= rounding else each, number - 1)
         if abs(length - number * self.usual) > _JITTER * self.usual + rounding:
@@ -70,6 +80,18 @@ class Steps:
                 "the model by System.from_ode, which takes steps of any length"
             )
         return Step(None, number - 1)
+
+
+    @property
+    def note(self) -> str:
+        """What the user should know of the steps so far; usually nothing."""
+        if 2 * self._short <= self._steps:
+            return ""
+        return (
+            f"{self._short} of {self._steps} steps are shorter than {_SHORT:g} times the usual "
+            f"one, {self.usual:.6g}; give --time-scale if the record's unit of time is not the "
+            "model's."
+        )
 
 
 def _takes_lengths(system: System) -> bool:

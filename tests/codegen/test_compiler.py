@@ -464,6 +464,33 @@ def test_wrong_code_is_compiled_with_less_optimisation(lie, wrong, script, cache
     assert note.startswith(f"{len(wrong)}\n")
 
 
+def arrhenius(x, u):
+    """A stirred tank with a jacket, which runs away with large inputs, and below 0 K."""
+    reaction = 1.2e9 * ca.exp(-8750.0 / x[1]) * x[0]
+    return ca.vertcat(
+        (1000.0 - x[0]) / 60.0 - reaction,
+        (350.0 - x[1]) / 60.0 + 0.2 * reaction - 0.14 * (x[1] - x[2]),
+        50.0 * u[0] * (u[1] - x[2]) + 0.04 * (x[1] - x[2]),
+    )
+
+
+def test_a_model_that_runs_away_is_not_taken_for_wrong_code(script):
+    weights = {
+        "prior": np.diag([1e4, 25.0, 9.0]), "disturbance": np.diag([4.0, 0.01, 0.0025]),
+        "noise": np.diag([0.25, 0.09]),
+    }
+    for states in (None, qpmhe.Box([0.0, 280.0, 270.0], [1100.0, 460.0, 400.0])):
+        x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+        f, h = ca.Function("f", [x, u], [arrhenius(x, u)]), ca.Function("h", [x], [x[1:]])
+        system = qpmhe.from_casadi(f, h, dt=2.0, states=states)
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.ExtendedKalman(**weights),
+            qpmhe.QuadraticCost.from_covariances(**weights), horizon=15,
+            initial_state=[600.0, 350.0, 300.0], engine="compiled",
+        )
+        assert mhe.engine == "compiled"
+
+
 def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypatch):
     # Of both libraries; the Python step must not use the model's.
     script.lies(f"{STEP_LIES['noises']};{MODEL_LIES['residuals']}", [FAST, MIDDLE, PLAIN])

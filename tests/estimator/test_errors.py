@@ -153,7 +153,7 @@ OF_ONE = [
 ]
 WITH_INPUT = [
     (InvalidInputError, ["u is missing", "update(y, u)"], lambda mhe: mhe.update([1.0])),
-    (InvalidInputError, ["u is missing", "2 inputs"], lambda mhe: mhe.run(ONES, None)),
+    (InvalidInputError, ["U is missing", "2 inputs", "run(Y, U)"], lambda mhe: mhe.run(ONES)),
     (ShapeError, ["inputs has 1 samples", "expected 5"], lambda mhe: mhe.run(ONES, [[0.0, 0.0]])),
 ]
 
@@ -196,7 +196,10 @@ def test_what_fails_at_the_newest_stage_is_in_the_message():
     beyond, no_slope = raising("beyond the table"), raising("no slope")
     for parts, text in (  # the observer is at 50 after a measurement of 100
         ({"f": beyond}, "f raised ValueError: beyond the table at x = [50."),
-        ({"h": lambda x: np.where(x > 2.0, np.nan, x)}, "not finite at x = [50."),
+        ({"h": lambda x: np.where(x > 2.0, np.nan, x)}, "h is [nan] at x = [50."),
+        ({"f": lambda x: np.where(x > 2.0, np.inf, x)}, "f is [inf] at x = [50."),
+        ({"observer": qpmhe.OutputInjection(lambda z, v: np.where(v > 10.0, np.nan, v))},
+         "the observer's correction is not finite at x = ["),
         ({"h": untraced(lambda x: x), "h_jacobian": lambda x: no_slope(x).reshape(1, 1) / x},
          "the Jacobian of h raised ValueError: no slope at x = [50."),
         ({"observer": qpmhe.OutputInjection(correction)},

@@ -75,6 +75,8 @@ def test_records_without_a_single_sample_and_files_that_cannot_be_read(here):
         (b"\n\n \n", "is empty"), (b"\xef\xbb\xbf", "is empty"),
         (b"time,y,u\n", "no samples"), (b"time,y,u", "no samples"),
         (b"0.0,0.5,0\n0.1,0.6,0\n", "header"), (b"t1me,y,u\n0,1,2\n", "--time"),
+        (b"T,y,u\n0,1,1\n", "'T' may be a temperature"),
+        (b"clock,T [K],y,u\n0,1,1,1\n", "'T [K]' has no unit of time"),
         (b"time,y (V),y (mV),u\n0,1,1,2\n", "'y (V)', 'y (mV)'; rename all but one"),
         (b"time,y;u\n0,1;2\n", "--separator"), (b"time y u\n0 1 2\n", "--separator"),
         (b"PK\x03\x04" + bytes(100), "spreadsheet"), (GOOD.encode("utf-16"), "UTF-16"),
@@ -125,6 +127,8 @@ def test_ways_of_writing_a_record_make_no_difference(here):
         ('time,note,y1,y2\n0,"two, ""so""",1,2\n1,"",2,1\n2,none,1,2\n', {}, None),
         ("sep=;\n" + SHORT.replace(",", ";"), {}, None),
         ("\ufeff" + SHORT.replace(",", "\t"), {}, None),
+        (SHORT.replace("time", "T,t / s").replace("\n0", "\n,0").replace("\n1", "\n,1")
+         .replace("\n2", "\n,2"), {}, None),
         (SHORT.replace(",", " ").replace("\n", "\r\n\r\n"), {"separator": "space"}, None),
         ("a\n\n# by hand\n" + SHORT, {"skip_lines": 3}, None),
         ("time (s);Level / m;Flow\n0;1;2\n1;2;1\n2;1;2\n",
@@ -170,6 +174,9 @@ def test_steps_gaps_and_units_that_are_taken_for_them(here):
     assert "--max-gap" in message
     summary, _ = read(milliseconds, dt=1.0, time_scale=1e-3)
     assert (summary.samples, summary.inserted, summary.notes) == (50, 0, [])
+    summary, _ = read("time,y,u\n0,1,1\n0.0001,1,1\n0.0002,1,1\n", CONTINUOUS)
+    assert "2 of 2 steps are shorter" in summary.notes[0]
+    assert "--time-scale" in summary.notes[0]
     assert "line 152" in refused(content([*range(150), *range(900, 950)]), DISCRETE, dt=1.0)
     summary = estimate(DISCRETE, dt=1.0, max_gap=750, resume=True)
     assert (summary.before, summary.samples, summary.inserted) == (100, 100, 750)

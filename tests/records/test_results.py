@@ -118,7 +118,8 @@ def test_options_that_do_not_fit(here):
     for options, words in (
         ({"covariances": "some"}, "none, std, full"),
         ({"outputs": "y3=y1"}, "y1, y2"), ({"inputs": "u1=y1"}, "no inputs"),
-        ({"outputs": "y1=time"}, "'time' is both the time and"),
+        ({"outputs": "y1=time"}, "no column for the time .* 'time' is used already"),
+        ({"outputs": "y1=time", "time": "time"}, "'time' is both the time and"),
         ({"separator": "ab"}, "separator"), ({"encoding": "klingon"}, "klingon"),
         ({"time_scale": 0.0}, "time-scale"), ({"max_gap": -1}, "max-gap"), ({"dt": "x"}, "dt"),
         ({"checkpoint_every": 0}, "checkpoint-every"), ({"missing": [" "]}, "--missing"),
