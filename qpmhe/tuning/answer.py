@@ -36,7 +36,7 @@ _WIDEST_LOG, _WIDEST = float(np.log(10.0)), 1.0
 _TOGETHER = 0.8
 # An axis whose ends are further apart has only powers of ten.
 _MANY_LABELS = 50.0
-# Standard errors by which a gain is beyond chance.
+# Standard errors by which a gain of the second search is beyond chance.
 _CHANCE = 2.0
 # Eigenvalues of the Hessian below this count as it; an interval is infinite then.
 _FLAT = 1e-6
@@ -190,7 +190,7 @@ class Tuning:
         share, doubt = gain(1, 2)
         best = 2 if share > _CHANCE * doubt else 1
         loss, spread = gain(best, 0)
-        if loss > _CHANCE * spread:
+        if loss > spread:
             return points[0], (
                 f"as at the start: the estimator's mean square {what} on {blocks} is larger with "
                 "the tuned weights. The model's error is not white noise, or the records are too "

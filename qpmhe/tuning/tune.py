@@ -70,8 +70,8 @@ def tune(
     the size of each covariance, its 95 % interval, and what the records do not identify. Then it
     lowers the error of the estimator itself: of its predictions, or of its states where the
     records have the truth; what this hardly depends on, as a factor of all covariances, stays as
-    likely as it was. Some blocks of the records are held out of both; they judge, and a change
-    that does not improve on them by two standard errors is rejected.
+    likely as it was. Some blocks of the records are held out of both; they judge: the second
+    search must improve on them by two standard errors, and the start stays if it is better by one.
 
     Parameters
     ----------

@@ -181,7 +181,8 @@ def test_the_estimators_own_error_is_lowered(objective):
     y, u, x = simulated(steps=300, truth=True)
     x[:, 1] = np.nan  # a state without truth does not count
     y[50:55] = x[50:55, 0] = np.nan  # a gap of the record
-    tuning = tuned([(y, u, x)], objective=objective, horizon=3, structure="scalar", held_out=0.0)
+    tuning = tuned([(y, u, x)], objective=objective, horizon=3, structure="scalar", held_out=0.0,
+                   disturbance=0.01 * np.eye(2))
     assert "the estimator's" in tuning.judgement
     assert "error of x2" not in tuning.scores
     error = "error of x1" if objective == "auto" else "y1, 5 ahead"
