@@ -95,8 +95,9 @@ def test_a_run_in_a_file_is_the_same_run_and_anything_else_is_refused(made, tmp_
             path.unlink()
         else:
             path.write_text(damage)
-        with pytest.raises(InvalidInputError, match=r"run\.npz cannot be read as a run"):
+        with pytest.raises(InvalidInputError, match=r"run\.npz cannot be read as a run") as caught:
             qpmhe.load_run(path)
+        assert "pickle" not in str(caught.value)
 
 
 def test_figures_are_pyplots_where_it_is_imported():

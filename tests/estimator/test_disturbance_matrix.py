@@ -139,6 +139,7 @@ def test_what_does_not_fit_is_refused():
     W = qpmhe.Box([-np.inf, 0.5, -np.inf], [np.inf, 0.5, np.inf])
     fixed, price = system(None, disturbances=W), cost(np.diag([0.2, 0.0, 0.1]))
     check(errors.SetError, ["component 1", "0.5", "variance"], estimator, fixed, price=price)
+    assert "disturbance_covariance=[[0.2, 0. , 0. ]" in repr(price)
     mhe, text = estimator(system(None), price=price), ["disturbance_weight", "singular"]
     check(errors.OptionError, text, mhe.update, 0.1, disturbance_weight=np.eye(3))
     walk = qpmhe.System(lambda x: x, lambda x: x, n=2, p=2)
