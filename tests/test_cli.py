@@ -66,16 +66,24 @@ def test_reproduction_over_seeds_is_the_mean_of_single_ones():
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("--seeds", "0"), ("--backend", "nonsense")]
+    ("option", "value", "words"),
+    [
+        ("--seeds", "-3", "-3"), ("--measure", "tim", "'tim' is not one of"),
+        ("--deadline", "soon", "soon"), ("--backend", "nonsense", "nonsense"),
+        ("--noise-levels", "-1", "--noise-levels is -1.0; expected"),
+        ("--start", "foo", "--start is 'foo'; expected"),
+    ],
 )
-def test_a_bad_option_is_reported_in_a_line(option, value):
+def test_a_bad_option_is_reported_in_a_line(option, value, words):
     code = "from qpmhe.cli import main; main()"
     answer = subprocess.run(
-        [sys.executable, "-c", code, "reproduce", option, value], capture_output=True, text=True
+        [sys.executable, "-c", code, "compare", option, value], capture_output=True, text=True
     )
     assert answer.returncode == 2
-    assert option in answer.stderr or value in answer.stderr
-    assert "Traceback" not in answer.stderr
+    assert words in answer.stderr
+    assert option in answer.stderr or value == "nonsense"
+    for stray in ("Traceback", "Input should", "Value error"):
+        assert stray not in answer.stderr
 
 
 def test_compare_report_export_and_a_study_with_an_unknown_key(tmp_path):

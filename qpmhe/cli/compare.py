@@ -157,7 +157,8 @@ def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
     before = signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     try:
         with named_as_options("jobs"):
-            frame = run(what, Store(store), progress=console, **options).frame()
+            # The tables on standard output can be redirected without the bar.
+            frame = run(what, Store(store), progress=Console(stderr=True), **options).frame()
     except (KeyboardInterrupt, SystemExit):
         console.print(
             f"stopped; all finished cells are in {store}, and the same command resumes the study."

@@ -40,7 +40,7 @@ def reproduce(
     console, figures = Console(), read_width(width)
     with Progress(
         TextColumn("paper's example"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
-        console=console, transient=True,
+        console=Console(stderr=True), transient=True,
     ) as bar:
         task = bar.add_task("")
         found = studies.reproduce(

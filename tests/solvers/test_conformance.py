@@ -1,5 +1,8 @@
 """`qpmhe.solvers.check`: every backend conforms, and faults and false words are found."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -28,6 +31,16 @@ def test_every_backend_is_what_it_says_and_prints_nothing(name, capfd):
     assert report.passed == (name not in MARKED)
     if name == "banded":
         assert measure(name) == Capabilities(*[False] * 7)
+
+
+def test_no_backend_has_a_banner():
+    # Which a solver writes once a process, where the test above may come too late.
+    code = (
+        "import qpmhe_solvers as s\n"
+        "for name in s.available(): s.create(name).solve(s.QP(2, 2))"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (answer.returncode, answer.stdout, answer.stderr) == (0, "", "")
 
 
 def test_a_backend_of_a_user_conforms():

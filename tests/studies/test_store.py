@@ -12,7 +12,7 @@ import pytest
 
 from qpmhe.errors import InvalidInputError
 from qpmhe.models.loading import find
-from qpmhe.studies import Store, StoreError, Study, export, summarise
+from qpmhe.studies import Store, StoreError, Study, export, summarise, write_report
 from qpmhe.studies import store as module
 from qpmhe.studies.cell import Cell, Task, compute, failure
 from qpmhe.studies.experiment import Source
@@ -118,6 +118,12 @@ def test_what_is_no_store_is_refused_with_the_remedy(path, tmp_path):
             with pytest.raises(StoreError, match=words):
                 use(path)
         path.unlink()
+    for use in (Study(backends=["banded"]).to_latex, lambda x: export(x, "a.csv"),
+                lambda x: write_report(x, "out")):
+        with pytest.raises(InvalidInputError, match=r"is 3; expected a qpmhe\.studies\.Store, or"):
+            use(3)
+    with pytest.raises(InvalidInputError, match=r"frame is None; expected a pandas\.DataFrame"):
+        summarise(None)
     with pytest.raises(StoreError, match="check that the folder exists"):
         Store(tmp_path / "nowhere" / "store.sqlite").writing().__enter__()
     path.touch()
@@ -196,7 +202,7 @@ def test_an_export_brings_everything_back(path, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for name, words in (
         ("cells.xlsx", r"expected a name in \.csv, \.parquet or \.tex"),
-        ("nowhere/a.csv", "cannot write"),
+        ("store.sqlite/a.csv", "cannot make the folder"),
         ("cells.parquet", r"needs pyarrow.*pip install 'qpmhe\[studies\]'"),
     ):
         with pytest.raises(InvalidInputError, match=words):

@@ -85,6 +85,7 @@ def test_what_does_not_fit_is_refused_in_a_file_with_its_line(monkeypatch, tmp_p
         (ModelError, "models", [f"{ODD}:three_parts"], "expected (system, observer, cost"),
         (BackendError, "backends", ["osqp"], "'osqp' is not installed; pip install osqp"),
         (OptionError, "qps", [1.5], "qps is 1.5"), (OptionError, "seeds", [-1], "seeds is -1"),
+        (OptionError, "seeds", 1.5, "seeds is 1.5; expected an integer >= 1"),
         (OptionError, "seed", 1, "Did you mean seeds?"),
     ):
         with pytest.raises(error, match=re.escape(words)):

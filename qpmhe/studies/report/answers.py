@@ -203,7 +203,7 @@ def cases(summary: DataFrame) -> list[Case]:
         if several["steps"]:
             title += f", T = {int(steps)}"
         if several["noise_level"]:
-            title += f", noise x {level:g}"
+            title += f", noise = {level:g}"
         name = file_name(title)
         key = name if name not in {case.key for case in found} else f"{name}-{place}"
         found.append(Case(key, title, rows))

@@ -163,6 +163,8 @@ def interactive(drawing: Drawing | None, drawn: Mapping[str, Style]) -> dict[str
         "margin": {"l": 8, "r": 14, "t": 24, "b": 8},
         "hoverlabel": {"align": "left", "bgcolor": "white", "font": {"size": 12}},
         "hovermode": "closest",
+        # Its own background would be the opposite of a page that it takes for black.
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#8a8a8a", "activecolor": _INK},
     }
     data: list[dict[str, Any]] = []
     part = 1 / (count + drawing.gap * (count - 1))
@@ -396,11 +398,12 @@ def _legends(figure: Any, drawing: Drawing, drawn: Mapping[str, Style]) -> None:
     if kinds & {"points", "line"}:
         present = {mark.backend for mark in marks} - {""}
         names = [name for name in drawn if name in present]
+        plain = present - {mark.backend for mark in marks if mark.kind != "level"}
         figure.legend(
             handles=[
-                Line2D([], [], color=drawn[name].color, marker=drawn[name].marker, markersize=5.5,
-                       linestyle=drawn[name].line if "line" in kinds else "none", linewidth=1.2,
-                       label=name)
+                Line2D([], [], color=drawn[name].color, markersize=5.5, label=name, linewidth=1.2,
+                       marker="none" if name in plain else drawn[name].marker,
+                       linestyle=drawn[name].line if "line" in kinds else "none")
                 for name in names
             ],
             loc="outside lower center", ncols=min(6, len(names)), fontsize=8,

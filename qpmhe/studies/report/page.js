@@ -10,7 +10,9 @@
   shade();
   const wanted = {};            // figure -> what its own menus choose
   const drawn = {};             // figure -> the JSON that is on screen
-  const config = { responsive: true, displaylogo: false,
+  // Where no pointer hovers the bar would always be there, and on narrow pages over the legend.
+  const roomy = matchMedia("(hover: hover) and (min-width: 600px)").matches;
+  const config = { responsive: true, displaylogo: false, displayModeBar: roomy ? "hover" : false,
     modeBarButtonsToRemove: ["toImage", "select2d", "lasso2d", "autoScale2d"] };
   const problem = document.getElementById("case");
   const current = () => (problem ? problem.value : Object.keys(data.cases)[0]);

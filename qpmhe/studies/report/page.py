@@ -335,8 +335,7 @@ def files(
             words = ranked(map(qps_words, rest["qps"]))
             found[f"{case.key}-anytime"] = static(
                 one, drawn, size(1.4 + 2.1 * max(2, len(words)), 5.0),
-                f"{case.title}\ncap on the solver's iterations in each QP; dashed: the observer "
-                f"alone{of_start}", columns(words, start=start),
+                f"{case.title}{of_start}", columns(words, start=start),
             )
         spreads = [
             one for one in figures.spreads(part.cells)
