@@ -20,6 +20,7 @@ from ..costs import Cost
 from ..errors import OptionError
 from ..observers import Observer
 from ..plots.style import STYLES, panels
+from .findings import listed
 from .likelihood import Likelihood
 from .score import Score
 from .search import NORMAL, limit
@@ -116,10 +117,12 @@ class Tuning:
             name for name, (low, high) in self.intervals.items()
             if self._theta is refined and not low <= self.values[name] <= high
         ]
-        self.notes = tuple(
-            f"{name} is outside of its interval: the estimator is better with weights that are "
-            "less likely, so the model's error is not white noise." for name in outside
-        ) + tuple(
+        one = len(outside) == 1
+        where = "is outside of its interval" if one else "are outside of their intervals"
+        self.notes = ((
+            f"{listed(outside)} {where}: the estimator is better with weights that are less "
+            "likely, so the model's error is not white noise.",
+        ) if outside else ()) + tuple(
             f"input {j + 1} is constant in all records, so its effect cannot be identified; vary "
             "it." for j in constant
         ) + ((f"the model failed at some points of the search ({likelihood.failure}), which were "
