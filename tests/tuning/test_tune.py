@@ -223,7 +223,8 @@ def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors,
         assert tuning.values["noise level"] == pytest.approx(
             np.exp(0.7) * tuning.likeliest["noise level"])
         assert found > least + 0.1
-        assert "noise level is outside of its interval: the estimator is better" in str(tuning)
+        (note,) = tuning.notes
+        assert note.startswith("disturbance level and noise level are outside of their intervals")
 
 
 def test_what_was_found_makes_an_estimator_and_compares_horizons():
