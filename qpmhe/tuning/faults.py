@@ -247,34 +247,34 @@ def _together(
     ])
     values = likelihoods(tried)
     fits = values[0] - values[1:] < _COSTS
-    told = list(found)
+    faults = list(found)
     for i, k in enumerate(some):
         total, upper = float(logs[i] + at[i]), not fits[i]
         if not upper:  # the least one that fits
             rows = fits[len(some) + i * count :][:count]
             total *= 1.0 - float(shares[np.flatnonzero(rows)[-1]])
-        told[k] = replace(found[k], value=float(np.exp(total)), upper=upper)
+        faults[k] = replace(found[k], value=float(np.exp(total)), upper=upper)
     base = changed(at)
-    told = [one for one in _disjoint(told, base) if one.kind not in _SCALED or one.matters]
-    return told, bank.run([base])
+    faults = [one for one in _disjoint(faults, base) if one.kind not in _SCALED or one.matters]
+    return faults, bank.run([base])
 
 
 def _disjoint(found: list[Fault], base: Hypothesis) -> list[Fault]:
     """A factor of all components and one of some of them as factors of these and of the others."""
-    told = list(found)
+    faults = list(found)
     for k, whole in enumerate(found):
         if whole.kind not in _SCALED or whole.subject:
             continue
         parts = [j for j, one in enumerate(found) if one.kind == whole.kind and one.subject]
         for j in parts:
-            told[j] = replace(found[j], value=found[j].value * whole.value)
+            faults[j] = replace(found[j], value=found[j].value * whole.value)
         covariance = base.noise if whole.kind == "noise" else base.disturbance
         named = {i for j in parts for i in found[j].subject}
         others = [i for i in np.flatnonzero(covariance.diagonal()).tolist() if i not in named]
         if parts:
             # None are left where each component has its own.
-            told[k] = replace(whole, subject=tuple(others), value=whole.value if others else 1.0)
-    return told
+            faults[k] = replace(whole, subject=tuple(others), value=whole.value if others else 1.0)
+    return faults
 
 
 def _best(

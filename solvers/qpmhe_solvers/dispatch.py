@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache, partial
 from typing import Any
 
@@ -70,11 +71,13 @@ def _silence_highs() -> None:
 
     It does so where its first solver is made, before qpsolvers can turn it off.
     """
-    from highspy._core import _Highs
+    # A release that has no such class shows its banner, but works.
+    with suppress(ImportError, AttributeError):
+        from highspy._core import _Highs
 
-    first = _Highs()
-    first.setOptionValue("log_to_console", False)
-    first.run()
+        first = _Highs()
+        first.setOptionValue("log_to_console", False)
+        first.run()
 
 
 def qpsolvers_arguments(layout: Layout, keep_empty: bool = False) -> tuple[Any, ...]:
