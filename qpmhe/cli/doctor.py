@@ -16,7 +16,8 @@ from qpmhe_solvers import backends
 
 from .. import codegen
 from ..adapters.casadi import from_casadi
-from ..codegen.compiler import cache_directory, cache_folders, find_compiler, optimisation
+from ..codegen.compiler import find_compiler, optimisation
+from ..codegen.folders import cache_directory, cache_folders, refusal
 from ..costs import QuadraticCost
 from ..errors import QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
@@ -163,4 +164,9 @@ def _cache() -> tuple[bool, str, str]:
             f"{size:.1f} MiB"
             + ("" if os.access(folder, os.W_OK) else ", read-only")
         )
-    return bool(texts), "cache", "; ".join(texts) or f"{wanted}, not there yet"
+    refused = refusal(wanted)
+    if refused:
+        texts.append(f"code in {wanted} is not used, since {refused}")
+    return (
+        bool(texts) and not refused, "cache", "; ".join(texts) or f"{wanted}, not there yet"
+    )

@@ -17,10 +17,9 @@ from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
-from platformdirs import user_cache_path
-
 from .._version import __version__
 from ..errors import CompilationError
+from .folders import cache_folders, own_file, writable_folder
 
 # They keep infinities and NaN, and the order of operations: without contraction of a * b + c to
 # one rounding, all levels give the same bits. The verdict compares costs that are stored, each
@@ -64,12 +63,6 @@ def find_compiler() -> list[str] | None:
     return None
 
 
-def cache_directory() -> Path:
-    """Where compiled libraries are kept: ``$QPMHE_CACHE_DIR``, else the user's cache folder."""
-    named = os.environ.get("QPMHE_CACHE_DIR")
-    return Path(named).absolute() if named else user_cache_path("qpmhe")
-
-
 @lru_cache(maxsize=1)
 def _processor() -> str:
     """What the machine code depends on: a home directory may serve several machines."""
@@ -101,7 +94,7 @@ def compiled_library(
             ready = _loaded(folder, digest, check)
             if ready is not None:
                 return ready
-    folder = _usable_folder()
+    folder = writable_folder()
     note = folder / f"{digest}.level"
     first, fault = _remembered(note)
     message = ""
@@ -234,10 +227,8 @@ def _checked_by() -> str:
 
 def _seal(path: Path) -> str:
     """The hash of a library's content, and whether it was checked; empty if there is none."""
-    try:
-        return path.read_text("ascii")
-    except (OSError, UnicodeError):  # another process is replacing it
-        return ""
+    content = own_file(path)  # None while another process replaces it
+    return "" if content is None else content.decode("ascii", "replace")
 
 
 def _replace(path: Path, text: str) -> None:
@@ -245,6 +236,7 @@ def _replace(path: Path, text: str) -> None:
     scratch = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
     try:
         scratch.write_text(text, encoding="utf-8")
+        scratch.chmod(0o600)
         os.replace(scratch, path)
     except OSError:
         scratch.unlink(missing_ok=True)
@@ -275,7 +267,9 @@ def _make(
         made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
         message = _run(compiler, _LEVELS[level], [Path(scratch, main)], made)
         if not message:
-            sealed.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
+            sealed.write_text(_content(path.name, made.read_bytes()), encoding="ascii")
+            made.chmod(0o700)  # what others can write is not loaded
+            sealed.chmod(0o600)
             # Each in one motion; a process that sees the one without the other compiles, too.
             os.replace(made, path)
             os.replace(sealed, seal)
@@ -293,47 +287,14 @@ def _remove_stale(folder: Path) -> None:
 
 
 def _intact(library: Path, seal: Path) -> bool:
-    """Whether a library in the cache is what was put there: a damaged one kills the process."""
-    try:
-        content = hashlib.sha256(library.read_bytes()).hexdigest()
-    except OSError:
-        return False
-    return content == _seal(seal).partition("\n")[0]
+    """Whether a library in the cache is what was put there, under this name, by this user."""
+    content = own_file(library)
+    return content is not None and _content(library.name, content) == _seal(seal).partition("\n")[0]
 
 
-def _user() -> int | None:
-    return os.getuid() if hasattr(os, "getuid") else None
-
-
-def _folders() -> tuple[Path, Path]:
-    """The cache, and what takes its place where it cannot be written."""
-    return cache_directory(), Path(tempfile.gettempdir(), f"qpmhe-{_user()}")
-
-
-def cache_folders() -> list[Path]:
-    """The existing folders that belong to this user: code is run from there."""
-    found = []
-    for folder in _folders():
-        try:
-            if _user() in (None, folder.stat().st_uid) and os.access(folder, os.R_OK | os.X_OK):
-                found.append(folder)
-        except OSError:
-            continue
-    return found
-
-
-def _usable_folder() -> Path:
-    user = _user()
-    for folder in _folders():
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK) and user in (None, folder.stat().st_uid):
-            return folder
-    raise CompilationError(
-        f"{cache_directory()} cannot be written; set QPMHE_CACHE_DIR to a folder that can."
-    )
+def _content(name: str, library: bytes) -> str:
+    """Hash of a library and its name: a damaged one, or that of another source, has another."""
+    return hashlib.sha256(name.encode() + b"\0" + library).hexdigest()
 
 
 def _run(

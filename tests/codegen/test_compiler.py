@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.codegen import compiler, fingerprint, library, rehearsal
+from qpmhe.codegen import compiler, fingerprint, folders, library, rehearsal
 from qpmhe.codegen.compiler import compiled_library, find_compiler
 from qpmhe.errors import CompilationError, EngineWarning, InvalidInputError, OptionError
 from qpmhe.estimation.snapshot import read, written
@@ -246,6 +246,129 @@ def test_folders_that_cannot_be_used_and_a_full_disk(cache, tmp_path, monkeypatc
             patch.setattr(*place, full)
             with pytest.raises(CompilationError, match="space left"):
                 answer()
+
+
+def refuses(folder, reason):
+    """Whether code of a folder is neither loaded nor written there, and says why."""
+    before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    assert answer() == 42  # in the private folder
+    after = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    return before == after and reason in folders.refusal(folder)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="POSIX only")
+def test_libraries_are_loaded_only_from_places_that_nobody_else_can_fill(
+    script, cache, tmp_path, monkeypatch
+):
+    assert answer() == 42
+    (made,), right = cache.glob("*.so"), ANSWER["a.h"]
+    assert (cache.stat().st_mode | made.stat().st_mode) & 0o077 == 0
+    seal = made.with_suffix(".sha256")
+
+    # Whoever can write a folder, or one on the way to it, could put a library there.
+    place, link = tmp_path / "place", tmp_path / "link"
+    place.mkdir(mode=0o755)
+    kept = place / "kept"
+    shutil.copytree(cache, kept)
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(kept))
+    calls = len(script.calls)
+    for folder, mode, reason in (
+        (kept, 0o777, "open to others"), (kept, 0o1777, "open to others"),
+        (place, 0o777, "can be changed"), (place, 0o1777, ""),
+    ):
+        usual = folder.stat().st_mode & 0o7777
+        folder.chmod(mode)
+        if reason:
+            assert refuses(kept, reason)
+        else:
+            assert folders.cache_folders() == [kept]
+        folder.chmod(usual)
+    assert len(script.calls) == calls + 1  # once, into the private folder
+    shutil.rmtree(next(tmp_path.glob("qpmhe-*")))
+    link.symlink_to(place)
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(link / "kept"))
+    assert answer() == 42
+    assert folders.refusal(link / "kept") == ""
+    assert len(script.calls) == calls + 1
+    circle = tmp_path / "circle"
+    circle.symlink_to(circle)
+    assert "link" in folders.refusal(circle / "kept")
+
+    if os.geteuid() == 0:
+        monkeypatch.setenv("QPMHE_CACHE_DIR", str(link / "kept"))
+        os.lchown(link, 12345, 12345)
+        assert refuses(kept, "")
+        assert "somebody else's link" in folders.refusal(link / "kept")
+        monkeypatch.setenv("QPMHE_CACHE_DIR", str(kept))
+        for one, reason in ((place, "can be changed"), (kept, "another user")):
+            os.chown(one, 12345, 12345)
+            assert refuses(kept, reason)
+            os.chown(one, 0, 0)
+
+    # Files: of another name, writable, linked, or another's are made again. The planted ones are
+    # harmless: they answer 43.
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "other"))
+    monkeypatch.setitem(ANSWER, "a.h", "#define NUMBER 43\n")
+    assert answer() == 43
+    (planted,) = (tmp_path / "other").glob("*.so")
+    monkeypatch.setitem(ANSWER, "a.h", right)
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(cache))
+
+    def plant(of, to):
+        to.unlink()
+        shutil.copy2(of, to)
+
+    def renamed():
+        plant(planted, made)
+        plant(planted.with_suffix(".sha256"), seal)
+
+    def linked():
+        made.unlink()
+        made.symlink_to(planted)
+        seal.unlink()
+        seal.symlink_to(planted.with_suffix(".sha256"))
+
+    ways = [renamed, linked, lambda: made.chmod(0o777), lambda: seal.chmod(0o666)]
+    if os.geteuid() == 0:
+        ways += [lambda: os.chown(made, 12345, 12345), lambda: os.chown(seal, 12345, 12345)]
+    for way in ways:
+        way()
+        calls = len(script.calls)
+        assert answer() == 42
+        assert len(script.calls) == calls + 1, way
+    assert not (made.is_symlink())
+    assert not (seal.is_symlink())
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="POSIX only")
+def test_the_temporary_folder_is_private_and_not_searched_where_the_cache_works(
+    script, cache, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "file" / "below"))
+    (tmp_path / "file").write_text("")
+    assert answer() == 42
+    private = next(tmp_path.glob("qpmhe-*"))
+    assert folders.cache_folders() == [private]
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(cache))
+    cache.mkdir()
+    assert folders.cache_folders() == [cache]
+    calls = len(script.calls)
+    assert answer() == 42
+    assert len(script.calls) == calls + 1  # it did not take the one in the temporary folder
+    monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "file" / "below"))
+    for open_to_others in (0o755, 0o770, 0o777):
+        private.chmod(open_to_others)
+        assert folders.cache_folders() == []
+        with pytest.raises(CompilationError, match=r"open to others.*set QPMHE_CACHE_DIR"):
+            answer()
+    target = tmp_path / "elsewhere"
+    private.rename(target)
+    target.chmod(0o700)
+    private.symlink_to(target)
+    assert folders.cache_folders() == [private]  # a link of our own
+    if os.geteuid() == 0:
+        os.lchown(private, 12345, 12345)
+        assert folders.cache_folders() == []
 
 
 def test_auto_takes_what_was_compiled_without_generating_it_again(script, monkeypatch):
