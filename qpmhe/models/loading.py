@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from modulefinder import ModuleFinder
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from types import FunctionType, ModuleType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import qpmhe_solvers
 
 from ..costs import Cost
 from ..errors import ModelError, QpmheError
+from ..estimation.estimator import MovingHorizonEstimator
 from ..model.system import System
 from ..observers import Observer
 from . import catalogue
@@ -122,6 +123,59 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
             f"model {name!r}: cannot read {error.filename} ({error.strerror})."
         ) from error
     return ModelSource(name, f"{place}:{function}", arguments, digest)
+
+
+def check_named_in_file(text: Any, folder: Path) -> None:
+    """Raise `ModelError` unless a study file in a folder may name this model.
+
+    A model is code, and a study file comes from anywhere. It may name a model of the catalogue, a
+    function that a Python file in its own folder defines, or a function of a module outside of the
+    standard library whose annotation says that it returns a model. The function is not called.
+    """
+    match = _FORM.fullmatch(text.strip()) if isinstance(text, str) else None
+    place, colon, name = (match["where"].strip() if match else "").rpartition(":")
+    if not colon:  # of the catalogue, or of no form, which `find` reports
+        return
+    remedy = "put a file that defines the function beside the study, or give the study in Python"
+    if place.endswith(".py"):
+        path = folder.joinpath(place).resolve()
+        if not path.is_relative_to(folder.resolve()):
+            raise ModelError(
+                f"model {text!r} is a file outside of the study's folder {folder}; {remedy}."
+            )
+    elif place.partition(".")[0] in sys.stdlib_module_names:
+        raise ModelError(
+            f"model {text!r} is in Python's standard library, which has no models; {remedy}."
+        )
+    source = find(text, folder)
+    with _import_path(place):
+        function = _function(source)
+    if place.endswith(".py"):
+        if getattr(function, "__module__", None) != _module_name(path):
+            raise ModelError(
+                f"model {text!r}: {place} only imports {name}; a study may name functions that "
+                "the file defines itself."
+            )
+    elif not _returns_model(function):
+        raise ModelError(
+            f"model {text!r}: nothing says that {name} returns a model; annotate it, as in "
+            f"def {name}() -> qpmhe.models.Example, or {remedy}."
+        )
+
+
+def _returns_model(function: Any) -> bool:
+    """Whether a function's annotation says that it returns a model, in any form that is read."""
+    if not isinstance(function, FunctionType):
+        return False
+    try:
+        kind = get_type_hints(function).get("return")
+    except Exception:  # names that cannot be resolved
+        return False
+    arguments = get_args(kind)
+    wanted: Any = arguments[0] if get_origin(kind) is tuple and arguments else kind
+    return isinstance(wanted, type) and issubclass(
+        wanted, (Example, MovingHorizonEstimator) if wanted is kind else System
+    )
 
 
 def _proposal(file: Path, written: str) -> str:
@@ -351,8 +405,12 @@ def _import_path(place: str) -> Iterator[None]:
             sys.path.remove(folder)
 
 
+def _module_name(path: Path) -> str:
+    return f"qpmhe_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+
+
 def _import_file(path: Path) -> ModuleType:
-    name = f"qpmhe_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    name = _module_name(path)
     if name in sys.modules:
         return sys.modules[name]
     specification = importlib.util.spec_from_file_location(name, path)

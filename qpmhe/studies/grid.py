@@ -24,7 +24,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, InvalidInputError, ModelError, OptionError
-from ..models.loading import find
+from ..models.loading import check_named_in_file, find
 from .cell import OBSERVER, Cell
 from .experiment import Source, experiment
 
@@ -157,7 +157,9 @@ class Study:
         """Read a study from the TOML file ``path``, and check it before anything runs.
 
         Its keys are the parameters of this class, without ``folder``. A `StudyError` names the
-        file, the key with its line, and the value that does not fit.
+        file, the key with its line, and the value that does not fit. The file may name models of
+        the catalogue, functions that a Python file in its folder defines, and functions of
+        installed modules that are annotated to return a model.
         """
         path = Path(path)
         try:
@@ -185,6 +187,8 @@ class Study:
         data = {key: value for key, value in options.items() if key in _DATA}
         for key, value in options.items():  # one by one, so that the error names the line
             try:
+                for name in _models(value) if key == "models" else ():
+                    check_named_in_file(name, path.parent)
                 cls(**(data if key in _DATA else {key: value}), folder=path.parent)
             except InvalidInputError as error:
                 words = str(error)

@@ -2,6 +2,7 @@
 
 import csv
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -73,13 +74,15 @@ def study_file(tmp_path, **options):
 
 
 def test_a_study_file_names_store_and_report_and_failed_cells_are_reported(tmp_path, shown):
-    file, store = study_file(tmp_path, models=[f"{ODD}:raises"]), tmp_path / "mine.sqlite"
+    shutil.copy(ODD, tmp_path / "odd_models.py")
+    file = study_file(tmp_path, models=["odd_models.py:raises"])
+    store = tmp_path / "mine.sqlite"
     text = command("study", file, "--jobs", 1)
     assert "1 of 2 cells failed; the report gives the reasons." in text
     assert "2 of 2 cells were there already" in command("study", file, "--out", tmp_path / "there")
     command("export", store, tmp_path / "cells.csv")
     assert len(pd.read_csv(tmp_path / "cells.csv")) == 2
-    file = study_file(tmp_path, models=[f"{ODD}:raises"], seeds=[1])
+    file = study_file(tmp_path, models=["odd_models.py:raises"], seeds=[1])
     words = "no cell of the study finished, 1 failed;.*ZeroDivisionError.*--retry-failed"
     with pytest.raises(QpmheError, match=words):  # the cell of seed 0 does not count
         command("study", file, "--store", store, "--jobs", 1)

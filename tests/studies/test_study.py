@@ -150,3 +150,52 @@ def test_figures_of_the_old_file_are_not_shown_for_the_new_one(here):
     assert "differs from the one that the study was started with" in row["reason"]
     write(here)
     assert rmse(model, "old.sqlite") == old
+
+
+def test_a_study_file_names_models_and_calls_no_other_function(monkeypatch, tmp_path):
+    (tmp_path / "study").mkdir()
+    (tmp_path / "packages").mkdir()
+    mark = tmp_path / "mark"
+    (tmp_path / "packages" / "some_models.py").write_text(
+        "from pathlib import Path\nimport qpmhe\nfrom qpmhe.models import Example, batch_reactor\n"
+        "def make() -> Example:\n    return batch_reactor()\n"
+        "def parts() -> 'tuple[qpmhe.System, qpmhe.Observer, qpmhe.Cost, qpmhe.models.Scenario]':\n"
+        "    return batch_reactor()\n"
+        "def touch(path):\n    Path(path).touch()\n    return batch_reactor()\n"
+        "def said(path) -> str:\n    Path(path).touch()\n"
+        "def unknown(path) -> 'Nowhere':\n    Path(path).touch()\n"
+        "class Maker:\n    def __init__(self, path) -> None:\n        Path(path).touch()\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path / "packages")
+    for place in ("study/beside.py", "above.py"):
+        (tmp_path / place).write_text(
+            "from qpmhe.models import batch_reactor\nfrom some_models import touch\n"
+            "def make():\n    return batch_reactor()\n"
+        )
+    file = tmp_path / "study" / "study.toml"
+
+    def read(model):
+        file.write_text(f'models = ["{model}"]\nbackends = ["banded"]\n')
+        return Study.from_toml(file)
+
+    given = f"(path='{mark}')"
+    for model, words in (
+        ("os:mkfifo" + given, "standard library"), ("pathlib:Path.touch" + given, "models has|the"),
+        (f"shutil:copy(src='{file}', dst='{mark}')", "standard library"),
+        ("some_models:touch" + given, r"annotate it, as in def touch\(\) -> qpmhe.models.Example"),
+        ("some_models:said" + given, "annotate it"),
+        ("some_models:unknown" + given, "annotate it"),
+        ("some_models:Maker" + given, "annotate it"),
+        ("beside.py:touch" + given, "beside.py only imports touch"),
+        ("../above.py:make", "outside of the study's folder"),
+        (f"{tmp_path / 'above.py'}:make", "outside of the study's folder"),
+    ):
+        with pytest.raises(StudyError, match=words) as caught:
+            read(model)
+        assert f"{file}, line 1:" in str(caught.value)
+        assert not mark.exists()
+    for model in ("batch_reactor", "beside.py:make", "some_models:make", "some_models:parts"):
+        assert len(read(model).sources) == 1
+    # In Python the caller names the function.
+    assert len(Study(models=["some_models:touch" + given], backends=["banded"]).sources) == 1
+    assert mark.exists()
