@@ -148,19 +148,33 @@ def check_named_in_file(text: Any, folder: Path) -> None:
             f"model {text!r} is in Python's standard library, which has no models; {remedy}."
         )
     source = find(text, folder)
+    if place.endswith(".py"):
+        if not _defines(path, name):
+            raise ModelError(
+                f"model {text!r}: {place} does not define {name} itself; a study may not name what "
+                "the file imports."
+            )
+        return
     with _import_path(place):
         function = _function(source)
-    if place.endswith(".py"):
-        if getattr(function, "__module__", None) != _module_name(path):
-            raise ModelError(
-                f"model {text!r}: {place} only imports {name}; a study may name functions that "
-                "the file defines itself."
-            )
-    elif not _returns_model(function):
+    if not _returns_model(function):
         raise ModelError(
             f"model {text!r}: nothing says that {name} returns a model; annotate it, as in "
             f"def {name}() -> qpmhe.models.Example, or {remedy}."
         )
+
+
+def _defines(file: Path, name: str) -> bool:
+    """Whether a file defines or assigns a name; `build` reports a file that cannot be read."""
+    try:
+        nodes = list(ast.walk(ast.parse(file.read_bytes())))
+    except (OSError, SyntaxError, ValueError):
+        return True
+    return any(
+        one.name == name if isinstance(one, (ast.FunctionDef, ast.ClassDef))
+        else isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store) and one.id == name
+        for one in nodes
+    )
 
 
 def _returns_model(function: Any) -> bool:
@@ -405,12 +419,8 @@ def _import_path(place: str) -> Iterator[None]:
             sys.path.remove(folder)
 
 
-def _module_name(path: Path) -> str:
-    return f"qpmhe_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-
-
 def _import_file(path: Path) -> ModuleType:
-    name = _module_name(path)
+    name = f"qpmhe_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
     specification = importlib.util.spec_from_file_location(name, path)

@@ -186,7 +186,7 @@ def test_a_study_file_names_models_and_calls_no_other_function(monkeypatch, tmp_
         ("some_models:said" + given, "annotate it"),
         ("some_models:unknown" + given, "annotate it"),
         ("some_models:Maker" + given, "annotate it"),
-        ("beside.py:touch" + given, "beside.py only imports touch"),
+        ("beside.py:touch" + given, "beside.py does not define touch itself"),
         ("../above.py:make", "outside of the study's folder"),
         (f"{tmp_path / 'above.py'}:make", "outside of the study's folder"),
     ):
