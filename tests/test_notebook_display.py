@@ -65,11 +65,11 @@ def test_a_run_is_a_table(made):
     pytest.importorskip("pandas")
     run = made["run"]
     table = run.to_frame()
-    np.testing.assert_array_equal(table[["x1", "x2"]], run.states[1:])
-    np.testing.assert_array_equal(table["J"], run.costs)
-    np.testing.assert_allclose(table["std2"] ** 2, run.covariances[:, 1, 1])
+    np.testing.assert_array_equal(table[["x1", "x2"]], run.states)
+    np.testing.assert_array_equal(table["J"][:-1], run.costs)
+    np.testing.assert_allclose(table["std2"][1:] ** 2, run.covariances[:, 1, 1])
     assert table.index.name == "t"
-    assert table["status"].iloc[-1] == str(run.statuses[-1]).removeprefix("Status.")
+    assert table["status"].iloc[-2] == str(run.statuses[-1]).removeprefix("Status.")
 
 
 def test_a_run_in_a_file_is_the_same_run_and_anything_else_is_refused(made, tmp_path):

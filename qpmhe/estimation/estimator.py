@@ -16,7 +16,7 @@ from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
-from .._checks import flag, numbers, positive, record, vector
+from .._checks import flag, numbers, positive, vector
 from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
@@ -35,6 +35,7 @@ from .run import Run, RunSource
 from .sensitivity import Sensitivity
 from .settings import Settings
 from .snapshot import read, written
+from .time_index import paired_record
 
 Array = NDArray[np.float64]
 
@@ -520,18 +521,23 @@ class MovingHorizonEstimator:
         inputs: ArrayLike | None = None,
         *,
         covariances: bool = False,
+        time_unit: Any = "s",
     ) -> Run:
         """Update with each sample of a record, starting at the current state.
 
         Parameters
         ----------
-        measurements : (T, p) array_like
-            y(t), ..., y(t+T-1); (T,) if p is 1.
-        inputs : (T, m) array_like, optional
-            The inputs of the same times.
+        measurements : (T, p) array_like, DataFrame or Series
+            y(t), ..., y(t+T-1); (T,) if p is 1. An index of times is the time axis: steps have its
+            lengths, and samples without measurement fill gaps of whole steps.
+        inputs : (T, m) array_like, DataFrame or Series, optional
+            The inputs of the same times. Where both have an index of times, rows are paired by it,
+            in any order; in gaps, inputs without a row of their own keep the last value.
         covariances : bool
             Whether to compute the covariance of each estimate; NaN where the model cannot
             be linearised along it.
+        time_unit : str or pandas.Timedelta
+            The model's unit of time, for an index of times: ``"s"``, ``"min"``, ``"h"``, ...
 
         Returns
         -------
@@ -541,38 +547,37 @@ class MovingHorizonEstimator:
         Raises
         ------
         ShapeError, InvalidInputError
-            If a shape is wrong; the estimator stays unchanged.
+            If a shape is wrong, or the times of measurements and inputs do not match or are no
+            steps of the model; the estimator stays unchanged.
         """
-        ys = record("measurements", measurements, self.system.p)
         flag("covariances", covariances)
-        us = None
-        if inputs is not None:
-            us = record("inputs", inputs, self._inputs)
-            if len(us) != len(ys):
-                raise ShapeError(
-                    f"inputs has {len(us)} samples; expected {len(ys)}, one for each measurement."
-                )
-        elif self._inputs:
+        ys, us, lengths, index, _ = paired_record(
+            self.system, measurements, inputs, self._inputs, time_unit
+        )
+        if us is None and self._inputs:
             self._input(None, call="run(Y, U)")
         whole = self._with_parameters(us, len(ys))
         at_once = None
         try:
-            at_once = None if covariances else self._engine.run(ys, whole)
+            if not covariances and lengths is None:
+                at_once = self._engine.run(ys, whole)
         except EngineChangeError as change:
             self._change_engine(change)
         if at_once is not None:
-            at_once.source = self.run_source(ys, whole)
+            at_once.source, at_once.index = self.run_source(ys, whole), index
             return at_once
         start, observer_start = self.state.copy(), self.observer_state
         estimates, collected = [], []
-        for y, u in zip(ys, [None] * len(ys) if us is None else us, strict=True):
-            estimates.append(self.update(y, u))
+        for t, y in enumerate(ys):
+            estimates.append(self.update(
+                y, None if us is None else us[t], dt=None if lengths is None else lengths[t]
+            ))
             if covariances:
                 collected.append(self._newest_covariance())
         n = self.system.n
         blocks = np.array(collected).reshape(-1, n, n) if covariances else None
         run = Run.of(start, estimates, blocks, observer_start=observer_start)
-        run.source = self.run_source(ys, whole)
+        run.source, run.index = self.run_source(ys, whole, lengths), index
         return run
 
     def run_source(

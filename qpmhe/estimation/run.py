@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -19,6 +19,7 @@ from ..model.system import System
 from ..observers import Observer
 from .estimate import Estimate, Status
 from .settings import Settings
+from .time_index import read_index, stored_index
 
 if TYPE_CHECKING:
     import pandas
@@ -97,9 +98,12 @@ class Run:
     source : RunSource or None
         What produced the run, for `qpmhe.diagnose`; None for a run that was assembled from single
         estimates, or unpickled.
+    index : pandas.DatetimeIndex, pandas.TimedeltaIndex or None
+        Times of x(0), ..., x(T), where the measurements had an index of times.
     """
 
     source: RunSource | None = None
+    index: pandas.Index | None = None
 
     #: Draws a run for a notebook; whoever can draw sets it.
     page: ClassVar[Callable[[Run], str] | None] = None
@@ -210,15 +214,16 @@ class Run:
         return None if Run.page is None else Run.page(self)
 
     def to_frame(self) -> pandas.DataFrame:
-        """The run as a pandas table, with one row per update.
+        """The run as a pandas table, with a row for each of the states x(0), ..., x(T).
 
         Returns
         -------
         pandas.DataFrame
-            Indexed by t. ``x1``, ``x2``, ... is the estimate of x(t+1), ``filtered1``, ... the
-            estimate of x(t), ``std1``, ... the standard deviations of the former, if covariances
-            were requested; then ``J``, ``J_candidate``, ``status``, ``qps``, ``solver_iterations``,
-            ``seconds``, ``solver_seconds``.
+            Indexed by the time of the state: t = 0, ..., T, or `index`. ``x1``, ``x2``, ... is the
+            estimate of x(t) from the measurements before t, ``std1``, ... its standard deviations,
+            if covariances were requested; ``filtered1``, ... is the estimate of x(t) that has used
+            y(t). ``J``, ``J_candidate``, ``status``, ``qps``, ``solver_iterations``, ``seconds``
+            and ``solver_seconds`` are of the update with y(t). The last row has no update yet.
 
         Raises
         ------
@@ -226,21 +231,28 @@ class Run:
             If pandas is not installed.
         """
         pandas = need("pandas", "Run.to_frame")
-        blocks = {"x": self.states[1:], "filtered": self.filtered}
+        with_gap = partial(np.pad, pad_width=((0, 1), (0, 0)), constant_values=np.nan)
+        blocks = {"x": self.states, "filtered": with_gap(self.filtered)}
         if self.covariances is not None:
             with np.errstate(invalid="ignore"):
-                blocks["std"] = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+                deviations = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+            blocks["std"] = with_gap(deviations)[np.arange(len(self) + 1) - 1]
         columns: dict[str, Any] = {
             f"{name}{i + 1}": values[:, i]
             for name, values in blocks.items() for i in range(values.shape[1])
         }
-        columns |= {
+        steps = {
             "J": self.costs, "J_candidate": self.candidate_costs,
             "status": [str(one).removeprefix("Status.") for one in self.statuses],
-            "qps": self.qps, "solver_iterations": self.solver_iterations,
+            "qps": pandas.array(self.qps, dtype="Int64"),
+            "solver_iterations": pandas.array(self.solver_iterations, dtype="Int64"),
             "seconds": self.times, "solver_seconds": self.solve_times,
         }
-        return pandas.DataFrame(columns, index=pandas.RangeIndex(len(self), name="t"))
+        every = pandas.RangeIndex(len(self) + 1, name="t")
+        table = pandas.DataFrame(columns, index=every).join(
+            pandas.DataFrame(steps, index=every[:-1])
+        )
+        return table if self.index is None else table.set_axis(self.index)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write all arrays to a NumPy archive, which `qpmhe.load_run` reads; without pickle.
@@ -253,12 +265,13 @@ class Run:
         arrays: dict[str, Any] = {
             name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
+        arrays |= stored_index(self.index)
         with open(path, "wb") as file:
             np.savez_compressed(file, engine=np.array(self.engine), **arrays)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Run:
-        """Read what `save` wrote, without its ``source``.
+        """Read what `save` wrote, without its ``source``; the index only where pandas is installed.
 
         Parameters
         ----------
@@ -273,6 +286,7 @@ class Run:
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = dict(file)
+            index = read_index(arrays)
             run = cls(**arrays | {"engine": str(arrays["engine"])})
             lengths = {len(arrays[name]) for name in _PER_STEP}
             if lengths != {len(run)} or len(run.states) != len(run) + 1:
@@ -287,6 +301,7 @@ class Run:
                 f"{path} cannot be read as a run ({what}); expected a "
                 "file that Run.save wrote."
             ) from error
+        run.index = index
         return run
 
     def share(self, flag: Status) -> float:

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._checks import Array
+from ..estimation.steps import Steps
 from .measurements import ColumnNames, Measurement, RecordReader, seconds_between
 from .record_model import RecordModel
-from .steps import Steps
 
 
 class RecordArrays(NamedTuple):

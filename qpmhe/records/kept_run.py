@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
-from .steps import Steps
+from ..estimation.steps import Steps
 
 Array = NDArray[np.float64]
 

@@ -20,12 +20,12 @@ from .._checks import count
 from ..errors import InvalidInputError, OptionError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.run import Run
+from ..estimation.steps import MAX_GAP, Step, Steps
 from .checkpoints import Checkpoint, CheckpointError, WriteError, load, plain, save, versions
 from .kept_run import KeptRun
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
 from .record_model import RecordModel, load_record_model
-from .steps import MAX_GAP, Step, Steps
 from .tables import RecordError
 
 if TYPE_CHECKING:

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.values import finite, shown
 
-from .._checks import Array, numbers, record, vector
+from .._checks import Array, numbers, vector
 from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimation.time_index import paired_record
 from ..model.system import System
 from ..models.scenario import Record
 
@@ -28,18 +29,23 @@ class TuningRecord:
 
     Parameters
     ----------
-    measurements : (T, p) array_like
-        y(0), ..., y(T-1), NaN where they are missing.
-    inputs : (T, m) array_like, optional
+    measurements : (T, p) array_like, DataFrame or Series
+        y(0), ..., y(T-1), NaN where they are missing. An index of times is the time axis, as in
+        `MovingHorizonEstimator.run`.
+    inputs : (T, m) array_like, DataFrame or Series, optional
         The inputs of the same times, without the model's parameters.
-    states : (T, n) or (T + 1, n) array_like, optional
-        The true states, NaN throughout in a column where a state has no truth.
+    states : (T, n) or (T + 1, n) array_like or DataFrame, optional
+        The true states, NaN throughout in a column where a state has no truth. Where states and
+        measurements have an index of times, they are paired by it.
     dt : (T,) array_like, optional
-        Length of each step, from t to t + 1, where they are not the sampling time.
+        Length of each step, from t to t + 1, where they are not the sampling time; to be left out
+        where the measurements have times.
     initial_state : (n,) array_like, optional
         The estimate of x(0); the one given to `qpmhe.tune` if left out.
     name : str, optional
         What messages call it, such as its file.
+    time_unit : str or pandas.Timedelta
+        The model's unit of time, for an index of times.
     """
 
     measurements: ArrayLike
@@ -48,6 +54,7 @@ class TuningRecord:
     dt: ArrayLike | None = None
     initial_state: ArrayLike | None = None
     name: str | None = None
+    time_unit: Any = "s"
 
 
 class Data:
@@ -56,7 +63,11 @@ class Data:
     def __init__(self, name: str, given: TuningRecord, system: System, inputs: int,
                  initial_state: Array | None) -> None:
         self.name = name
-        self.y = record(f"measurements of {name}", given.measurements, system.p)
+        names = f"measurements of {name}", f"inputs of {name}"
+        paired = paired_record(
+            system, given.measurements, given.inputs, inputs, given.time_unit, names
+        )
+        self.y = paired.measurements
         self.observed: Mask = np.isfinite(self.y)
         samples = len(self.y)
         if not samples:
@@ -70,17 +81,18 @@ class Data:
             raise InvalidInputError(
                 f"{name} has no inputs, and the system takes {inputs}; give (measurements, inputs)."
             )
-        us = np.zeros((samples, 0))
-        if given.inputs is not None:
-            us = record(f"inputs of {name}", given.inputs, inputs)
-        self.u = us
-        if len(us) != samples or not np.isfinite(us).all():
+        us = self.u = np.zeros((samples, 0)) if paired.inputs is None else paired.inputs
+        if not np.isfinite(us).all():
             raise InvalidInputError(
-                f"inputs of {name}: {len(us)} samples, {int((~np.isfinite(us)).sum())} numbers "
-                f"missing; expected {samples} samples without gaps. Hold the last value in gaps."
+                f"inputs of {name}: {int((~np.isfinite(us)).sum())} numbers missing; expected "
+                f"{samples} samples without gaps. Hold the last value in gaps."
             )
-        self.dt: Array | None = None
+        self.dt: Array | None = paired.lengths
         if given.dt is not None:
+            if paired.times is not None:
+                raise InvalidInputError(
+                    f"{name} has step lengths (dt) and an index of times; leave out dt."
+                )
             self.dt = vector(f"dt of {name}", given.dt, samples)
             if not (self.dt > 0.0).all():
                 raise InvalidInputError(f"dt of {name} has steps <= 0; sort the record by time.")
@@ -90,7 +102,8 @@ class Data:
                     "System.from_ode, or resample the record."
                 )
         self.truth = None if given.states is None else _truth(
-            name, given.states, system, np.asarray(self.observed.any(axis=1))
+            name, paired.states(given.states, f"states of {name}"), system,
+            np.asarray(self.observed.any(axis=1)),
         )
         start = initial_state
         if given.initial_state is not None:

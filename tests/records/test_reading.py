@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qpmhe.estimation.steps import Steps
 from qpmhe.records import RecordError
-from qpmhe.records.steps import Steps
 
 from .oscillator import discrete, lines
 from .tools import CONTINUOUS, DISCRETE, estimate, get, put, rows, shell

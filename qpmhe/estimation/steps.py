@@ -29,14 +29,17 @@ class Step(NamedTuple):
 class Steps:
     """The steps of a record: of any length (`any_length`), or multiples of the usual one.
 
-    Without `max_gap`, gaps have the usual limit and no message names an option for it.
+    Without `max_gap`, gaps have the usual limit and no message names an option for it. Messages
+    name the options `scaling` and `spacing`; the latter is empty where the user cannot give it.
     """
 
     def __init__(
         self, system: System, *, usual: float | None = None, scale: float = 1.0,
-        equal: bool = False, max_gap: int | None = None,
+        equal: bool = False, max_gap: int | None = None, scaling: str = "--time-scale",
+        spacing: str = "--dt",
     ) -> None:
-        self._scale = positive("--time-scale", scale)
+        self._scaling, self._spacing = scaling, spacing
+        self._scale = positive(scaling, scale)
         self.max_gap = MAX_GAP if max_gap is None else count("--max-gap", max_gap, 0)
         self._raise_it = "" if max_gap is None else "raise --max-gap, "
         self._steps = self._short = 0
@@ -64,7 +67,7 @@ class Steps:
             raise ValueError(
                 f"a gap of {length:.6g} is {number} steps of {self.usual:.6g}; at most "
                 f"{self.max_gap} samples in a row may be missing. Split the record there, "
-                f"{self._raise_it}or give --time-scale if the record's unit of time is not the "
+                f"{self._raise_it}or give {self._scaling} if the record's unit of time is not the "
                 "model's"
             )
         each = length / number
@@ -76,8 +79,10 @@ class Steps:
         if abs(length - number * self.usual) > _JITTER * self.usual + rounding:
             raise ValueError(
                 f"a step of {length:.6g} is no multiple of the usual one, {self.usual:.6g}; "
-                "resample the record, give the usual step with --dt if it is another, or make "
-                "the model by System.from_ode, which takes steps of any length"
+                "resample the record, "
+                + (f"give the usual step with {self._spacing} if it is another, "
+                   if self._spacing else "")
+                + "or make the model by System.from_ode, which takes steps of any length"
             )
         return Step(None, number - 1)
 
@@ -89,7 +94,7 @@ class Steps:
             return ""
         return (
             f"{self._short} of {self._steps} steps are shorter than {_SHORT:g} times the usual "
-            f"one, {self.usual:.6g}; give --time-scale if the record's unit of time is not the "
+            f"one, {self.usual:.6g}; give {self._scaling} if the record's unit of time is not the "
             "model's."
         )
 
