@@ -1,4 +1,4 @@
-"""Records from pandas: an index of times is the time axis; everything else is paired by position."""
+"""Records from pandas: an index of times is the time axis; all else is paired by position."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,8 @@ def test_rows_are_paired_by_time_in_any_order_and_of_any_resolution(name):
     assert plain.index is None
     others = u.set_axis(u.index.as_unit("ns"))
     wider = pd.concat([u, u.set_axis(u.index + (u.index[-1] - u.index[0]) + pd.Timedelta("1D"))])
-    for inputs in (u, u[::-1], u["u"].sample(frac=1.0, random_state=1), others, wider, u.to_numpy()):
+    shuffled = u["u"].sample(frac=1.0, random_state=1)
+    for inputs in (u, u[::-1], shuffled, others, wider, u.to_numpy()):
         run = estimator(discrete()).run(y, inputs)
         np.testing.assert_array_equal(run.states, plain.states)
         assert run.index[:-1].equals(index)
@@ -117,7 +118,8 @@ def test_tuning_pairs_rows_and_fills_gaps():
     gone = [4, 5]
     dropped = np.delete(np.arange(T), gone)
     truth = np.random.default_rng(4).normal(size=(T, 2))
-    for states in (truth[dropped], pd.DataFrame(truth, y.index)[::-1], pd.DataFrame(truth[dropped])):
+    timed = pd.DataFrame(truth, y.index)[::-1]
+    for states in (truth[dropped], timed, pd.DataFrame(truth[dropped])):
         (data,) = checked_data([(y.iloc[dropped], u[::-1], states)], discrete(), 1, [0.0, 0.0])
         np.testing.assert_array_equal(data.y[dropped], y.iloc[dropped])
         assert np.isnan(data.y[gone]).all()
