@@ -117,7 +117,8 @@ def from_jax(
     system = _assembled(_Model(programs, length), m, options)
     sources = {name: programs.as_numpy(name) for name in ("f", "h")}
     system.tracing = ModelTrace(
-        system.f, system.h, n, p, m, system.states, length, method, sources
+        system.f, system.h, n, p, m, system.states, length,
+        None if length is None else method, sources,
     )
     if length is not None:
         system.dt = length

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from .._checks import choice, dimension, positive
 from ..errors import InvalidInputError, ModelError
@@ -41,6 +44,11 @@ class CasadiModel:
     state_residual: Any = None
     losses: tuple[Any, Any, Any] = (None, None, None)
     correction: Any = None
+
+    def __post_init__(self) -> None:
+        # A map that is taken for a rate, with a step of 0, would be the identity.
+        if (self.dt is None) != (self.method is None):
+            raise ValueError(f"dt is {self.dt} and method {self.method}; expected both or none.")
 
     def with_jacobian(self, which: str) -> tuple[Any, list[int]]:
         """A function of (x, u) to f or h and the nonzeros of its Jacobian by x.
@@ -161,16 +169,41 @@ def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
         except Exception as caught:  # whatever the user's function makes of symbols
             error = caught
             continue
-        if asserting:
-            return function
-        try:
-            return function.expand()
-        except Exception:  # operations that have no scalar form
-            return function
+        if not asserting:
+            with suppress(Exception):  # operations that have no scalar form
+                function = function.expand()
+        _check_same(ca, name, call, function, n, m)
+        return function
     raise ModelError(
         f"{name} cannot be evaluated on CasADi symbols ({type(error).__name__}: {error}); write "
         "it with CasADi's functions (casadi.sin, casadi.vertcat), or use qpmhe.System."
     )
+
+
+def _check_same(
+    ca: Any, name: str, call: Callable[[Any, Any], Any], function: Any, n: int, m: int
+) -> None:
+    """Compare the expression with what the user gave, on numbers; what takes none is left out."""
+    generator = np.random.default_rng(0)
+    for scale in (1.0, 0.1, 10.0):
+        x, u = (scale * generator.uniform(0.2, 1.0, size) for size in (n, m))
+        try:
+            value = call(ca.DM(x), ca.DM(u))
+            if isinstance(value, (list, tuple)):
+                value = ca.vertcat(*value)
+            theirs = ca.DM(value).full().ravel(order="F")
+            mine = function(x, u).full().ravel()
+        except Exception:  # of symbols alone, or outside of its domain
+            continue
+        if theirs.size == mine.size and not np.allclose(
+            theirs, mine, rtol=1e-9, atol=1e-9 * np.nanmax(np.abs(theirs), initial=0.0),
+            equal_nan=True,
+        ):
+            raise ModelError(
+                f"{name} returns {theirs.tolist()} for the numbers {x.tolist()}, and its "
+                f"expression of CasADi symbols is {mine.tolist()} there: it depends on more than "
+                "its arguments, or on their types; write one formula for both."
+            )
 
 
 def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:

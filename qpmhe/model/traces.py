@@ -168,11 +168,12 @@ class ModelTrace:
 
     def _difference(self, name: str, found: Traced, where: Points) -> str:
         """Where a trace differs from its function; blank where it does not."""
-        if name == "f" and self._sources is not None and self.dt is not None:
+        if name == "f" and self._sources is not None:
+            # As the step in C takes it: a rate by the method, a map as it is.
             ca, n = import_casadi(), self._n
             x, u = ca.SX.sym("x", n), ca.SX.sym("u", self._m)
             model = CasadiModel(found.function, None, n, 0, self._m, self.dt, self.method)
-            stepped = ca.Function("f", [x, u], [ca.densify(model.step()(x, u, self.dt))])
+            stepped = ca.Function("f", [x, u], [ca.densify(model.step()(x, u, self.dt or 0.0))])
             found = Traced(stepped, "", (n,))
         return difference(found, self._functions[name], where)
 

@@ -91,13 +91,12 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("functions", "options", "error", "text"), WRONG)
-def test_wrong_input_fails_at_construction_and_nan_before_a_run(functions, options, error, text):
+def test_wrong_input_and_nan_fail_at_construction(functions, options, error, text):
     with pytest.raises(error, match=text):
         from_casadi(*functions, **{"compiled": False, **options})
     # math.sin turns a symbol into NaN silently.
-    system = from_casadi(lambda x: [math.sin(x[0]), x[1]], lambda x: x[0], n=2, compiled=False)
-    with pytest.raises(ModelError, match=r"f is .*nan"):
-        estimator(system)
+    with pytest.raises(ModelError, match=r"expression of CasADi symbols is \[nan"):
+        from_casadi(lambda x: [math.sin(x[0]), x[1]], lambda x: x[0], n=2, compiled=False)
 
 
 def falling(case):
@@ -198,3 +197,17 @@ def test_assertions_hold(way, compiled):
         np.testing.assert_allclose(system.h(x, NONE), y)
     np.testing.assert_allclose(system.h.batch(xs, us), expected)
     np.testing.assert_allclose(system.f.batch(xs, us), 0.9 * xs)
+
+
+def test_an_expression_is_compared_with_the_function_on_numbers():
+    ca = pytest.importorskip("casadi")
+
+    def other_for_symbols(x):
+        return 0.9 * x if isinstance(x, ca.DM) else 0.8 * x
+
+    with pytest.raises(ModelError, match=r"f returns .* and its expression of CasADi symbols is"):
+        qpmhe.from_casadi(other_for_symbols, lambda x: x, n=1, compiled=False)
+    with pytest.raises(ModelError, match=r"h returns .* write one formula for both"):
+        qpmhe.from_casadi(lambda x: x, other_for_symbols, n=1, compiled=False)
+    for fine in (lambda x: ca.sqrt(x - 5.0), lambda x: ca.if_else(x > 0.5, x, -x), ca.log):
+        qpmhe.from_casadi(fine, lambda x: x, n=1, compiled=False)

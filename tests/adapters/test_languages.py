@@ -14,6 +14,7 @@ import qpmhe
 from adapters import twins
 from adapters.twins import LANGUAGES, STEPS, THETA, M, N, P, made, plain, points
 from qpmhe import Status
+from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
 
 # Those that evaluate by code of another package, and those whose functions pickle.
@@ -31,6 +32,12 @@ def test_values_jacobians_and_expressions(language, way):
     assert system.derivatives == dict.fromkeys("fh", METHODS.get(language, "traced"))
     assert system.symbolic is not None
     twins.check(system, lambda x, u: plain(way, x, u), *points())
+    # The expression, from which the step in C is made, is the user's function as well.
+    step, output = system.symbolic.step(), system.symbolic.h
+    for x, u in zip(*points(), strict=True):
+        ahead, seen = plain(way, x, u)
+        np.testing.assert_allclose(step(x, u, system.dt or 0.0).full()[:, 0], ahead, rtol=1e-12)
+        np.testing.assert_allclose(output(x, u).full()[:, 0], seen, rtol=1e-12)
     if way == "discrete":
         with pytest.raises(InvalidInputError, match="steps of another length"):
             _ = system.timed
@@ -41,6 +48,30 @@ def test_values_jacobians_and_expressions(language, way):
     twins.check(
         system.timed, lambda x, v: plain(way, x, v[:-1], v[-1].real), xs, np.hstack((us, lengths))
     )
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no compiler")
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_the_compiled_step_of_a_discrete_model_is_that_of_the_users_function(language):
+    system, gain = made(language, "discrete"), 0.05 * np.ones((N, P))
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(gain),
+        qpmhe.QuadraticCost(prior=np.eye(N), disturbance=2.0 * np.eye(N), noise=3.0 * np.eye(P)),
+        horizon=3, initial_state=0.1 * np.ones(N), engine="compiled",
+    )
+    z, rng = [0.1 * np.ones(N)], np.random.default_rng(0)
+    ys, us = 0.1 * rng.normal(size=(5, P)), np.hstack((0.1 * rng.normal(size=(5, 1)), 5 * [THETA]))
+    for y, u in zip(ys, us, strict=True):
+        found = mhe.update(y, u)
+        ahead, seen = plain("discrete", z[-1], u)
+        z.append(ahead + gain @ (y - seen))
+    assert mhe.engine == "compiled"
+    np.testing.assert_allclose(found.candidate, z[2:], rtol=1e-12)
+    along, cost = found.trajectory, ((found.trajectory[0] - z[2]) ** 2).sum()
+    for k in range(3):
+        ahead, seen = plain("discrete", along[k], us[2 + k])
+        cost += 2.0 * ((along[k + 1] - ahead) ** 2).sum() + 3.0 * ((ys[2 + k] - seen) ** 2).sum()
+    assert found.cost == pytest.approx(cost, rel=1e-10)
 
 
 @pytest.mark.parametrize("way", ["discrete", "rk4"])
