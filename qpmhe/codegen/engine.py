@@ -14,11 +14,9 @@ from .._checks import check_problem, positive_definite
 from ..costs import Cost
 from ..errors import InvalidInputError
 from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
-from ..estimation.covariance import window_covariances
 from ..estimation.engine import PythonEngine
 from ..estimation.engines import EngineChangeError
 from ..estimation.estimate import DroppedRow, Estimate, Status
-from ..estimation.prior import PriorWeights
 from ..estimation.problem import Solved
 from ..estimation.run import Run
 from ..estimation.settings import Settings
@@ -30,7 +28,6 @@ from ..estimation.snapshot import (
     near,
     reading,
 )
-from ..model.residuals import difference
 from ..model.system import System
 from ..model.traces import next_check
 from ..observers import Observer
@@ -308,49 +305,10 @@ class CompiledEngine:
         )
 
     def covariances(self) -> Array:
-        """Covariances along the last estimate."""
-        record = self._memory[0]
-        if not record["has_trajectory"]:
-            raise InvalidInputError("there is no estimate yet; call update first.")
-        length = self.length
-        stages = record["stages"][(record["first"] + np.arange(length)) % self._sizes[2]]
-        system, cost, count = self._system, self.cost, length
-        irregular = bool(stages["is_irregular"].any())
-        inputs = stages["u"][:, : system.m]
-        weights = np.zeros((count, system.n + system.p, system.n + system.p))
-        weights[:, : system.n, : system.n] = np.where(
-            stages["has_own_disturbance"][:, None, None], stages["own_disturbance_weight"],
-            cost.disturbance,
-        )
-        weights[:, system.n :, system.n :] = stages["noise_weight"]
-        factors = cost.discount ** np.append(count, np.arange(count - 1, -1, -1.0))
-        model = system.timed if irregular else system
-        if irregular:
-            inputs = np.column_stack((inputs, stages["step"]))
-        trajectory = record["trajectory"][: length + 1].copy()
-        with np.errstate(all="ignore"):
-            assert model.kernel is not None  # of every system with a CasADi form
-            residuals = model.kernel.residuals(trajectory, stages["y"], inputs)
-            system.wrap(residuals, trajectory[1:], stages["y"])
-            if not np.isfinite(residuals).all():
-                raise InvalidInputError("the model has no finite values along the estimate.")
-            weights = cost.majorise(residuals, weights)
-            mean = record["smoothed"] if record["has_smoothed"] else stages["z"][0]
-            weight, _ = PriorWeights(self.system, self._observer, cost)(
-                stages["covariance"][0] if self._library.layout.covariance else None
-            )
-            offset = difference(system.state_residual, trajectory[0], mean)
-            prior = cost.majorise_prior(offset, weight)
-            if system.held and (hold := self.solved().problem.hold) is not None:
-                prior = prior + hold.whole
-            return window_covariances(
-                model,
-                trajectory,
-                inputs,
-                weights * factors[1:, None, None],
-                prior * factors[0],
-                self._basis(),
-            )
+        """Covariances along the last estimate, as the Python step has them."""
+        self.solved()
+        assert self._mirror is not None
+        return self._mirror.covariances()
 
     def solved(self) -> Solved:
         """The last step's problem and its estimate, as the Python step has them."""
@@ -363,11 +321,6 @@ class CompiledEngine:
         with np.errstate(all="ignore"):
             hand_over(record, self._directions, self.usual, self._mirror)
         return self._mirror.solved()
-
-    def _basis(self) -> Array:
-        """The directions (n, k) in which there are disturbances."""
-        tools = self._tools
-        return self._directions.constraints_of(tools.system, tools.cost).basis
 
     def state_dict(self) -> dict[str, Any]:
         """All information from the measurements so far, as plain arrays and numbers."""

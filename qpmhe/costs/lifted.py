@@ -18,8 +18,9 @@ class LiftedCost(Cost):
     r"""The user's cost of w, as a cost of :math:`d = x^+ - f(x)`.
 
     With B, :math:`B^+` and N of a `Subspace`, it is the user's cost of :math:`(B^+ d, v)`. Its
-    weight of d is :math:`B^{+\top} W B^+ + s N N^\top`: the last term, which makes it regular,
-    is zero for every d in the range of B, and no other d is that of an estimate.
+    weight of d is :math:`B^{+\top} W B^+ + s N N^\top`: the last term, which makes it regular and
+    is of the size of the first, is zero for every d in the range of B, and no other d is that of an
+    estimate.
 
     Parameters
     ----------
@@ -34,7 +35,7 @@ class LiftedCost(Cost):
     def __init__(self, cost: Cost, space: Subspace) -> None:
         self._cost, self.quadratic = cost, cost.quadratic
         self.space: Subspace = space
-        self._stand_in = space.stand_in
+        self._stand_in = _of_size(space, space.inverse.T @ cost.disturbance @ space.inverse)
         eye = np.eye(cost.p)
         self._lift, self._range = _blocks(space.inverse, eye), _blocks(space.directions, eye)
         weight = self._lifted(cost.disturbance)
@@ -138,6 +139,16 @@ def lifted(cost: Cost, matrix: Array | None, covariance: Array | None) -> Cost:
     return LiftedCost(
         cost, Subspace(directions, matrix, cost.prior_variances(covariance, matrix))
     )
+
+
+def _of_size(space: Subspace, weight: Array) -> Array:
+    """N N' times a power of two, of the size of the disturbances' weight in the same units.
+
+    If it were of the prior's size, a vague prior would make the two together ill-conditioned.
+    """
+    scaled = weight * np.multiply.outer(space.scale, space.scale)
+    exponent = np.frexp(scaled.diagonal().max(initial=0.0))[1]
+    return np.asarray(np.ldexp(space.stand_in, exponent))
 
 
 def _blocks(first: Array, second: Array) -> Array:

@@ -37,7 +37,7 @@ class Subspace:
     noise_free : (n, k) array
         N.
     stand_in : (n, n) array
-        A weight of the size of the prior's on the noise-free directions alone, s N N'.
+        A weight of the size of the prior's on the noise-free directions alone, N N'.
     to_disturbances : (r, n) array or None
         :math:`G^+`, which maps d to w; None for the identity.
     """

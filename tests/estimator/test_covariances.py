@@ -94,7 +94,7 @@ def test_there_are_none_without_jacobians_or_along_a_stage_that_failed():
 
 @pytest.mark.parametrize("engine", ["python", "compiled"])
 def test_weights_that_vanish_are_named_and_those_of_noises_are_missing_measurements(engine):
-    """Of redescending losses, to zero and to a number that is lost in rounding."""
+    """Of redescending losses: zero is named, a weight of 1e-22 is a variance of 1e22."""
     if engine == "compiled" and find_compiler() is None:
         pytest.skip("there is no C compiler")
     weights = {"prior": np.eye(2), "disturbance": np.eye(2), "noise": np.eye(1)}
@@ -109,9 +109,14 @@ def test_weights_that_vanish_are_named_and_those_of_noises_are_missing_measureme
     ):
         mhe = of_loss("disturbance", loss)
         run = mhe.run([0.0, 0.0, 1e11, 1e11], covariances=True)
-        check(InvalidInputError, ["weights", "undetermined", "Huber"], mhe.covariances)
-        known = np.isfinite(run.covariances).all(axis=(1, 2))
-        assert known[[0, 1, 3]].tolist() == [True, True, False]
+        known, vanishes = np.isfinite(run.covariances).all(axis=(1, 2)), "Cauchy" not in repr(mhe)
+        assert known[[0, 1, 3]].tolist() == [True, True, not vanishes]
+        if vanishes:
+            check(InvalidInputError, ["weights", "undetermined", "Huber"], mhe.covariances)
+        else:
+            for newest in (run.covariances[3], mhe.covariances()[-1]):
+                assert newest.diagonal().min() > 1e20
+                assert np.linalg.eigvalsh(newest)[0] > 0.0
         # After the outlier the observer is far from the last measurement, too.
         outlier, missing = of_loss("noise", loss), of_loss("noise", loss)
         outlier.run([0.0, 1e11, 0.0])
@@ -119,3 +124,103 @@ def test_weights_that_vanish_are_named_and_those_of_noises_are_missing_measureme
         np.testing.assert_allclose(
             outlier.covariances(), missing.covariances(), rtol=1e-9, atol=1e-15
         )
+
+
+def filtered_and_smoothed(a, c, noise, prior, disturbance, missing):
+    """Covariances of a linear window by a Kalman filter with Rauch-Tung-Striebel, in 60 digits."""
+    mp = pytest.importorskip("mpmath")
+    with mp.workdps(60):
+        def exact(array):
+            return mp.matrix(np.asarray(array).tolist())
+
+        ahead, steps = exact(prior), []
+        for i in range(len(a)):
+            here, before, output, move = ahead, ahead, exact(c[i]), exact(a[i])
+            if not missing[i]:
+                spread = output * before * output.T + exact(noise)
+                here = before - before * output.T * spread**-1 * output * before
+            ahead = move * here * move.T + exact(disturbance)
+            steps.append((here, move, ahead))
+        found = [ahead]
+        for here, move, following in reversed(steps):
+            gain = here * move.T * following**-1
+            found.insert(0, here + gain * (found[0] - following) * gain.T)
+        n = len(prior)
+        return np.array([[float(one[i, j]) for i in range(n) for j in range(n)] for one in found])
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+@pytest.mark.parametrize(("n", "p", "directions"), [(2, 1, 2), (2, 1, 1), (4, 2, 4), (8, 2, 3)])
+def test_vague_priors_against_60_digits(n, p, directions, engine):
+    """Priors of 1 to 1e10 deviations of the noise; outputs along no axis, gaps, odd units."""
+    if engine == "compiled" and (find_compiler() is None or n == 4):
+        pytest.skip("one large and two small libraries are enough, where there is a compiler")
+    rng = np.random.default_rng(n + directions)
+    units = 10.0 ** rng.integers(-6, 7, n)
+    a = (np.eye(n) + np.triu(rng.normal(size=(n, n)), 1) / n) * np.multiply.outer(units, 1 / units)
+    c = rng.normal(size=(p, n)) / units
+    b = units[:, None] * rng.normal(size=(n, directions))
+    noise = np.diag(10.0 ** rng.uniform(-1, 0, p))
+    q = np.diag(10.0 ** rng.uniform(-3, 0, directions))
+    shape = rng.normal(size=(n, n))
+    shape = units[:, None] * (shape @ shape.T / n + np.eye(n)) * units
+    singular = {"disturbance_matrix": b} if directions < n else {}
+    whole = b @ q @ b.T
+    system = qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=n, p=p, **singular)
+    horizon = 12
+    missing, ys = rng.random(horizon) < 0.2, rng.normal(size=(horizon, p))
+    ys[missing] = np.nan
+    given = {"disturbance": q if singular else whole, "noise": noise}
+    for deviations in (1.0, 1e3, 1e6, 1e8, 1e10):
+        prior = deviations**2 * shape
+        for observer, weight in (
+            (qpmhe.Luenberger(np.zeros((n, p))), prior),
+            (qpmhe.ExtendedKalman(prior=prior, **given), qpmhe.ObserverPrior()),
+        ):
+            mhe = qpmhe.MovingHorizonEstimator(
+                system, observer, qpmhe.QuadraticCost.from_covariances(prior=weight, **given),
+                horizon=horizon, initial_state=np.zeros(n), engine=engine, max_qps=1,
+            )
+            mhe.run(ys)
+            assert mhe.engine == engine
+            found, right = mhe.covariances(), filtered_and_smoothed(
+                [a] * horizon, [c] * horizon, noise, prior, whole, missing
+            ).reshape(-1, n, n)
+            deviation = np.sqrt(np.diagonal(right, axis1=1, axis2=2))
+            scale = deviation[:, :, None] * deviation[:, None, :]
+            assert np.abs((found - right) / scale).max() < 1e-11
+            assert np.linalg.eigvalsh(found / scale).min() > -1e-15
+            np.testing.assert_array_equal(found, found.transpose(0, 2, 1))
+
+
+def test_a_direction_of_the_prior_alone_is_right_to_1e10_deviations_and_refused_beyond():
+    n, horizon = 3, 8
+    rng = np.random.default_rng(1)
+    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    spin = np.eye(n)
+    spin[:2, :2] = np.linalg.qr(rng.normal(size=(2, 2)))[0]
+    a, c = turn @ spin @ turn.T, np.array([[*rng.normal(size=2), 0.0]]) @ turn.T
+    system = qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=n, p=1)
+
+    def of(deviations):
+        given = {"disturbance": 1e-4 * np.eye(n), "noise": [[1.0]]}
+        given["prior"] = deviations**2 * np.eye(n)
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger(np.zeros((n, 1))),
+            qpmhe.QuadraticCost.from_covariances(**given), horizon=horizon,
+            initial_state=np.zeros(n), max_qps=0,
+        )
+        mhe.run(np.zeros(horizon))
+        return mhe.covariances(), given
+
+    for deviations, allowed in ((1e3, 1e-12), (1e6, 1e-12), (1e8, 1e-12), (1e10, 1e-9)):
+        found, given = of(deviations)
+        right = filtered_and_smoothed(
+            [a] * horizon, [c] * horizon, given["noise"], given["prior"], given["disturbance"],
+            [False] * horizon,
+        ).reshape(-1, n, n)
+        deviation = np.sqrt(np.diagonal(right, axis1=1, axis2=2))
+        gap = (found - right) / (deviation[:, :, None] * deviation[:, None, :])
+        assert np.abs(gap).max() < allowed
+    for deviations in (1e13, 1e15, 1e20):
+        check(InvalidInputError, ["weights", "undetermined"], of, deviations)

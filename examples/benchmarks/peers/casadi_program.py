@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from problems import Problem
 
-from qpmhe.codegen.compiler import cache_directory, find_compiler
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.codegen.folders import cache_directory
 
 from .base import Array, Peer, UnavailableError, WindowData
 

@@ -23,6 +23,7 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 #define FEW 10
 #define ROUNDS 20
 #define STIFFNESS (sizeof(real) == 8 ? (real)1e6 : (real)1e3)
+#define STIFFER (sizeof(real) == 8 ? (real)1e3 : (real)1e2)
 
 #if CONSTRAINED
 
@@ -344,6 +345,56 @@ static int mhe_exclude(mhe_rows *q, int rows, real open)
     return changes;
 }
 
+#if MHE_QUIET || MHE_X_SET
+/* a' D^-1 a, with the diagonal D of the Hessian's block of a stage. */
+static real mhe_pliancy(const real *panel, const real *a)
+{
+    real sum = 0;
+    for (int j = 0; j < NX; j++)
+        if (a[j] != 0) sum += a[j] * a[j] / panel[j * WIDTH + j];
+    return sum;
+}
+#endif
+
+/* Weights of the active rows. Those of W and V have the standard deviation of a disturbance or
+ * noise. Rows of X and of the directions without disturbances have only that of the prior, which
+ * may be vague: so they are stiffer than what the Hessian in the panels opposes to them. */
+static void mhe_set_stiffness(const mhe_estimator *e, mhe_workspace *k)
+{
+    mhe_rows *q = &k->rows;
+    for (int i = 0; i < mhe_row_stages(e); i++) {
+        const int own = i * ROWS;
+        for (int at = own; at < own + ROWS; at++)
+            q->weight[at] =
+                q->place[at] == BETWEEN ? 0 : STIFFNESS / (q->deviation[at] * q->deviation[at]);
+#if MHE_QUIET
+        const real *panel = k->panels + i * NX * WIDTH;
+        for (int r = 0; r < MHE_QUIET && i < e->length; r++) {
+            const int at = own + W_COUNT - MHE_QUIET + r;
+            const real *row = e->settings->disturbances.rows + (W_COUNT - NX - MHE_QUIET + r) * NX;
+            real a[NX];
+            if (q->place[at] == BETWEEN) continue;
+            for (int j = 0; j < NX; j++) {
+                a[j] = 0;
+                for (int c = 0; c < NX; c++) a[j] -= row[c] * k->at[i]->f_jacobian[c * NX + j];
+            }
+            q->weight[at] = STIFFER / (mhe_pliancy(panel, a) + mhe_pliancy(panel + NX * WIDTH, row));
+        }
+#endif
+#if MHE_X_SET
+        const real *block = k->panels + i * NX * WIDTH;
+        const int first = own + W_COUNT + V_COUNT;
+        for (int j = 0; j < NX; j++)
+            if (q->place[first + j] != BETWEEN)
+                q->weight[first + j] = STIFFER * block[j * WIDTH + j];
+        for (int r = 0; r < MHE_X_ROWS; r++)
+            if (q->place[first + NX + r] != BETWEEN)
+                q->weight[first + NX + r] =
+                    STIFFER / mhe_pliancy(block, e->settings->states.rows + r * NX);
+#endif
+    }
+}
+
 /* Guess which rows are active, solve the QP with these as equations, guess anew: the primal-dual
  * active-set method of Hintermueller, Ito and Kunisch (SIAM Journal on Optimization 13, 2002),
  * which mostly ends after a few factorisations, with an exact solution. The equations are those of
@@ -362,17 +413,17 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
         real open = 0, energy = 0, last = INFINITY;
         if (active && (*iterations == limit || *iterations == GUESSES)) return STOPPED;
         *iterations += active > 0;
-        for (int i = 0; i < rows; i++) {
-            q->weight[i] =
-                q->place[i] == BETWEEN ? 0 : STIFFNESS / (q->deviation[i] * q->deviation[i]);
-            q->load[i] = q->weight[i] * mhe_limit_of(q, i) - q->force[i];
-        }
         if (!again) {
             if (active && mhe_time_is_up(k)) return STOPPED;
             mhe_build(e, k, offset, nearest);
-            if (active) mhe_add_weights(e, k);
+            if (active) {
+                mhe_set_stiffness(e, k);
+                mhe_add_weights(e, k);
+            }
             if (!mhe_factorise(k, count)) return STOPPED;
         }
+        for (int i = 0; i < rows; i++)
+            q->load[i] = q->weight[i] * mhe_limit_of(q, i) - q->force[i];
         for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
         if (active) mhe_add_loads(e, k, k->step);
         if (!mhe_solve(k, count, k->step)) return STOPPED;
@@ -427,15 +478,15 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real product)
 }
 
 /* Residuals, weights and loads where rows.value = c(d). Returns the sum of the products, and
- * the largest residual in its row's scale. Equations have no sides, but stiffness and force as in
- * the active-set method. */
-static real mhe_set_residuals(mhe_rows *q, int rows, real stiffness, real *infeasible)
+ * the largest residual in its row's scale. Equations have no sides, but weight and force as in
+ * the active-set method, the weight made stiffer by a factor. */
+static real mhe_set_residuals(mhe_rows *q, int rows, real stiffer, real *infeasible)
 {
     real products = 0, worst[STRANDS] = {0};
     for (int i = 0; i < rows; i++) {
         const int s = i % STRANDS, equation = q->low[i] == q->high[i];
         q->missed[i] = equation ? q->value[i] - q->high[i] : 0;
-        q->weight[i] = equation ? stiffness / (q->deviation[i] * q->deviation[i]) : 0;
+        q->weight[i] = equation ? stiffer * q->weight[i] : 0;
         q->load[i] = -q->force[i];
         worst[s] = mhe_max(fabs(q->missed[i]) / q->scale[i], worst[s]);
     }
@@ -543,7 +594,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     const mhe_settings *s = e->settings;
     const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
-    real far = INFINITY, stiffness = STIFFNESS;
+    real far = INFINITY, stiffer = 1;
     const real missed = mhe_row_violation(e, k, k->step);
     const real promise = fabs(mhe_product(size, k->gradient, k->step));
     if (!(missed > 0)) return SOLVED;
@@ -559,9 +610,10 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         mhe_build(e, k, offset, nearest);
         mhe_hessian_times(k, count, k->step, k->product);
         mhe_rows_times(e, k, k->step);
-        const real products = mhe_set_residuals(q, rows, stiffness, &infeasible);
-        stiffness = mhe_max(stiffness, STIFFNESS * scale / products);
-        if (!(stiffness < STIFFNESS * STIFFNESS)) stiffness = STIFFNESS * STIFFNESS;
+        mhe_set_stiffness(e, k);
+        const real products = mhe_set_residuals(q, rows, stiffer, &infeasible);
+        stiffer = mhe_max(stiffer, scale / products);
+        if (!(stiffer < STIFFNESS)) stiffer = STIFFNESS;
         for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
         mhe_add_loads(e, k, k->residual);
         for (int j = 0; j < size; j++) {
