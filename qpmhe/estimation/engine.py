@@ -473,9 +473,7 @@ class PythonEngine:
         return Solved(problem, formulation, self._trajectory.copy(), window.conditions)
 
     def state_dict(self) -> dict[str, Any]:
-        """The memory as plain arrays and numbers."""
-        # The solver's warm start is not saved: so this estimator continues without it, too.
-        self._solver.forget()
+        """The memory as plain arrays and numbers; a solver's warm start is not among them."""
         modes, methods = self._system.call_modes()
         return {
             "problem": self._size(),
@@ -491,6 +489,10 @@ class PythonEngine:
             "modes": list(modes),
             "methods": list(methods),
         }
+
+    def forget_warm_start(self) -> None:
+        """Have the next QP start without what the solver has kept."""
+        self._solver.forget()
 
     def _description(self) -> dict[str, Any]:
         return described(self._system, self._observer, self._given_cost, self._settings)

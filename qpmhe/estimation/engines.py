@@ -83,6 +83,9 @@ class Engine(Protocol):
     def solved(self) -> Solved:
         """The last step's problem and its estimate."""
 
+    def forget_warm_start(self) -> None:
+        """Have the next QP start without what a solver has kept."""
+
     def state_dict(self) -> dict[str, Any]:
         """The memory as plain arrays and numbers."""
 

@@ -659,8 +659,10 @@ class MovingHorizonEstimator:
         """A snapshot of the estimator's memory: arrays by name, and one text for the rest.
 
         Save it with ``numpy.savez(file, **state)`` or ``json.dumps(state,
-        default=numpy.ndarray.tolist)``. An estimator made with the same arguments continues bit for
-        bit after `load_state_dict`, in the same process or another.
+        default=numpy.ndarray.tolist)``. An estimator made with the same arguments continues from
+        there after `load_state_dict`, in the same process or another: bit for bit, unless a QP
+        solver was warm-started. What it keeps is not saved; see `forget_warm_start`. Taking a
+        snapshot changes nothing in this estimator.
 
         Returns
         -------
@@ -668,6 +670,15 @@ class MovingHorizonEstimator:
             Copies, safe to keep, pickle or save.
         """
         return written(self._engine.state_dict())
+
+    def forget_warm_start(self) -> None:
+        """Have the next QP start without what the QP solver has kept of those before.
+
+        An estimator that goes on after this call, and another that continues from its
+        `state_dict`, give the same estimates to the last bit, whatever the solver. The compiled
+        step needs no such call: snapshots have all that it keeps.
+        """
+        self._engine.forget_warm_start()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where another estimator stopped.

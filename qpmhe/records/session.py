@@ -493,7 +493,8 @@ class _Session:
         summary.incomplete += Status.MISSING in estimate.status
         self._digest = _digest(self._digest, sample)
         if self._taken % self._newest.every == 0:
-            state = self._mhe.state_dict()  # in any case: the solver forgets its warm start
+            self._mhe.forget_warm_start()  # in any case: a run that resumes has none here
+            state = self._mhe.state_dict()
             if sample.complete:
                 self._newest = replace(
                     self._newest, samples=self._taken, offset=self._output.offset,

@@ -84,13 +84,16 @@ def test_a_solver_starts_afresh_where_its_estimator_changes():
     assert solver.calls.count("shift") == 1
     state = one.state_dict()
     for change in (
-        one.state_dict, lambda: one.load_state_dict(state), lambda: one.set(noise_weight=2.0),
+        one.forget_warm_start, lambda: one.load_state_dict(state), lambda: one.set(noise_weight=2.0),
         one.reset,
     ):
         one.update([1.0])
         solver.calls.clear()
         change()
         assert "forget" in solver.calls
+    solver.calls.clear()
+    one.state_dict()
+    assert not solver.calls
     # A time budget ends with its estimator.
     estimator(backend=solver, time_budget=5.0).update([1.0])
     assert solver.time_limit <= 5.0
