@@ -39,7 +39,7 @@ _checked: set[tuple[str, str]] = set()
 
 
 class WrongCodeError(CompilationError):
-    """The compiler makes wrong code from the source, at every level of optimisation."""
+    """The compiled code is not right at any level of optimisation."""
 
 
 class NotCachedError(CompilationError):
@@ -122,8 +122,8 @@ def compiled_library(
     if not fault:
         raise CompilationError(f"{' '.join(compiler)} failed: {message}")
     raise WrongCodeError(
-        f"{' '.join(compiler)} makes wrong code ({fault}); set CC to another compiler, or "
-        "update this one."
+        f"the code that {' '.join(compiler)} makes is not right at any level of optimisation "
+        f"({fault}); take engine='python', or set CC to another compiler."
     )
 
 
@@ -243,9 +243,14 @@ def _replace(path: Path, text: str) -> None:
 
 
 def _remembered(note: Path) -> tuple[int, str]:
-    """The first level that is not known to fail, and what was wrong with those before."""
+    """The first level that is not known to fail, and what was wrong with those before.
+
+    What another version found counts no more: its check may have been at fault.
+    """
     try:
-        level, _, fault = note.read_text(encoding="utf-8").partition("\n")
+        level, judge, fault = note.read_text(encoding="utf-8").split("\n", 2)
+        if judge != _checked_by():
+            return 0, ""
         return min(max(int(level), 0), len(_LEVELS)), fault
     except (OSError, ValueError):  # there is none, or it is damaged
         return 0, ""
@@ -253,7 +258,7 @@ def _remembered(note: Path) -> tuple[int, str]:
 
 def _remember(note: Path, level: int, fault: str) -> None:
     """Write the note; without it the next process tries all levels again."""
-    _replace(note, f"{level}\n{fault}")
+    _replace(note, f"{level}\n{_checked_by()}\n{fault}")
 
 
 def _make(

@@ -194,7 +194,11 @@ class _Guide:
             self.improved += 1
             if Status.ROWS_DROPPED in found.status:
                 problem = problem.without_violated()
-            outcome.trial = problem.evaluate(found.trajectory * self.nudge)
+            # C has rolled it out already. Done again, rounding could lead to another branch of a
+            # loss, whose J is not that of this trajectory.
+            outcome.trial = problem.evaluate(
+                found.trajectory * self.nudge, roll_out=np.ndim(self.nudge) > 0
+            )
             outcome.improved, outcome.dropped = True, found.dropped
             self.violation = outcome.trial.violation
         elif not (self.improved or np.ndim(self.nudge) or known > _CANCELLED * abs(found.cost)):

@@ -193,9 +193,13 @@ def test_damaged_files_in_the_cache(script, cache):
         elsewhere()
         elsewhere()
         assert len(script.calls) == 2
-    for note in ("", "x", "-1\n", "1", "99\nall of it"):
+    judge, notes = compiler._checked_by(), cache / f"{path.stem[:-2]}.level"
+    for note in (
+        "", "x", f"-1\n{judge}\n", "1", f"1\n{judge}", "99\nright by qpmhe 0.1\nof another version",
+        f"99\n{judge}\nall of it",
+    ):
         assert answer() == 42
-        (cache / f"{path.stem[:-2]}.level").write_text(note)
+        notes.write_text(note)
     with pytest.raises(compiler.WrongCodeError, match="all of it"):
         answer()
 
@@ -620,7 +624,7 @@ def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypa
     for _ in range(2):
         with pytest.warns(EngineWarning, match=r"virtual machine.*residuals"):
             interpreted = system(None)
-        with pytest.raises(CompilationError, match="wrong code"):
+        with pytest.raises(CompilationError, match="not right at any level"):
             system(compiled=True)
         with pytest.warns(EngineWarning, match="Python step"):
             mhe = estimator(parts=(interpreted, *arguments()[0][1:]), engine="compiled")
