@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Exponents = NDArray[np.int32]
 _EPS = float(np.finfo(np.float64).eps)
+# Negative eigenvalues of correlations up to this size are rounding; C has the same number.
+_INDEFINITE = 1e-9
 
 
 def unit_diagonal(matrix: Array) -> tuple[Array, Exponents, int]:
@@ -36,6 +38,21 @@ def inverse(matrix: Array) -> Array:
     found = np.linalg.inv(scaled)
     result: Array = np.ldexp(0.5 * (found + found.T), -whole - units[:, None] - units)
     return result
+
+
+def is_covariance(matrix: Array) -> bool:
+    """Whether a symmetric matrix is finite and, up to rounding, positive semidefinite."""
+    variances = matrix.diagonal()
+    if not (np.isfinite(matrix).all() and variances.min() >= 0.0):
+        return False
+    deviations = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    correlations = matrix / deviations / deviations[:, None]
+    np.fill_diagonal(correlations, 1.0 + _INDEFINITE)
+    try:
+        np.linalg.cholesky(correlations)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def solve(matrix: Array, side: Array) -> Array:

@@ -193,8 +193,7 @@ class Layout:
                 ("quiet", r, self.quiet * n),
             ]
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
-        inner = max(self.sets[2][0] * self.nx, 1)
-        fields += [(name, r, inner) for name in ("inner_lower", "inner_upper")]
+        fields += [(name, r, n) for name in ("inner_lower", "inner_upper", "aside")]
         options = (
             "metric_settled", "project", "max_qps", "max_iterations", "infeasible",
             "start_at_best", "reinitialize", "smooth", "delay",
@@ -410,11 +409,9 @@ def _filled(
         hold = Hold(system.held, inverse(regular), basis, cost.disturbance)
         for name in record["hold"].dtype.names or ():
             _fill(record["hold"], name, getattr(hold, name))
+    record["inner_lower"], record["inner_upper"] = system.f_jacobian.inner
+    record["aside"] = system.f_jacobian.aside
     if system.states is not None:
-        inner = system.f_jacobian.inner
-        record["inner_lower"], record["inner_upper"] = (
-            (-np.inf, np.inf) if inner is None else inner
-        )
         metric = observer.metric
         record["metric"] = inverse(initial if metric is None else metric).ravel()
         record["metric_weight"] = initial.ravel()

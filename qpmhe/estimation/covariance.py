@@ -6,7 +6,6 @@ from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgeqp3, dgeqrf
 
 from .._linalg import cholesky, unit_diagonal
 from ..errors import InvalidInputError
@@ -136,12 +135,16 @@ def _triangle(rows: Array) -> Array:
     others are (Cox and Higham, Stability of Householder QR factorization for weighted least squares
     problems, 1998).
     """
+    from scipy.linalg.lapack import dgeqrf  # late: the step does without SciPy
+
     order = np.argsort(-np.abs(rows).max(axis=1, initial=0.0), kind="stable")
     return np.triu(dgeqrf(rows[order])[0])
 
 
 def _pivoted(rows: Array) -> Array:
     """A square root of the rows' information, with columns exchanged by size as well."""
+    from scipy.linalg.lapack import dgeqp3
+
     n = rows.shape[1]
     order = np.argsort(-np.abs(rows).max(axis=1), kind="stable")
     factors, exchanged = dgeqp3(rows[order])[:2]

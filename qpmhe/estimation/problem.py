@@ -362,7 +362,7 @@ class Problem:
         if self._formulation.extended:
             self._add_penalty(trial)
             cost = trial.cost
-        if not math.isfinite(cost):
+        if not 0.0 <= cost < math.inf:  # below 0 with a weight that is indefinite
             trial.cost = trial.violation = math.inf
         elif self.constrained and not of_candidate:
             trial.violation = self.constraints.violation(*self._points(trial))

@@ -9,7 +9,7 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
-from .._linalg import inverse
+from .._linalg import inverse, is_covariance
 from ..costs import Cost
 from ..model.functions import contained, raised
 from ..model.sets import ConvexSet
@@ -458,7 +458,7 @@ class Window(Stages):
             view.z_next[...], output, jacobian = kernel.stage(view.z, u)
             np.subtract(view.y, output, terms.noise)
             np.negative(jacobian, terms.linear[:, 1:])
-            if model.f_jacobian.inner is not None and not np.isfinite(jacobian).all():
+            if not np.isfinite(jacobian).all():
                 self._differentiate(terms, (model.f_jacobian, model.h_jacobian), (view.z, u))
         if self._output_residual is not None:
             self._evaluating = "output_residual"
@@ -484,7 +484,7 @@ class Window(Stages):
         return model, u
 
     def _advance_observer(self, k: int, view: StageView) -> bool:
-        """Add the correction to f(z), and project; whether state and covariance are finite."""
+        """Add the correction to f(z), and project; whether state and covariance are sound."""
         sample, terms, z_next = self._sample, view.terms, view.z_next
         if self._observer.needs_jacobians:
             sample.f_jacobian, sample.h_jacobian = -terms.minus_a, -terms.minus_c
@@ -505,7 +505,8 @@ class Window(Stages):
                 z_next[...] = self._turns(z_next)
                 predicted = None if predicted is None else self._turns(predicted)
         if self._covariances is not None:
-            if posterior is None or not np.isfinite(posterior).all():
+            # What is lost to rounding would make a weight of the prior below which J is negative.
+            if posterior is None or not is_covariance(posterior):
                 return False
             self._covariances[k + 1] = posterior
         if not math.isfinite(z_next.dot(z_next)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from functools import partial
 from typing import Any
@@ -33,6 +34,9 @@ _FAR = 8.0
 # How far inside a bound a Jacobian is taken that is not finite at it, as a share of the state's
 # magnitude, and at most of the width.
 _INWARD, _MOST_INWARD = 2.0**-10, 0.25
+# How far beside a point where it is still not finite: shares of the magnitudes, of changing sign
+# and size, since functions without a derivative at 0 have none along axes and diagonals, either.
+_ASIDE, _GOLDEN = 2.0**-24, 0.6180339887498949
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
@@ -41,15 +45,19 @@ class Jacobian:
     """The Jacobian with respect to x of a `BatchedFunction` with vector values.
 
     Steps are fractions of the states' magnitudes, which are 1 until `use_scales` sets them; a given
-    Jacobian is compared with differences only from then on. Where it is not finite on a bound of X
-    (a square root's at 0, for example), it is taken a small step inside.
+    Jacobian is compared with differences only from then on. Rows that are not finite on a bound of
+    X (a square root's at 0, for example) are taken a small step inside, and rows that are not
+    finite there either (a range's at its beacon) a tiny step beside the point: one sensor without a
+    derivative does not stop the others.
 
     Attributes
     ----------
     method : str
         ``given``, ``complex step`` or ``finite differences``.
-    inner : (2, n) array or None
-        Bounds a small step inside those of X; None if X has no bounds.
+    inner : (2, n) array
+        Bounds a small step inside those of X, infinite where X has none.
+    aside : (n,) array
+        The step beside a point without derivative.
     remedy : str
         Remedy for a wrong given Jacobian.
     """
@@ -69,7 +77,8 @@ class Jacobian:
         n = probes[0][0].size
         self._eye: Array = np.eye(n)
         self._bounds = None if states is None else (states.lower, states.upper)
-        self.inner: Array | None = None
+        self.inner: Array = np.array((np.full(n, -np.inf), np.full(n, np.inf)))
+        self.aside: Array = np.zeros(n)
         self._outputs: Array = np.zeros(function.shape)
         self._scales: Array | None = None
         self._set_scales(np.ones(n))
@@ -86,15 +95,13 @@ class Jacobian:
     def __call__(self, x: Array, u: Array) -> Array:
         """The Jacobian (d, n) at one state."""
         if self._given is not None:
-            return self._given(x, u) if self.inner is None else self._taken(self._given, x, u)
+            return self._taken(self._given, x, u)
         value: Array = self.batch(x[None], u[None])[0]
         return value
 
     @property
     def direct(self) -> Callable[..., Any]:
         """A function of one state, and of the input where there are any."""
-        if self._given is not None and self.inner is None:
-            return self._given.direct
         return self if self._inputs else partial(self, u=np.zeros(0))
 
     def use_scales(self, scales: Array, outputs: Array | None, probes: Probes) -> None:
@@ -118,6 +125,7 @@ class Jacobian:
         self._sizes = np.ldexp(1.0, np.frexp(scales)[1] - 1)
         self._complex_steps = _COMPLEX_STEP * self._sizes
         self._complex_moves = 1j * self._complex_steps * self._eye
+        self.aside = _ASIDE * self._sizes * (-_GOLDEN) ** np.arange(len(self._eye))
         if self._bounds is not None and np.isfinite(self._bounds).any():
             lower, upper = self._bounds
             step = np.minimum(_INWARD * self._sizes, _MOST_INWARD * (upper - lower))
@@ -126,20 +134,26 @@ class Jacobian:
     def _given_batch(self) -> Callable[[Array, Array], Array]:
         given = self._given
         assert given is not None
-        return given.batch if self.inner is None else partial(self._taken, given.batch)
+        return partial(self._taken, given.batch)
 
     def _taken(self, given: Callable[[Array, Array], Any], x: Array, u: Array) -> Array:
-        """A given Jacobian, from inside the bounds where it is not finite or raises on them."""
-        assert self.inner is not None
+        """A given Jacobian, with rows from inside the bounds or from beside x where it has none."""
         try:
             found: Array = np.asarray(given(x, u), np.float64)
+            if np.isfinite(found).all():
+                return found
         except Exception:
-            return np.asarray(given(np.clip(x, *self.inner), u))
-        if np.isfinite(found).all():
-            return found
-        finite = np.isfinite(found).all(axis=(-2, -1), keepdims=True)
-        found = found.copy()  # a function may return one and the same array every time
-        return np.where(finite, found, given(np.clip(x, *self.inner), u))
+            found = np.full((*x.shape[:-1], *self.function.shape, x.shape[-1]), np.nan)
+        places = [np.clip(x, *self.inner), np.clip(x + self.aside, *self.inner)]
+        for place in places if np.isfinite(self.inner).any() else places[1:]:
+            finite = np.isfinite(found).all(axis=-1, keepdims=True)
+            if finite.all():
+                break
+            with suppress(Exception):  # it raises there, too: what is missing stays so
+                found = np.where(finite, found, given(place, u))
+        if np.isnan(found).all():  # with the error of the place itself
+            return np.asarray(given(x, u), np.float64)
+        return found
 
     def _complex(self, x: Array, u: Array) -> Array:
         moved = x[..., None, :] + self._complex_moves

@@ -77,10 +77,12 @@ def test_there_are_none_without_jacobians_or_along_a_stage_that_failed():
         system = qpmhe.System(f, lambda x: x, n=1, p=1, **options)
         return observer_alone(system, qpmhe.Luenberger([gain]), [start])
 
-    still = {"gain": 0.0, "start": 0.0}
+    # Without derivative at -1 and beside it.
+    still = {"gain": 0.0, "start": -1.0, "f": lambda x: np.sqrt(np.maximum(x, 0.0))}
+    infinite = {"f_jacobian": lambda x: 0.5 / np.sqrt(np.maximum(x, 0.0))[..., None]}
+    raising = {"f_jacobian": lambda x: [[0.5 / max(float(x[0]), 0.0) ** 0.5]]}
     for given, text, *ys in (
-        ({"f_jacobian": lambda x: 0.5 / np.sqrt(x)[..., None], **still}, "not finite", 1.0),
-        ({"f_jacobian": lambda x: [[0.5 / float(x[0]) ** 0.5]], **still}, "no Jacobians", 1.0),
+        (infinite | still, "not finite", 1.0), (raising | still, "no Jacobians", 1.0),
         ({"f": lambda x: [math.sqrt(x[0])]}, "along the estimate", 1.0, -5.0, 1.0, 1.0),
     ):
         mhe = root(**given)

@@ -73,3 +73,92 @@ def test_the_step_inside_is_of_the_magnitude_of_the_states(unit):
     inside = 0.25 / found[0, 0, 0] ** 2
     assert 1e-4 * unit < inside < 1e-2 * unit
     assert found[1, 0, 0] == 0.25 / np.sqrt(unit)
+
+
+BEACONS = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+
+
+def ranges(x):
+    return np.stack([np.hypot(x[..., 0] - a, x[..., 1] - b) for a, b in BEACONS], -1)
+
+
+def radar(x):
+    return np.stack([np.hypot(x[..., 0], x[..., 1]), np.arctan2(x[..., 1], x[..., 0])], -1)
+
+
+def speed(x):
+    return np.stack([x[..., 0], x[..., 1], np.sqrt(x[..., 2] ** 2 + x[..., 3] ** 2)], -1)
+
+
+def drift(x):
+    return np.stack(
+        [x[..., 0] + 0.1 * x[..., 2], x[..., 1] + 0.1 * x[..., 3], x[..., 2], x[..., 3]], -1)
+
+
+def friction(x):
+    v = x[..., 1]
+    return np.stack([x[..., 0] + 0.1 * v, v + 0.1 - 0.02 * np.sign(v) * np.sqrt(np.abs(v))], -1)
+
+
+# Functions, noise, a path that starts beside the point without derivative.
+SINGULAR = {
+    "at a beacon": (lambda x: x, ranges, 0.05, [0.3, 0.2], [0.1, 0.05]),
+    "radar at its origin": (lambda x: x, radar, 0.02, [0.3, 0.2], [0.1, 0.05]),
+    "speed at rest": (drift, speed, 0.05, [0.0, 0.0, 0.5, 0.3], None),
+    "friction at rest": (friction, lambda x: x[..., :1], 0.02, [0.0, 0.05], None),
+}
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+@pytest.mark.parametrize("name", SINGULAR)
+def test_a_start_without_derivative_ends_as_one_beside_it(name, engine):
+    f, h, sigma, start, move = SINGULAR[name]
+    n, rng, path = len(start), np.random.default_rng(1), [np.array(start)]
+    for _ in range(40):
+        path.append(path[-1] + np.array(move) if move else f(path[-1]))
+    path = np.array(path)
+    clean = h(path[:-1])
+    ys, p = clean + sigma * rng.normal(size=clean.shape), clean.shape[1]
+    system = qpmhe.System(f, h, n=n, p=p)
+    given = {"disturbance": 0.05 * np.eye(n), "noise": sigma**2 * np.eye(p)}
+    found = []
+    for begin in (np.zeros(n), 1e-9 * np.arange(1, n + 1)):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.ExtendedKalman(prior=np.eye(n), **given),
+            qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(), **given),
+            horizon=10, initial_state=begin, max_qps=None, engine=engine,
+        )
+        run = mhe.run(ys)
+        assert mhe.engine == engine
+        assert not any(qpmhe.Status.MODEL_FAILED in one for one in run.statuses)
+        assert (run.costs >= 0.0).all()
+        found.append(run.filtered)
+    assert np.abs(found[0][35:] - found[1][35:]).max() < 0.1
+    assert np.abs(found[0][20:, :2] - path[20:-1, :2]).max() < 0.6
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_covariances_of_observers_stay_semidefinite_whatever_the_model_does(engine):
+    """Near an empty tank a derivative is 1e8; its square costs all digits of a covariance."""
+    def tanks(x):
+        outflow = 0.2 * np.sqrt(np.abs(x) + 1e-18)
+        return np.stack([x[..., 0] - outflow[..., 0],
+                         x[..., 1] + outflow[..., 0] - outflow[..., 1],
+                         x[..., 2] + outflow[..., 1] - outflow[..., 2]], -1)
+
+    system = qpmhe.System(tanks, lambda x: x[..., 2:], n=3, p=1)
+    given = {"disturbance": 1e-4 * np.eye(3), "noise": [[1e-2]]}
+    lost = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.ExtendedKalman(prior=np.eye(3), **given),
+            qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(), **given),
+            horizon=4, initial_state=np.zeros(3), engine=engine,
+        )
+        assert mhe.engine == engine
+        for _ in range(40):
+            estimate = mhe.update(rng.choice([0.0, 1e-9, 1.0]) * rng.normal(size=1))
+            assert 0.0 <= estimate.cost <= estimate.candidate_cost
+            lost += qpmhe.Status.MODEL_FAILED in estimate.status
+    assert lost < 240

@@ -84,7 +84,8 @@ def test_a_solver_starts_afresh_where_its_estimator_changes():
     assert solver.calls.count("shift") == 1
     state = one.state_dict()
     for change in (
-        one.forget_warm_start, lambda: one.load_state_dict(state), lambda: one.set(noise_weight=2.0),
+        one.forget_warm_start, lambda: one.load_state_dict(state),
+        lambda: one.set(noise_weight=2.0),
         one.reset,
     ):
         one.update([1.0])

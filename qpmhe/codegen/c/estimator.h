@@ -216,8 +216,9 @@ typedef struct {
      * Lyapunov equation by which it settles. */
     mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];
     mhe_real metric_weight[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];
-    /* Bounds a small step inside those of X, where Jacobians that are not finite are taken. */
-    mhe_real inner_lower[MHE_SIZE(MHE_X_SET * MHE_NX)], inner_upper[MHE_SIZE(MHE_X_SET * MHE_NX)];
+    /* Bounds a small step inside those of X, and a tiny step aside, where rows of Jacobians are
+     * taken that are not finite. */
+    mhe_real inner_lower[MHE_NX], inner_upper[MHE_NX], aside[MHE_NX];
     int32_t metric_settled;    /* whether `metric` is for good */
     int32_t project;           /* keep the observer in X */
     int32_t max_qps;           /* QPs for each sample */

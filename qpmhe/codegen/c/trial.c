@@ -52,7 +52,7 @@ static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
     cost += mhe_hold_cost(e, k, trial->x);
     trial->cost = cost;
     trial->violation = 0;
-    if (!isfinite(cost)) {
+    if (!(cost >= 0 && isfinite(cost))) { /* below 0 with a weight that is indefinite */
         trial->cost = trial->violation = INFINITY;
         return;
     }

@@ -47,27 +47,67 @@ static int mhe_rejection(const mhe_settings *s, const mhe_stage *stage, const in
 }
 #endif
 
-/* f and h at a state, and their Jacobians: where one is not finite on the bounds of X, a small step
- * inside them. */
+/* Take the rows that are not finite from another Jacobian. */
+static void mhe_fill_rows(int count, real *jacobian, const real *other)
+{
+    for (int r = 0; r < count; r++)
+        if (!mhe_all_finite(NX, jacobian + r * NX))
+            memcpy(jacobian + r * NX, other + r * NX, sizeof(real) * NX);
+}
+
+/* f and h at a state, and their Jacobians: rows that are not finite from a small step inside the
+ * bounds of X, and rows that are not finite there from a tiny step aside. */
 static void mhe_linear(const mhe_settings *s, const real *x, const mhe_stage *stage, real *next,
                        real *output, mhe_terms *t)
 {
     mhe_f_jacobian(x, stage->u, stage->step, next, t->f_jacobian);
     mhe_h_jacobian(x, stage->u, output, t->h_jacobian);
-#if MHE_X_SET
-    const int f = mhe_all_finite(NX * NX, t->f_jacobian);
-    const int h = mhe_all_finite(NY * NX, t->h_jacobian);
-    if (f && h) return;
-    real at[NX], unused[NX + NY];
-    for (int j = 0; j < NX; j++) {
-        const real above = mhe_max(s->inner_lower[j], x[j]);
-        at[j] = above < s->inner_upper[j] ? above : s->inner_upper[j];
+    for (int aside = !MHE_X_SET; aside < 2; aside++) {
+        const int f = mhe_all_finite(NX * NX, t->f_jacobian);
+        const int h = mhe_all_finite(NY * NX, t->h_jacobian);
+        if (f && h) return;
+        real at[NX], unused[NX + NY], f_there[NX * NX], h_there[NY * NX];
+        for (int j = 0; j < NX; j++) {
+            const real moved = aside ? x[j] + s->aside[j] : x[j];
+            const real above = mhe_max(s->inner_lower[j], moved);
+            at[j] = above < s->inner_upper[j] ? above : s->inner_upper[j];
+        }
+        if (!f) {
+            mhe_f_jacobian(at, stage->u, stage->step, unused, f_there);
+            mhe_fill_rows(NX, t->f_jacobian, f_there);
+        }
+        if (!h) {
+            mhe_h_jacobian(at, stage->u, unused, h_there);
+            mhe_fill_rows(NY, t->h_jacobian, h_there);
+        }
     }
-    if (!f) mhe_f_jacobian(at, stage->u, stage->step, unused, t->f_jacobian);
-    if (!h) mhe_h_jacobian(at, stage->u, unused, t->h_jacobian);
-#endif
-    (void)s;
 }
+
+#if MHE_COVARIANCE
+/* Whether a matrix is finite and, up to rounding of its correlations, positive semidefinite. */
+static int mhe_is_covariance(const real *P)
+{
+    const real least = sizeof(real) == 8 ? (real)1e-9 : (real)1e-4;
+    real deviation[NX], root[NX * NX];
+    if (!mhe_all_finite(NX * NX, P)) return 0;
+    for (int j = 0; j < NX; j++) {
+        const real variance = P[j * NX + j];
+        if (!(variance >= 0)) return 0;
+        deviation[j] = variance > 0 ? sqrt(variance) : 1;
+    }
+    for (int j = 0; j < NX; j++)
+        for (int i = j; i < NX; i++) {
+            real sum = i == j ? 1 + least : P[j * NX + i] / deviation[i] / deviation[j];
+            for (int k = 0; k < j; k++) sum -= root[k * NX + j] * root[k * NX + i];
+            if (i == j) {
+                if (!(sum > 0)) return 0;
+                root[j * NX + j] = sqrt(sum);
+            } else
+                root[j * NX + i] = sum / root[j * NX + j];
+        }
+    return 1;
+}
+#endif
 
 /* Evaluate the stage at its z and step the observer to `next`, its covariance to `following` and its
  * sensors' counts to `rejections`, in X or, if there is one, `onto`; the cost, or infinity. `events`
@@ -96,7 +136,9 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     mhe_enter_turn(s, next);
     mhe_enter_turn(s, predicted);
     if (!mhe_all_finite(NX, next)) return INFINITY;
-    if (MHE_COVARIANCE && !mhe_all_finite(NX * NX, following)) return INFINITY;
+#if MHE_COVARIANCE
+    if (!mhe_is_covariance(following)) return INFINITY;
+#endif
 #if MHE_X_SET
     if (s->project) *events = mhe_stay_inside(e, stage, onto, predicted, next, following);
 #else
