@@ -255,6 +255,10 @@ def penalties(
     return made[0], made[1]
 
 
+# Of a bound: beyond it, there is none.
+_LARGEST = 1e150
+
+
 class Box(ConvexSet):
     r"""A box :math:`\{s : \ell \le s \le u\}`, open-ended where a bound is infinite.
 
@@ -262,7 +266,8 @@ class Box(ConvexSet):
     ----------
     lower, upper : array_like
         Bounds of equal shape (d,), in the units of the vector that they bound; ``-inf`` and ``inf``
-        where a component is unbounded. Equal bounds fix a component: a disturbance in {0} makes its
+        where a component is unbounded. Bounds beyond 1e150, whose squares are not finite, count as
+        none. Equal bounds fix a component: a disturbance in {0} makes its
         state free of process noise.
 
     Raises
@@ -286,7 +291,9 @@ class Box(ConvexSet):
                 f"a bound is NaN (lower {low.tolist()}, upper {high.tolist()}); "
                 "write -inf or inf where a component is unbounded."
             )
-        empty = (low > high) | (low == np.inf) | (high == -np.inf)
+        # Differences of larger numbers overflow.
+        low, high = np.where(low < -_LARGEST, -np.inf, low), np.where(high > _LARGEST, np.inf, high)
+        empty = (low > high) | (low > _LARGEST) | (high < -_LARGEST)
         if empty.any():
             j = int(np.argmax(empty))
             raise SetError(

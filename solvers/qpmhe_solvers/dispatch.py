@@ -45,7 +45,7 @@ class DispatchSolver(NativeSolver):
 
     def structure(self, qp: QP) -> Structure:
         """The limits of this QP."""
-        return Structure.of(qp, exact=True)
+        return Structure.of(qp, exact=True, bounds=self.style.bounds == "rows")
 
     def _set_up(self, layout: Layout) -> Any:
         return self._package.Problem(*qpsolvers_arguments(layout, self._translation.keep_empty))

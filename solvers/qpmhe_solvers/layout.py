@@ -44,12 +44,16 @@ class Structure(NamedTuple):
     equal: Flags
 
     @staticmethod
-    def of(qp: QP, *, exact: bool = False) -> Structure:
-        """The structure that a QP needs; with room for its own limits only, if exact."""
+    def of(qp: QP, *, exact: bool = False, bounds: bool = False) -> Structure:
+        """The structure that a QP needs; with room for its own limits only, if exact.
+
+        Equal bounds of an unknown are an equality if ``bounds``, where they become rows: active-set
+        methods call two rows that face each other infeasible.
+        """
         stages, n, rows = qp.sizes
         size = stages * n
         equal = (qp.all_lower == qp.all_upper) & np.isfinite(qp.all_lower)
-        equal[:size] = False
+        equal[:size] &= bounds
         sides = []
         for limits in (qp.all_lower, qp.all_upper):
             finite = np.isfinite(limits) & ~equal

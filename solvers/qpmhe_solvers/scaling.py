@@ -19,6 +19,9 @@ _STEP_PEAKS = 2.0**-10, 2.0**3
 # Spread of the Hessian's diagonal over the stages at which the least known stage, rather than the
 # best, is what the accuracy is for; and below which share double precision has none.
 _SPREAD, _LEAST = 2.0**10, 2.0**-34
+# A limit so many scaled units away is none: a step has some units, and interior points lose their
+# way between such limits. Whoever takes the step checks it against the limits themselves.
+_FAR = 1e7
 # Largest exponent: products of two factors do not overflow.
 _MOST = 500
 
@@ -65,6 +68,9 @@ class Scale:
     def apply(self, qp: QP, scaled: QP) -> None:
         """Write the scaled numbers of a QP."""
         np.multiply(qp.numbers, self._factors, out=scaled.numbers)
+        lower, upper = scaled.all_lower, scaled.all_upper
+        lower[lower < -_FAR] = -np.inf
+        upper[upper > _FAR] = np.inf
         scaled.key = self.key
 
     def leave_out(self, peaks: list[float]) -> None:
