@@ -51,7 +51,7 @@ def test_bounds_that_are_far_away_are_none(name):
     right = states([0.0, -np.inf, -np.inf], 3 * [np.inf], used, engine)
     # The near bound is active.
     assert np.abs(right - states(3 * [-np.inf], 3 * [np.inf])).max() > 0.01
-    if name != "proxqp":  # which is off by 0.01 at its tolerance, far bounds or not
+    if not name.startswith("proxqp"):  # which is off by 0.01 at its tolerance, far bounds or not
         assert np.abs(right - states([0.0, -np.inf, -np.inf], 3 * [np.inf])).max() < CLOSE
     for far in (1e10, 1e12, 1e20, 1e200, 1.7e308):
         found = states([0.0, -far, -far], 3 * [far], used, engine)
