@@ -152,12 +152,42 @@ def test_both_engines_snapshots_batches_and_derivatives_have_the_bounds():
         # What the window knows of its first state is this weight and its measurements.
         known = np.linalg.inv(mhe.covariances()[0]) - weight
         assert np.linalg.eigvalsh(known)[0] > 0.0
+    ours, theirs = (mhe.sensitivity() for mhe in (python, compiled))
+    for name in ("prior", "measurements", "prior_weight"):
+        np.testing.assert_allclose(
+            getattr(theirs, name), getattr(ours, name), rtol=1e-8, atol=1e-10
+        )
+    # The last state by the mean of the prior: what the bounded weight says, by least squares.
+    np.testing.assert_allclose(ours.prior[-1], _by_prior_mean(weight, 6), rtol=1e-8, atol=1e-10)
     batch = qpmhe.BatchEstimator(
         python.system, python.observer, cost, members=2, horizon=6, max_qps=3,
         initial_states=[0.0, 0.0],
     )
     found = np.array([batch.update(np.tile(y, (2, 1))).states for y in ys[:30]])
     np.testing.assert_allclose(found[:, 1], run.states[1:], rtol=0, atol=1e-12)
+
+
+def _by_prior_mean(weight, horizon):
+    """Derivative (2, 2) of x(t+1) by z(t-N) in a least squares problem."""
+    n = 2 * (horizon + 1)
+    rows, sides = [np.eye(2, n)], [np.eye(2)]
+    scale = [weight]
+    for k in range(horizon):
+        step = np.zeros((2, n))
+        step[:, 2 * k : 2 * k + 4] = np.hstack((-A, np.eye(2)))
+        seen = np.zeros((1, n))
+        seen[:, 2 * k : 2 * k + 2] = C
+        rows += [step, seen]
+        sides += [np.zeros((2, 2)), np.zeros((1, 2))]
+        scale += [np.linalg.inv(Q), np.linalg.inv(R)]
+    matrix = np.vstack(rows)
+    weights = np.zeros((len(matrix), len(matrix)))
+    at = 0
+    for each in scale:
+        weights[at : at + len(each), at : at + len(each)] = each
+        at += len(each)
+    normal = matrix.T @ weights @ matrix
+    return np.linalg.solve(normal, matrix.T @ weights @ np.vstack(sides))[-2:]
 
 
 @pytest.mark.filterwarnings("always::qpmhe.errors.PriorWarning")
