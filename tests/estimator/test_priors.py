@@ -90,6 +90,7 @@ def test_without_a_prior_it_is_the_kalman_filter(engine, make, kind):
 @pytest.mark.parametrize(("deviation", "digits"), [(1e3, 1e-11), (1e5, 1e-7), (1e6, 1e-5)])
 def test_the_bounds_leave_vague_priors_alone(engine, deviation, digits):
     ys, prior = record(), deviation**2 * R * np.eye(2)
+    estimator(engine=engine)  # a library is checked where it is first made: on a filter with digits
     found = estimator(prior=prior, engine=engine).run(ys).filtered
     np.testing.assert_allclose(found[2:], kalman_filter(ys, prior)[2:], rtol=0, atol=digits)
     # A bound that cannot hold a filter's certainty discards what came before the window.
