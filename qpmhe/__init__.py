@@ -28,7 +28,7 @@ from .costs import (
     QuadraticCost,
     RobustCost,
 )
-from .errors import ObserverWarning, QpmheError
+from .errors import ObserverWarning, PriorWarning, QpmheError
 from .estimation.active_rows import ActiveRow
 from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
@@ -133,6 +133,7 @@ __all__ = [
     "OutputInjection",
     "Polytope",
     "Power",
+    "PriorWarning",
     "QpmheError",
     "Quadratic",
     "QuadraticCost",

@@ -19,6 +19,7 @@ __all__ = [
     "ModelError",
     "ObserverWarning",
     "OptionError",
+    "PriorWarning",
     "QpmheError",
     "SetError",
     "ShapeError",
@@ -45,6 +46,10 @@ class CompilationError(QpmheError):
 
 class ObserverWarning(UserWarning):
     """An unreliable observer, or an initial state that was projected onto the state set."""
+
+
+class PriorWarning(ObserverWarning):
+    """A constant weight of the prior beside an observer that has a covariance."""
 
 
 class EngineWarning(UserWarning):

@@ -41,9 +41,7 @@ def observed(
     example = catalogue()[model]()
     cost, scenario = example.cost, example.scenario
     if prior == "observer":
-        cost = qpmhe.QuadraticCost(
-            prior=qpmhe.ObserverPrior(), disturbance=cost.disturbance, noise=cost.noise
-        )
+        cost = qpmhe.QuadraticCost(disturbance=cost.disturbance, noise=cost.noise)
     start = scenario.initial_state + distance * (
         scenario.initial_estimate - scenario.initial_state
     )

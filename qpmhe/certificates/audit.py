@@ -70,25 +70,30 @@ def about_corrections(system: System, observer: Observer) -> tuple[Assumption, A
     )
 
 
-def about_cost(cost: Cost) -> tuple[CostConstants | None, Assumption]:
+def about_cost(cost: Cost, observer: Observer) -> tuple[CostConstants | None, Assumption]:
     """The cost's constants, rounded outward where they could be, Assumption ass:stagecosts."""
+    covariance, rule = observer.initial_covariance(), cost.observer_prior
     found = partial(Assumption, "cost bounds", "ass:stagecosts")
-    constants, evidence, stated = cost.constants, Evidence.ASSUMED, ", as the cost states them"
+    constants = cost.constants_with(covariance)
+    evidence, stated = Evidence.ASSUMED, ", as the cost states them"
     if constants is None:
         why = (
             f"the discount {cost.discount:.6g} makes the lower bounds shrink with a stage's age"
             if cost.discount < 1.0
-            else "its ObserverPrior has no bounds; give it some, ObserverPrior(minimum, maximum)"
-            if cost.observer_prior is not None and cost.observer_prior.bounds is None
+            else f"its prior's weight comes from the observer's covariance, and "
+            f"{type(observer).__name__} has none; give a weight, prior="
+            if rule is not None and covariance is None
+            else f"its prior's weight is relative to the initial covariance of "
+            f"{type(observer).__name__}, which is singular; give it a regular one"
+            if rule is not None and not cost.least_prior(covariance).any()
             else "its terms are not bounded by powers with one exponent, above and below"
         )
         return None, found(False, Evidence.PROVED, f"the cost has no constants: {why}")
     if cost.quadratic:
-        evidence, stated, (low, high) = Evidence.PROVED, "", constants.prior
-        prior = (
-            eigenvalue_bounds(cost.least_prior) if cost.observer_prior is None
-            else (low * (1.0 - 1e-12), high * (1.0 + 1e-12))
-        )
+        evidence, stated = Evidence.PROVED, ""
+        low, high = eigenvalue_bounds(cost.initial_weight(covariance))
+        # The weight itself keeps twice the distance from the upper bound: rounding is within it.
+        prior = (low, high) if rule is None else (low / rule.kappa, high * rule.kappa)
         constants = CostConstants(
             constants.exponent, prior, eigenvalue_bounds(cost.disturbance),
             eigenvalue_bounds(cost.noise),

@@ -274,7 +274,7 @@ def examined(
     constants: dict[int, TheoremConstants] = {}
     parts = [] if stability is None else [stability.evidence]
     if "the theorem" not in errors:
-        weights, about = about_cost(cost)
+        weights, about = about_cost(cost, observer)
         if weights is None:
             errors["the theorem"] = CertificateError(f"{about.text}; the theorem needs them.")
         output = about_slope(system, region, "h", deadline.part(_OUTPUT))

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from .._checks import Array
 from ..costs import Cost
 from .observer_bound import ObserverBound, largest_ratio
 from .properties import Detectability
@@ -20,11 +21,13 @@ class MeasuredCost:
     With detectability's norms P and V, a trajectory of k stages with the cost B is at most
     :math:`\alpha_k \sqrt B` from one without disturbances and noises that starts at its prior's
     mean z, and the true one at most :math:`d_k`. `docs/explanation/guarantees.md` derives both.
-    The cost is quadratic, without discount; the bound is of the observer whose state is z.
+    The cost is quadratic, without discount, with weights of the prior of at least ``least_prior``
+    (n, n); the bound is of the observer whose state is z.
     """
 
     def __init__(
-        self, detectability: Detectability, cost: Cost, bound: ObserverBound, sizes: Sizes
+        self, detectability: Detectability, cost: Cost, bound: ObserverBound, sizes: Sizes,
+        least_prior: Array,
     ) -> None:
         P, V = detectability.P, detectability.V
         assert P is not None
@@ -32,7 +35,7 @@ class MeasuredCost:
         self._eta = detectability.eta
         self._start, self._noise, self._disturbance = (
             largest_ratio(mine, theirs) ** 2
-            for mine, theirs in ((P, cost.least_prior), (V, cost.noise), (P, cost.disturbance))
+            for mine, theirs in ((P, least_prior), (V, cost.noise), (P, cost.disturbance))
         )
         self._entry = largest_ratio(P, bound.metric)
         self._length = largest_ratio(np.eye(len(P)), P)

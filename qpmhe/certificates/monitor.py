@@ -166,7 +166,10 @@ class Monitor:
         detected = certificate.detectability
         if not self.barred and MeasuredCost.applies(detected, cost):
             assert detected is not None
-            self._measured = MeasuredCost(detected, cost, self.bound, self.sizes)
+            self._measured = MeasuredCost(
+                detected, cost, self.bound, self.sizes,
+                cost.least_prior(estimator.observer.initial_covariance()),
+            )
 
     def check(
         self, estimate: Estimate, u: ArrayLike | None = None, *, dt: float | None = None
@@ -356,7 +359,8 @@ def _costs(certificate: Certificate, estimate: Estimate, u: Array) -> tuple[floa
     except Exception:  # a model that is not defined here: the hypothesis does not hold
         return math.nan, math.nan
     y = h_x + estimate.noises
-    own = cost.prior_cost(x[0] - z[0], cost.least_prior)
+    least = cost.least_prior(certificate.observer.initial_covariance())
+    own = cost.prior_cost(x[0] - z[0], least)
     found = []
     for states, following, v, start in ((x, f_x, estimate.noises, own), (z, f_z, y - h_z, 0.0)):
         w = states[1:] - following

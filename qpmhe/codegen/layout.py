@@ -167,10 +167,12 @@ class Layout:
             ("output_periods", r, p), ("state_periods", r, n), ("turn_middle", r, n),
         ]
         if self.covariance:
+            bounds = [("added", r, n * n), ("least_weight", r, n * n)]
             fields.append(("covariances", _struct([
                 ("initial", r, n * n), ("disturbance", r, n * n), ("noise", r, p * p),
-                ("f_jacobian", r, n * n), ("h_jacobian", r, p * n), ("minimum", r),
-                ("maximum", r), ("least", r), ("spread", r), ("typical", r, n),
+                ("f_jacobian", r, n * n), ("h_jacobian", r, p * n),
+                *(bounds if self.observer_prior else []),
+                ("least", r), ("spread", r), ("typical", r, n),
             ])))
         if k := self.held:
             fields.append(("hold", _struct([
@@ -362,8 +364,9 @@ def _filled(
             _fill(part, name, matrix)
         part["spread"] = own.spread
         part["least"] = _LEAST_SINGLE if single else SINGULAR
-        rule = cost.observer_prior
-        part["minimum"], part["maximum"] = (rule and rule.bounds) or (0.0, 0.0)
+        if layout.observer_prior:
+            _fill(part, "added", prior_weights.added)
+            _fill(part, "least_weight", prior_weights.least)
     if own.innovation is not None:
         part, limits = record["innovation"], own.innovation.limits(system.p)
         part["limits"][: limits.size], part["reopen"] = limits, own.innovation.reopen

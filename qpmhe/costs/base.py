@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,9 @@ _KEPT_BYTES = 2**22
 _KEPT_LEAST = 8
 # In place of a variance of zero: its weight acts as infinity, and its square does not overflow.
 _NO_VARIANCE = 2.0**-500
+#: The default of `ObserverPrior`. A larger one would not change a weight by more than the rounding
+#: of covariances that have shrunk from 1e10 standard deviations to one.
+LARGEST_KAPPA = 1e32
 
 
 @dataclass(frozen=True)
@@ -95,61 +98,54 @@ class CostForm(NamedTuple):
 class ObserverPrior:
     r"""Weight the prior z(t-N) with the inverse of the observer's covariance at t-N.
 
-    With a Kalman-type observer on a linear system, the estimator then equals the Kalman
-    filter for every horizon. With D the standard deviations and C the correlations of the
-    covariance, the weight is
+    This is the rule where a cost is made without a prior. With a Kalman-type observer on a linear
+    system, the estimator then equals the Kalman filter for every horizon. With P(t) the observer's
+    covariance, P(0) that of the initial error and :math:`\kappa` a number, the weight is
 
     .. math::
-        D^{-1} C^{-1} D^{-1}, \qquad P = D\, C\, D
+        W(t) = \big(P(t) + \tfrac{2}{\kappa} P(0)\big)^{-1} + \tfrac{1}{\kappa} P(0)^{-1},
+        \qquad
+        \kappa^{-1} P(0)^{-1} \preceq W(t) \preceq \kappa\, P(0)^{-1}
 
-    where eigenvalues of C below 1e-12, which are rounding, are raised to 1e-12, or to 3e-9 if the
-    disturbance has fewer directions than the state, so that C may be singular.
+    so that (eq:cond0) holds with constants in every unit, whatever becomes of P(t). The default is
+    below rounding wherever the observer has not reduced a standard deviation to less than
+    :math:`10^{-8}` of the initial one, and changes the weight by 2 parts in :math:`10^{12}` at
+    :math:`10^{-10}`. Constants for a certificate that is of use need a smaller number.
+
+    With D the standard deviations and C the correlations of a covariance, its inverse is
+    :math:`D^{-1} C^{-1} D^{-1}`, where eigenvalues of C below 1e-12, which are rounding, are raised
+    to 1e-12, or to 3e-9 if the disturbance has fewer directions than the state, so that C may be
+    singular. States that are known exactly in P(0) count with the typical variance of
+    `Cost.prior_variances` in the bounds.
 
     Parameters
     ----------
-    minimum, maximum : float, optional
-        Bounds to which the eigenvalues of the prior weight (inverse of squared state units) are
-        clipped. Then (eq:cond0) holds with them as :math:`\underline c_p` and :math:`\overline
-        c_p`, which a certificate needs. If left out, nothing is clipped, and the cost has no
-        `Cost.constants`. An `OptionError` is raised unless both are left out or 0 < minimum <
-        maximum < infinity.
+    kappa : float
+        :math:`\kappa`, between 4 and 1e32.
+
+    Raises
+    ------
+    OptionError
+        If ``kappa`` is outside of these bounds.
     """
 
-    __slots__ = ("maximum", "minimum")
+    __slots__ = ("kappa",)
 
-    def __init__(self, minimum: float | None = None, maximum: float | None = None) -> None:
-        self.minimum: float | None = None
-        self.maximum: float | None = None
-        if minimum is None and maximum is None:
-            return
-        low, high = finite(minimum), finite(maximum)
-        if low is None or high is None or not 0.0 < low < high:
+    def __init__(self, kappa: float = LARGEST_KAPPA) -> None:
+        found = finite(kappa)
+        if found is None or not 4.0 <= found <= LARGEST_KAPPA:
             raise OptionError(
-                f"minimum is {shown(minimum)} and maximum {shown(maximum)}; "
-                "expected finite numbers with 0 < minimum < maximum, or neither of them."
+                f"kappa is {shown(kappa)}; expected a number from 4 to {LARGEST_KAPPA:g}: the "
+                "largest factor between the prior's weight and the initial one."
             )
-        self.minimum, self.maximum = low, high
-
-    @property
-    def bounds(self) -> tuple[float, float] | None:
-        """Minimum and maximum; None if left out."""
-        if self.minimum is None or self.maximum is None:
-            return None
-        return self.minimum, self.maximum
+        self.kappa = found
 
     def weight(self, covariance: Array, least: float = SINGULAR) -> Array:
-        """The inverse of a covariance (n, n), clipped if bounds were given.
+        """The inverse of a covariance (n, n), without the bounds.
 
-        Otherwise eigenvalues of its correlations below ``least`` count as that.
+        Eigenvalues of its correlations below ``least`` count as that.
         """
-        bounds = self.bounds
-        if bounds is None:
-            return _relative_inverse(covariance, least)
-        values, vectors = np.linalg.eigh(covariance)
-        with np.errstate(divide="ignore"):
-            clipped = np.clip(np.where(values > 0.0, 1.0 / values, bounds[1]), *bounds)
-        weight: Array = (vectors * clipped) @ vectors.T
-        return weight
+        return _relative_inverse(covariance, least)
 
 
 def _relative_inverse(covariance: Array, least: float) -> Array:
@@ -162,6 +158,17 @@ def _relative_inverse(covariance: Array, least: float) -> Array:
     return weight / products
 
 
+def is_regular(covariance: Array) -> bool:
+    """Whether the correlations of a covariance have no eigenvalue of the size of rounding."""
+    variances = covariance.diagonal()
+    if not (variances > 0.0).all():
+        return False
+    deviations = np.sqrt(variances)
+    return bool(
+        np.linalg.eigvalsh(covariance / np.multiply.outer(deviations, deviations))[0] > SINGULAR
+    )
+
+
 class Cost(ABC):
     r"""A cost :math:`\gamma^K \Gamma(x_0 - \bar x) + \sum_{i<K} \gamma^{K-1-i} l(w_i, v_i)`.
 
@@ -172,8 +179,9 @@ class Cost(ABC):
     Parameters
     ----------
     prior, disturbance, noise : array
-        Weights of the initial error (n, n) or the `ObserverPrior` for it, of w (r, r) and of v
-        (p, p). r is n, or the number of columns of the system's ``disturbance_matrix``.
+        Weights of the initial error (n, n), of w (r, r) and of v (p, p); the first may be an
+        `ObserverPrior`, or None for the default one. r is n, or the number of columns of the
+        system's ``disturbance_matrix``.
     discount : float
         gamma, 1 for none.
 
@@ -201,13 +209,15 @@ class Cost(ABC):
     least_correlation: float = SINGULAR
 
     def __init__(
-        self, prior: Array | ObserverPrior, disturbance: Array, noise: Array, discount: float
+        self, prior: Array | ObserverPrior | None, disturbance: Array, noise: Array,
+        discount: float,
     ) -> None:
         factor = finite(discount)
         if factor is None or not 0.0 < factor <= 1.0:
             raise OptionError(f"discount is {shown(discount)}; expected a number in (0, 1].")
         self.discount = factor
-        self.prior, self.disturbance, self.noise = prior, disturbance, noise
+        self.prior: Array | ObserverPrior = ObserverPrior() if prior is None else prior
+        self.disturbance, self.noise = disturbance, noise
         self.p = noise.shape[0]
         self.stage_weight = self.joint_weight(noise)
         # By pattern, the least recently used first. Estimators in several threads may share it:
@@ -252,12 +262,17 @@ class Cost(ABC):
         """The rule that takes the prior weight from the observer's covariance, if there is one."""
         return self.prior if isinstance(self.prior, ObserverPrior) else None
 
-    @property
-    def least_prior(self) -> Array:
-        """A lower bound (n, n) on the weight of the initial error; zero if none is known."""
+    def least_prior(self, covariance: Array | None) -> Array:
+        """A lower bound (n, n) on the weight of the initial error.
+
+        With an `ObserverPrior` it is relative to the observer's initial ``covariance``, and zero
+        where that is singular.
+        """
         if not isinstance(self.prior, ObserverPrior):
             return self.prior
-        return (self.prior.minimum or 0.0) * np.eye(self.n)
+        if covariance is None or not is_regular(covariance):
+            return np.zeros((self.n, self.n))
+        return np.asarray(self.initial_weight(covariance) / self.prior.kappa)
 
     def graduated(self, progress: float) -> Cost:
         """The surrogate cost when a share ``progress`` of the first window is full."""
@@ -301,6 +316,27 @@ class Cost(ABC):
     @abstractmethod
     def constants(self) -> CostConstants | None:
         """The constants of (eq:exp_bounds); None if the cost has none."""
+
+    def constants_with(self, covariance: Array | None) -> CostConstants | None:
+        """The constants with an observer of this initial covariance (n, n), None if it has none.
+
+        The same as `constants`, except with an `ObserverPrior`: its bounds are relative to the
+        covariance. None where that is singular.
+        """
+        rule = self.observer_prior
+        if rule is None or covariance is None or not is_regular(covariance):
+            return self.constants
+        found = self._with_prior(self.initial_weight(covariance)).constants
+        if found is None:
+            return None
+        low, high = found.prior
+        return replace(found, prior=(low / rule.kappa, high * rule.kappa))
+
+    def _with_prior(self, weight: Array) -> Cost:
+        """The same cost with a constant weight of the prior."""
+        other = copy(self)
+        other.prior = weight
+        return other
 
     @abstractmethod
     def stage_costs(self, residuals: Array, weights: Array) -> Array:

@@ -26,9 +26,10 @@ class QuadraticCost(Cost):
 
     Parameters
     ----------
-    prior : (n, n) array_like or ObserverPrior
-        Weight P of the prior, symmetric positive definite, or `ObserverPrior` to take it from a
-        Kalman-type observer.
+    prior : (n, n) array_like or ObserverPrior, optional
+        Weight P of the prior, symmetric positive definite. If left out, it comes from the
+        covariance of a Kalman-type observer, as `ObserverPrior` says; another observer needs a
+        weight here.
     disturbance, noise : (r, r) and (p, p) array_like
         Weights Q of the disturbance w and R of the noise v, symmetric positive definite. r is n,
         or the number of columns of the system's ``disturbance_matrix``.
@@ -47,12 +48,12 @@ class QuadraticCost(Cost):
     quadratic = True
 
     def __init__(
-        self, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
-        discount: float = 1.0,
+        self, *, prior: ArrayLike | ObserverPrior | None = None, disturbance: ArrayLike,
+        noise: ArrayLike, discount: float = 1.0,
     ) -> None:
         w = positive_definite("disturbance", disturbance)
-        first: Array | ObserverPrior
-        if isinstance(prior, ObserverPrior):
+        first: Array | ObserverPrior | None
+        if prior is None or isinstance(prior, ObserverPrior):
             first = prior
         else:
             first = check_prior_size(positive_definite("prior", prior), w.shape[0])
@@ -60,8 +61,8 @@ class QuadraticCost(Cost):
 
     @classmethod
     def from_covariances(
-        cls, *, prior: ArrayLike | ObserverPrior, disturbance: ArrayLike, noise: ArrayLike,
-        discount: float = 1.0,
+        cls, *, prior: ArrayLike | ObserverPrior | None = None, disturbance: ArrayLike,
+        noise: ArrayLike, discount: float = 1.0,
     ) -> QuadraticCost:
         """The cost from the covariances of initial error, w and v; see `QuadraticCost`.
 
@@ -71,7 +72,8 @@ class QuadraticCost(Cost):
         covariance, singular = positive_semidefinite("disturbance covariance", disturbance)
         cost = cls(
             prior=(
-                prior if isinstance(prior, ObserverPrior) else _inverse("prior covariance", prior)
+                prior if prior is None or isinstance(prior, ObserverPrior)
+                else _inverse("prior covariance", prior)
             ),
             disturbance=np.eye(len(covariance)) if singular else inverse(covariance),
             noise=_inverse("noise covariance", noise),
@@ -94,18 +96,15 @@ class QuadraticCost(Cost):
     def constants(self) -> CostConstants | None:
         """Constants of (eq:exp_bounds): extreme eigenvalues of the weights, a = 2.
 
-        None with a discount, since the bounds then shrink with the age of a stage; with an
-        `ObserverPrior` without bounds, since its weight is arbitrary; and with a singular
-        covariance, since the cost in directions without variance is unbounded.
+        None with a discount, since the bounds then shrink with the age of a stage; with a singular
+        covariance, since the cost in directions without variance is unbounded; and with an
+        `ObserverPrior`, whose bounds `constants_with` finds from the observer's covariance.
         """
         if self.discount < 1.0 or self.disturbance_factor is not None:
             return None
-        prior = (
-            self.prior.bounds if isinstance(self.prior, ObserverPrior) else _extremes(self.prior)
-        )
-        if prior is None:
+        if isinstance(self.prior, ObserverPrior):
             return None
-        return CostConstants(2.0, prior, _extremes(self.disturbance), _extremes(self.noise))
+        return CostConstants(2.0, *map(_extremes, (self.prior, self.disturbance, self.noise)))
 
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
         """The quadratic forms; see `Cost.stage_costs`."""

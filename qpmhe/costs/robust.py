@@ -28,8 +28,10 @@ class RobustCost(Cost):
 
     Parameters
     ----------
-    prior : Loss, (n, n) array_like or ObserverPrior
-        Loss of the initial error; a matrix stands for `Quadratic`.
+    prior : Loss, (n, n) array_like or ObserverPrior, optional
+        Loss of the initial error; a matrix stands for `Quadratic`. If left out, the loss is
+        quadratic, and its weight comes from the covariance of a Kalman-type observer, as
+        `ObserverPrior` says; another observer needs a weight here.
     disturbance, noise : Loss or array_like
         Losses of w and v, such as `Huber` or `Power`; a matrix stands for `Quadratic`.
     discount : float
@@ -43,14 +45,14 @@ class RobustCost(Cost):
     """
 
     def __init__(
-        self, *, prior: Loss | ArrayLike | ObserverPrior, disturbance: Loss | ArrayLike,
-        noise: Loss | ArrayLike, discount: float = 1.0,
+        self, *, prior: Loss | ArrayLike | ObserverPrior | None = None,
+        disturbance: Loss | ArrayLike, noise: Loss | ArrayLike, discount: float = 1.0,
     ) -> None:
         self.disturbance_loss = _loss("disturbance", disturbance)
         self.noise_loss = _loss("noise", noise)
         r = self.disturbance_loss.dimension
-        weight: Array | ObserverPrior
-        if isinstance(prior, ObserverPrior):
+        weight: Array | ObserverPrior | None
+        if prior is None or isinstance(prior, ObserverPrior):
             weight = prior
             self.prior_loss: Loss = Quadratic(np.eye(r))
         else:
@@ -81,19 +83,25 @@ class RobustCost(Cost):
 
     @property
     def constants(self) -> CostConstants | None:
-        """The constants of (eq:exp_bounds), if all losses have one exponent, undiscounted."""
-        if self.discount < 1.0:
+        """The constants of (eq:exp_bounds), if all losses have one exponent, undiscounted.
+
+        With an `ObserverPrior`, `constants_with` finds them.
+        """
+        if self.discount < 1.0 or isinstance(self.prior, ObserverPrior):
             return None
         losses = (self.prior_loss, self.disturbance_loss, self.noise_loss)
         exponent = self.noise_loss.exponent
         if exponent is None or any(loss.exponent != exponent for loss in losses):
             return None
         prior, disturbance, noise = (loss.constants() for loss in losses)
-        if isinstance(self.prior, ObserverPrior):
-            prior = self.prior.bounds
         if prior is None or disturbance is None or noise is None:
             return None
         return CostConstants(exponent, prior, disturbance, noise)
+
+    def _with_prior(self, weight: Array) -> RobustCost:
+        other = copy(self)
+        other.prior, other.prior_loss = weight, Quadratic(weight)
+        return other
 
     def stage_costs(self, residuals: Array, weights: Array) -> Array:
         """The losses of w and v added; see `Cost.stage_costs`."""

@@ -30,6 +30,7 @@ from .conditions import ConditionReader, Conditions
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .hold import WindowHold
+from .prior import check_prior
 from .problem import Solved
 from .run import Run, RunSource
 from .sensitivity import Sensitivity
@@ -59,7 +60,9 @@ class MovingHorizonEstimator:
     observer : Observer
         The auxiliary observer, such as `Luenberger`.
     cost : Cost
-        `QuadraticCost` or `RobustCost`.
+        `QuadraticCost` or `RobustCost`. Without a prior it needs an observer that has a covariance,
+        see `ObserverPrior`; a constant prior beside such an observer gives a `PriorWarning`, unless
+        no QP is solved.
     horizon : int
         N >= 1. While there are fewer than N samples, all are used (Remark rem:emtpyN).
     initial_state : (n,) array_like
@@ -164,6 +167,7 @@ class MovingHorizonEstimator:
         arrival: str = "observer",
         parameters: ArrayLike | None = None,
     ) -> None:
+        is_copy = "settings" in vars(self)  # from `__setstate__`: no warning is given twice
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
             engine, project_observer, infeasible, warm_start, candidate, time_budget, delay,
@@ -174,12 +178,7 @@ class MovingHorizonEstimator:
         _require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
         _require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
         check_cost(system, cost)
-        if cost.observer_prior is not None and observer.initial_covariance() is None:
-            raise InvalidInputError(
-                f"the prior weight comes from the observer, but {type(observer).__name__} "
-                "has no covariance; take a Kalman-type observer, such as qpmhe.ExtendedKalman, "
-                "or give a constant weight."
-            )
+        check_prior(observer, cost, warns=not is_copy and self.settings.max_qps != 0)
         # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(
             cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix),
@@ -748,6 +747,7 @@ class MovingHorizonEstimator:
     def __setstate__(self, saved: dict[str, Any]) -> None:
         # Construction checks everything again: a snapshot is input like any other.
         options = vars(saved["settings"]) | {"engine": saved["engine"]}
+        self.settings = saved["settings"]
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
             *saved["arguments"], initial_state=saved["initial_state"], **options
         )

@@ -325,7 +325,8 @@ class Examination:
                 f"The estimator predicts its measurements {number(ratio)} times worse than an "
                 "extended Kalman filter with the same weights.",
                 "Raise max_qps." if self.source.settings.max_qps == 0 or kept > _KEPT
-                else "Raise max_qps or the horizon, or use qpmhe.ObserverPrior.", "warning",
+                else "Raise max_qps or the horizon, or take a Kalman-type observer and a cost "
+                "without prior.", "warning",
             )
 
     def _prior_shares(self, disturbance: Array) -> Array:
@@ -427,8 +428,8 @@ class Examination:
         else:
             text += f"; no N up to {len(shares) - 1} brings that below 10 %."
         remedy = "" if weak or self.source.cost.observer_prior is not None else (
-            "So its weight matters: let qpmhe.tune choose it, or a Kalman-type observer by "
-            "qpmhe.ObserverPrior."
+            "So its weight matters: let qpmhe.tune choose it, or a Kalman-type observer, with a "
+            "cost without prior."
         )
         return Finding("prior", text, remedy, "note")
 

@@ -62,14 +62,14 @@ class Weights:
 
     def cost(self) -> Cost:
         """The cost: quadratic, or with Huber's loss of the noise where there is a threshold."""
-        prior: Any = ObserverPrior() if self.arrival == "observer" else None
+        constant = self.arrival == "constant"
         if self.threshold is None:
             return QuadraticCost.from_covariances(
-                prior=self.prior if prior is None else prior, disturbance=self.disturbance,
+                prior=self.prior if constant else None, disturbance=self.disturbance,
                 noise=self.noise, discount=self.discount,
             )
         return RobustCost(
-            prior=inverse(self.prior) if prior is None else prior,
+            prior=inverse(self.prior) if constant else None,
             disturbance=inverse(self.disturbance),
             noise=Huber(inverse(self.noise), threshold=self.threshold), discount=self.discount,
         )

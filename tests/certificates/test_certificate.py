@@ -66,7 +66,8 @@ FREE = qpmhe.QuadraticCost(prior=qpmhe.ObserverPrior(), disturbance=np.eye(2), n
 
 def test_a_cost_without_constants_leaves_the_observers_bound(certificate):
     parts = {name: getattr(certificate, name) for name in ("region", "detectability", "stability")}
-    for cost, words in ((DISCOUNTED, "discount"), (HUBER, "exponent"), (FREE, "minimum, maximum")):
+    cases = (DISCOUNTED, "discount"), (HUBER, "exponent"), (FREE, "give a weight, prior=")
+    for cost, words in cases:
         found = certify(certificate.system, certificate.observer, cost, horizon=5, **parts)
         assert (found.holds, list(found.errors)) == (True, ["the theorem"])
         assert words in str(found.errors["the theorem"])
@@ -167,3 +168,37 @@ def test_what_is_stated_or_changed_by_hand_is_assumed(parts):
         observed.P[0, 0] = 0.0
     copied = pickle.loads(pickle.dumps(detected))  # without the system
     assert (copied.evidence, copied.system) == (Evidence.PROVED, None)
+
+
+@pytest.mark.parametrize("kappa", [10.0, 1e32])
+def test_a_prior_by_the_observer_has_the_constants_of_its_bounds(certificate, kappa):
+    system, region = certificate.system, certificate.region
+    covariances = {"disturbance": 0.01 * np.eye(2), "noise": [[0.04]]}
+    observer = qpmhe.SteadyStateKalman(
+        system, [1.5, 3.0], prior=np.diag([4.0, 0.25]), **covariances
+    )
+    cost = qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(kappa), **covariances)
+    found = certify(
+        system, observer, cost, horizon=10, region=region, sizes=Sizes(0.3, 0.6),
+        detectability=certificate.detectability, seconds=20,
+    )
+    assert (found.errors, found.evidence) == ({}, Evidence.PROVED)
+    low, high = found.of().cost.prior
+    assert (low, high) == pytest.approx((0.25 / kappa, 4.0 * kappa), rel=1e-9)
+    assert low <= 0.25 / kappa
+    assert high >= 4.0 * kappa
+    # Every weight of a run is within them, and the constants are those of the theorem.
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=10, initial_state=[0.1, 4.5], max_qps=2
+    )
+    for y in 4.0 + np.random.default_rng(0).standard_normal(30):
+        mhe.update([y])
+        values = np.linalg.eigvalsh(mhe._engine.solved().problem.prior_weight)
+        assert low <= values[0] <= values[-1] <= high
+    own = replace(
+        found.of(), cost=CostConstants(
+            2.0, (0.25 / kappa, 4.0 * kappa), found.of().cost.disturbance, found.of().cost.noise
+        ),
+    )
+    assert pytest.approx(own.C, rel=1e-8) == found.of().C
+    assert np.isfinite(own.C).all()

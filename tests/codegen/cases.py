@@ -306,7 +306,7 @@ def _steady(one):
         noise=0.05 * spd(6, one.system.p), prior=spd(4, one.system.n),
     )
     kept = {name: getattr(one.cost, name) for name in ("disturbance", "noise")}
-    cost = QuadraticCost(prior=ObserverPrior(0.5, 20.0), **kept)
+    cost = QuadraticCost(prior=ObserverPrior(6.0), **kept)
     return replace(one, observer=observer, cost=cost)
 
 
@@ -585,7 +585,7 @@ FEATURES = {
         "extended conditions": ("reactor", filtered(
             prior=np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.01]]
         ), conditions, AGAIN, WARM),
-        "unscented": ("inputs", filtered(UKF, ObserverPrior(0.8, 6.0), spread=1.2), gaps),
+        "unscented": ("inputs", filtered(UKF, ObserverPrior(5.0), spread=1.2), gaps),
         "unscented prior": ("inputs", filtered(UKF), AGAIN, ONE, conditions),
         # A covariance that is singular up to rounding has a root only up to that.
         "unscented singular": ("inputs", filtered(UKF, spd(1, 3), **SINGULAR), looser),

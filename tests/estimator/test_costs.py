@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe import ObserverPrior, Power, QuadraticCost, RobustCost
+from qpmhe import Huber, ObserverPrior, Power, QuadraticCost, RobustCost
 from qpmhe.errors import InvalidInputError, OptionError, WeightError
 
 from .plain import spd
@@ -67,21 +67,34 @@ def test_threads_may_share_a_cost_whose_patterns_are_dropped():
 
 
 def test_the_bounds_of_the_observer_prior_are_its_constants():
-    rule, others = ObserverPrior(0.1, np.int64(10)), {"disturbance": np.eye(3), "noise": 4.0}
-    found = rule.weight(np.diag([2.0, 1e9, 0.0]))
-    np.testing.assert_allclose(found, np.diag([0.5, 0.1, 10.0]), rtol=1e-9)
+    covariance = np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, 1e-6]])
+    low, *_, high = np.linalg.eigvalsh(np.linalg.inv(covariance))
+    rule, others = ObserverPrior(np.int64(10)), {"disturbance": np.eye(3), "noise": 4.0}
     for kind in (QuadraticCost, RobustCost, QuadraticCost.from_covariances):
-        assert kind(prior=rule, **others).constants.prior == (0.1, 10.0)
-        unbounded = kind(prior=ObserverPrior(), **others)
-        assert unbounded.constants is None
-        assert not unbounded.least_prior.any()
+        cost = kind(prior=rule, **others)
+        assert (cost.constants, cost.constants_with(None)) == (None, None)
+        found = cost.constants_with(covariance)
+        assert found.prior == pytest.approx((low / 10.0, high * 10.0), rel=1e-9)
+        np.testing.assert_allclose(
+            cost.least_prior(covariance), np.linalg.inv(covariance) / 10.0, rtol=1e-9
+        )
+        omitted, huge = kind(**others), 1e32
+        assert omitted.observer_prior.kappa == huge
+        found = omitted.constants_with(covariance)
+        assert found.prior == pytest.approx((low / huge, high * huge), rel=1e-9)
+        constant = kind(prior=np.diag([1.0, 2.0, 4.0]), **others)
+        assert constant.constants_with(covariance) == constant.constants
+        for known in (np.diag([1.0, 0.0, 1.0]), np.ones((3, 3))):
+            assert omitted.constants_with(known) is None
+            assert not omitted.least_prior(known).any()
+    assert RobustCost(noise=Huber(4.0), disturbance=np.eye(3)).constants_with(covariance) is None
     # Singular covariances, too, have a weight.
     known = ObserverPrior().weight(np.diag([0.0, 4.0]))
     assert 1e100 < known[0, 0] < np.inf
     assert known[1, 1] == pytest.approx(0.25)
-    for bounds in ((0.0, 1.0), (1.0, 1.0), (1.0, np.inf), ("a", 1.0), (1.0, None)):
-        text = [f"minimum is {bounds[0]!r} and maximum {bounds[1]!r}", "0 < minimum < maximum"]
-        check(OptionError, text, ObserverPrior, *bounds)
+    for kappa in (0.0, 3.9, -1.0, 1.1e32, np.inf, np.nan, "a", None, [5.0]):
+        check(OptionError, ["kappa is", "from 4 to 1e+32"], ObserverPrior, kappa)
+
 
 
 def test_wrong_costs_are_named():

@@ -40,10 +40,11 @@ def test_parts():
         check(InvalidInputError, text, estimator, **{name: value})
     text = ["gain has shape (1, 2)", "(n, p) = (2, 1)"]
     check(ShapeError, text, estimator, observer=qpmhe.Luenberger([[0.1, 0.2]]))
-    check(
-        InvalidInputError, ["Luenberger has no covariance", "qpmhe.ExtendedKalman"],
-        estimator, cost=cost_of(prior=qpmhe.ObserverPrior()),
-    )
+    text = ["covariance, but Luenberger has none", "prior=", "qpmhe.ExtendedKalman"]
+    check(InvalidInputError, text, estimator, cost=cost_of(prior=qpmhe.ObserverPrior()))
+    for kind in (qpmhe.QuadraticCost, qpmhe.QuadraticCost.from_covariances, qpmhe.RobustCost):
+        omitted = kind(disturbance=np.eye(2), noise=[[1.0]])
+        check(InvalidInputError, ["Luenberger has none", "prior="], estimator, cost=omitted)
 
 
 def test_initial_states():

@@ -27,7 +27,7 @@ def _extended(cost: qpmhe.QuadraticCost) -> tuple[qpmhe.ExtendedKalman, qpmhe.Qu
     weights = {"disturbance": cost.disturbance, "noise": cost.noise}
     return (
         qpmhe.ExtendedKalman(**covariances),
-        qpmhe.QuadraticCost(prior=qpmhe.ObserverPrior(), **weights),
+        qpmhe.QuadraticCost(**weights),
     )
 
 

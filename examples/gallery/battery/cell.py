@@ -15,7 +15,6 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-import qpmhe
 from qpmhe.plots.style import LIGHT, REAL, line_styles
 from qpmhe.tuning import Weights
 
@@ -107,7 +106,7 @@ def error(estimates: Array, soc: Array) -> Array:
 
 def own(problem: Problem, weights: Weights) -> dict[str, Way]:
     """A filter that outliers and a wrong prior do not lead astray, and a loss that fits it."""
-    cost = robust_cost(weights, qpmhe.ObserverPrior())
+    cost = robust_cost(weights)
     constant = robust_cost(weights, np.linalg.inv(weights.prior))
     found: dict[str, Way] = {
         "MHE, Huber, gain, 2 QPs": partial(

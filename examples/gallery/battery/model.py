@@ -193,15 +193,15 @@ def weights_of(cell: Cell, dt: float, prior: Array = PRIOR) -> Weights:
     return Weights(prior, disturbance(cell, dt), noise(dt), horizon=round(HORIZON / dt))
 
 
-def robust_cost(weights: Weights, prior: Array | qpmhe.ObserverPrior) -> qpmhe.RobustCost:
+def robust_cost(weights: Weights, prior: Array | None = None) -> qpmhe.RobustCost:
     """Huber's loss of the noise beyond what the model's error reaches.
 
     Parameters
     ----------
     weights : Weights
         Covariances of disturbance and noise.
-    prior : (4, 4) array or ObserverPrior
-        Weight of the prior.
+    prior : (4, 4) array, optional
+        Weight of the prior; the observer's covariance gives it if left out.
     """
     return qpmhe.RobustCost(
         prior=prior, disturbance=np.linalg.inv(weights.disturbance),

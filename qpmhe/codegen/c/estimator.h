@@ -152,9 +152,11 @@ typedef struct {
     mhe_real disturbance[MHE_NX * MHE_NX], noise[MHE_NY * MHE_NY];
     /* Jacobians of a constant gain's error. */
     mhe_real f_jacobian[MHE_NX * MHE_NX], h_jacobian[MHE_NY * MHE_NX];
-    /* The prior's weight: eigenvalues are clipped to these bounds, or where both are 0 those of
-     * the correlations count as `least` at least. */
-    mhe_real minimum, maximum, least;
+#if MHE_OBSERVER_PRIOR
+    /* What is added to the covariance that weighs the prior, and to its inverse. */
+    mhe_real added[MHE_NX * MHE_NX], least_weight[MHE_NX * MHE_NX];
+#endif
+    mhe_real least;           /* eigenvalue of the correlations that are inverted */
     mhe_real spread;          /* of sigma points, in standard deviations */
     mhe_real typical[MHE_NX]; /* variances where states may be known exactly, else 0 */
 } mhe_covariances;

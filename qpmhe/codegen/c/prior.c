@@ -20,16 +20,16 @@ static void mhe_compose(const real *values, const real *V, real *out)
     mhe_symmetrise(NX, out);
 }
 
-/* out = the inverse of M, of which each eigenvalue is between low and high, or made so. M is
+/* out = the inverse of M, of which each eigenvalue counts as `least` at least. M is
  * overwritten. */
-static void mhe_bounded_inverse(real *M, real low, real high, int is_clear, real *out)
+static void mhe_bounded_inverse(real *M, real least, int is_clear, real *out)
 {
     real V[NX * NX], values[NX];
     if (is_clear && mhe_invert(NX, M, out)) return;
     mhe_eigen(NX, M, V);
     for (int i = 0; i < NX; i++) {
         const real value = M[i * NX + i];
-        values[i] = 1 / (value > low ? value < high ? value : high : low);
+        values[i] = 1 / (value > least ? value : least);
     }
     mhe_compose(values, V, out);
 }
@@ -38,29 +38,26 @@ static void mhe_bounded_inverse(real *M, real low, real high, int is_clear, real
 static void mhe_weight_of(const mhe_covariances *o, real *P, real *out)
 {
     real scratch[NX * NX], deviations[NX];
-    if (o->maximum > 0) {
-        const real low = 1 / o->maximum, high = 1 / o->minimum;
-        const int is_clear = mhe_eigenvalues_within(NX, P, low, high, scratch);
-        mhe_bounded_inverse(P, low, high, is_clear, out);
-        return;
-    }
     for (int j = 0; j < NX; j++) deviations[j] = sqrt(mhe_max(P[j * NX + j], LEAST_VARIANCE));
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) P[i * NX + j] /= deviations[i] * deviations[j];
     const int is_clear =
         mhe_eigenvalues_within(NX, P, WELL_CONDITIONED * o->least, INFINITY, scratch);
-    mhe_bounded_inverse(P, o->least, INFINITY, is_clear, out);
+    mhe_bounded_inverse(P, o->least, is_clear, out);
     for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) out[i * NX + j] /= deviations[i] * deviations[j];
+        for (int j = 0; j < NX; j++) {
+            real *entry = out + i * NX + j;
+            *entry = *entry / (deviations[i] * deviations[j]) + o->least_weight[i * NX + j];
+        }
 }
 
 /* The weight with the variances of some states increased. */
-static void mhe_weight_plus(const mhe_covariances *o, const real *covariance, const real *added,
+static void mhe_weight_plus(const mhe_covariances *o, const real *covariance, const real *plus,
                             real factor, real *out)
 {
     real P[NX * NX];
     memcpy(P, covariance, sizeof P);
-    for (int j = 0; j < NX; j++) P[j * NX + j] += factor * added[j];
+    for (int j = 0; j < NX; j++) P[j * NX + j] += factor * plus[j];
     mhe_weight_of(o, P, out);
 }
 #endif
@@ -74,19 +71,20 @@ static void mhe_set_prior(mhe_estimator *e, mhe_workspace *k)
     prior->weight = prior->distance_weight = e->settings->prior_weight;
 #if MHE_OBSERVER_PRIOR
     const mhe_covariances *o = &e->settings->covariances;
-    real known[NX];
+    real known[NX], covariance[NX * NX];
     int count = 0;
+    for (int j = 0; j < NX * NX; j++) covariance[j] = first->covariance[j] + o->added[j];
     for (int j = 0; j < NX; j++) {
         const int is_known =
-            o->typical[j] > 0 && first->covariance[j * NX + j] <= MHE_NO_VARIANCE * o->typical[j];
+            o->typical[j] > 0 && covariance[j * NX + j] <= MHE_NO_VARIANCE * o->typical[j];
         known[j] = is_known ? o->typical[j] : 0;
         count += is_known;
     }
     prior->weight = prior->distance_weight = prior->own_weight;
-    mhe_weight_plus(o, first->covariance, known, MHE_KNOWN, prior->own_weight);
+    mhe_weight_plus(o, covariance, known, MHE_KNOWN, prior->own_weight);
     if (count) {
         /* A state that is known exactly is judged by its typical magnitude. */
-        mhe_weight_plus(o, first->covariance, known, 1, prior->own_distance);
+        mhe_weight_plus(o, covariance, known, 1, prior->own_distance);
         prior->distance_weight = prior->own_distance;
     }
 #endif
