@@ -226,3 +226,25 @@ def test_a_direction_of_the_prior_alone_is_right_to_1e10_deviations_and_refused_
         assert np.abs(gap).max() < allowed
     for deviations in (1e13, 1e15, 1e20):
         check(InvalidInputError, ["weights", "undetermined"], of, deviations)
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_a_run_keeps_those_of_its_steps_beside_a_vague_prior(engine):
+    """From the first sample on, after which nothing is known of a direction along no axis."""
+    if engine == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
+    a, c = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.7]])
+    given = {"disturbance": np.diag([1e-2, 1e-4]), "noise": np.eye(1), "prior": 1e12 * np.eye(2)}
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=2, p=1),
+        qpmhe.Luenberger(np.zeros((2, 1))), qpmhe.QuadraticCost.from_covariances(**given),
+        horizon=8, initial_state=np.zeros(2), engine=engine, max_qps=1,
+    )
+    run = mhe.run(np.random.default_rng(0).normal(size=(8, 1)), covariances=True)
+    for count, found in enumerate(run.covariances, 1):
+        right = filtered_and_smoothed(
+            [a] * count, [c] * count, given["noise"], given["prior"], given["disturbance"],
+            [False] * count,
+        )[-1].reshape(2, 2)
+        scale = np.sqrt(np.multiply.outer(right.diagonal(), right.diagonal()))
+        assert np.abs((found - right) / scale).max() < 1e-9
