@@ -195,8 +195,8 @@ def estimator_files(
     head = header(name, {**layout.header_values(name), "version": __version__})
     parts = (
         "algebra.c", "residuals.c", "conditions.c", "cost.c", "observer.c", "projection.c",
-        "window.c", "prior.c", "hold.c", "sets.c", "trial.c", "factor.c", "budget.c",
-        "inequalities.c", "optimizer.c", "step.c",
+        "window.c", "prior.c", "hold.c", "sets.c", "trial.c",
+        "factor.c" if layout.free is None else "elimination.c", "budget.c", "inequalities.c", "optimizer.c", "step.c",
     )
     body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
     data = (
