@@ -18,60 +18,75 @@
 static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACTOR : factor; }
 
 /* Entry c of the row that reflection j has made. */
-static real mhe_entry(const mhe_block *b, int width, int j, int c)
+static real mhe_entry(const mhe_block *b, int j, int c)
 {
-    return c < b->lead[j] ? 0 : c == b->lead[j] ? b->pivot[j] : b->rows[j * width + c];
+    return c < b->lead[j] ? 0 : b->rows[j * COLUMNS + c];
 }
 
-/* Reflection of the rows from j on, to zeros in column c below row j. 0 where there are zeros only. */
-static int mhe_reflect(mhe_block *b, int width, int j, int c)
+/* Reflection of the rows from j on, to zeros in column c below row j, which are not written. 0 where
+ * there are zeros only. Rows are updated by fours of columns, so that a compiler can keep them in
+ * registers; what lies left of column c is not read again. */
+static int mhe_reflect(mhe_block *b, int j, int c)
 {
-    real *row = b->rows + j * width, sums[2 * NX], norm = 0, largest = 0;
+    real *restrict row = b->rows + j * COLUMNS, *restrict mirror = b->mirrors + j * EQUATIONS;
+    real norm = 0, largest = 0;
+    const int last = b->count;
     int at = j;
-    for (int i = j; i < b->count; i++) {
-        const real value = fabs(b->rows[i * width + c]);
+    for (int i = j; i < last; i++) {
+        const real value = b->rows[i * COLUMNS + c];
+        mirror[i] = value;
         norm += value * value;
-        if (value > largest) largest = value, at = i;
+        if (fabs(value) > largest) largest = fabs(value), at = i;
     }
     if (norm == 0) return 0; /* not where it is NaN */
     b->lead[j] = c;
     b->other[j] = at;
-    if (at != j)
-        for (int q = c; q < width; q++) {
-            const real value = row[q];
-            row[q] = b->rows[at * width + q];
-            b->rows[at * width + q] = value;
+    if (at != j) {
+        real *restrict other = b->rows + at * COLUMNS;
+        const real value = mirror[j];
+        mirror[j] = mirror[at], mirror[at] = value;
+        for (int q = 0; q < COLUMNS; q++) {
+            const real moved = row[q];
+            row[q] = other[q], other[q] = moved;
         }
+    }
     norm = sqrt(norm);
-    b->pivot[j] = row[c] > 0 ? -norm : norm;
-    b->share[j] = 1 / (norm * (norm + fabs(row[c])));
-    row[c] -= b->pivot[j];
-    for (int q = c + 1; q < width; q++) sums[q] = 0;
-    for (int i = j; i < b->count; i++) {
-        const real *own = b->rows + i * width, value = own[c];
-        if (value == 0) continue;
-        for (int q = c + 1; q < width; q++) sums[q] += value * own[q];
+    const real first = mirror[j], pivot = first > 0 ? -norm : norm;
+    const real share = 1 / (norm * (norm + fabs(first)));
+    b->share[j] = share;
+    mirror[j] -= pivot;
+    real sums[COLUMNS];
+    const int start = c / 4 * 4;
+    for (int q = start; q < COLUMNS; q++) sums[q] = 0;
+    for (int i = j; i < last; i++) {
+        const real *restrict own = b->rows + i * COLUMNS, value = share * mirror[i];
+        if (value == 0) continue; /* most rows have few numbers */
+        for (int q = start; q < COLUMNS; q += 4)
+            for (int l = 0; l < 4; l++) sums[q + l] += value * own[q + l];
     }
-    for (int i = j; i < b->count; i++) {
-        real *own = b->rows + i * width;
-        const real value = b->share[j] * own[c];
+    for (int i = j; i < last; i++) {
+        real *restrict own = b->rows + i * COLUMNS;
+        const real value = mirror[i];
         if (value == 0) continue;
-        for (int q = c + 1; q < width; q++) own[q] -= value * sums[q];
+        for (int q = start; q < COLUMNS; q += 4)
+            for (int l = 0; l < 4; l++) own[q + l] -= value * sums[q + l];
     }
+    row[c] = pivot;
     return 1;
 }
 
 /* Apply a block's reflections to the right-hand side of its rows. */
-static void mhe_apply(const mhe_block *b, int width, real *side)
+static void mhe_apply(const mhe_block *b, real *restrict side)
 {
     for (int j = 0; j < b->rank; j++) {
-        const real *column = b->rows + b->lead[j], first = side[j];
+        const real *restrict mirror = b->mirrors + j * EQUATIONS;
+        const real first = side[j];
         real sum = 0;
         side[j] = side[b->other[j]];
         side[b->other[j]] = first;
-        for (int i = j; i < b->count; i++) sum += column[i * width] * side[i];
+        for (int i = j; i < b->count; i++) sum += mirror[i] * side[i];
         sum *= b->share[j];
-        for (int i = j; i < b->count; i++) side[i] -= sum * column[i * width];
+        for (int i = j; i < b->count; i++) side[i] -= sum * mirror[i];
     }
 }
 
@@ -241,7 +256,7 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
                 real *row = b->rows + b->count++ * COLUMNS;
                 for (int c = 0; c < COLUMNS; c++) row[c] = 0;
                 for (int l = later->lead[j] - MHE_FREE; l < NX; l++) {
-                    const real value = mhe_entry(later, COLUMNS, j, MHE_FREE + l);
+                    const real value = mhe_entry(later, j, MHE_FREE + l);
                     for (int c = 0; c < MHE_FREE; c++) row[c] += value * s->free[l * MHE_FREE + c];
                     for (int c = 0; c < NX; c++) row[MHE_FREE + c] += value * A[l * NX + c];
                 }
@@ -251,8 +266,8 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
         else if (weighted)
             mhe_add_inequalities(e, k, i);
 #endif
-        for (int c = 0; c < COLUMNS && b->rank < b->count; c++) {
-            b->rank += mhe_reflect(b, COLUMNS, b->rank, c);
+        for (int c = 0; c < MHE_FREE + NX && b->rank < b->count; c++) {
+            b->rank += mhe_reflect(b, b->rank, c);
             if (c < MHE_FREE) b->free = b->rank;
         }
     }
@@ -261,30 +276,32 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
     const mhe_block *data = k->blocks;
     b->count = 0;
     for (int j = 0; j < NX; j++) k->order[j] = j;
+    memset(b->rows, 0, sizeof(real) * (size_t)(data->rank - data->free + NX) * COLUMNS);
     for (int j = data->free; j < data->rank; j++, b->count++)
         for (int c = 0; c < NX; c++)
-            b->rows[b->count * NX + c] = mhe_entry(data, COLUMNS, j, MHE_FREE + c);
+            b->rows[b->count * COLUMNS + c] = mhe_entry(data, j, MHE_FREE + c);
     for (int j = 0; j < NX; j++, b->count++)
-        for (int c = 0; c < NX; c++)
-            b->rows[b->count * NX + c] = c < j ? 0 : k->prior_root[j * NX + c];
+        for (int c = j; c < NX; c++)
+            b->rows[b->count * COLUMNS + c] = k->prior_root[j * NX + c];
     for (int j = 0; j < NX; j++) {
         real most = -1;
         int at = j;
         for (int c = j; c < NX; c++) {
             real square = 0;
-            for (int i = j; i < b->count; i++) square += b->rows[i * NX + c] * b->rows[i * NX + c];
+            for (int i = j; i < b->count; i++)
+                square += b->rows[i * COLUMNS + c] * b->rows[i * COLUMNS + c];
             if (square > most) most = square, at = c;
         }
         if (at != j) {
             const int other = k->order[j];
             k->order[j] = k->order[at], k->order[at] = other;
             for (int i = 0; i < b->count; i++) {
-                const real value = b->rows[i * NX + j];
-                b->rows[i * NX + j] = b->rows[i * NX + at];
-                b->rows[i * NX + at] = value;
+                real *row = b->rows + i * COLUMNS;
+                const real value = row[j];
+                row[j] = row[at], row[at] = value;
             }
         }
-        if (!mhe_reflect(b, NX, j, j) || !isfinite(b->pivot[j])) return 0;
+        if (!mhe_reflect(b, j, j) || !isfinite(b->rows[j * COLUMNS + j])) return 0;
     }
     b->rank = NX;
     return 1;
@@ -355,20 +372,20 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
         for (int j = later->free; i < count && j < later->rank; j++, at++) {
             side[at] = side[EQUATIONS + j];
             for (int l = later->lead[j] - MHE_FREE; l < NX && !push; l++)
-                side[at] -= mhe_entry(later, COLUMNS, j, MHE_FREE + l) * drift[l];
+                side[at] -= mhe_entry(later, j, MHE_FREE + l) * drift[l];
         }
-        mhe_apply(b, COLUMNS, side);
+        mhe_apply(b, side);
     }
     const mhe_block *start = &k->start, *data = k->blocks;
     real side[2 * NX], first[NX];
     int at = 0;
     for (int j = data->free; j < data->rank; j++) side[at++] = k->sides_of[j];
     for (int j = 0; j < NX; j++) side[at++] = push ? 0 : k->first_target[j];
-    mhe_apply(start, NX, side);
+    mhe_apply(start, side);
     for (int j = NX - 1; j >= 0; j--) {
         real sum = side[j];
-        for (int c = j + 1; c < NX; c++) sum -= start->rows[j * NX + c] * first[c];
-        first[j] = sum / start->pivot[j];
+        for (int c = j + 1; c < NX; c++) sum -= start->rows[j * COLUMNS + c] * first[c];
+        first[j] = sum / start->rows[j * COLUMNS + j];
     }
     for (int j = 0; j < NX; j++) out[k->order[j]] = first[j];
     for (int i = 0; i < count; i++) {
@@ -379,7 +396,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
             const real *row = b->rows + j * COLUMNS;
             real sum = given[j] - mhe_dot(NX, row + MHE_FREE, own);
             for (int c = b->lead[j] + 1; c < MHE_FREE; c++) sum -= row[c] * disturbance[c];
-            disturbance[b->lead[j]] = sum / b->pivot[j];
+            disturbance[b->lead[j]] = sum / b->rows[j * COLUMNS + b->lead[j]];
         }
         for (int j = 0; j < NX; j++)
             next[j] = mhe_dot(NX, k->at[i]->f_jacobian + j * NX, own) +
@@ -396,7 +413,7 @@ static void mhe_set_curvatures(const mhe_estimator *e, mhe_workspace *k)
         real *square = k->curvature + k->order[c];
         *square = 0;
         for (int j = 0; j <= c; j++) {
-            const real value = mhe_entry(&k->start, NX, j, c);
+            const real value = mhe_entry(&k->start, j, c);
             *square += value * value;
         }
     }
@@ -405,7 +422,7 @@ static void mhe_set_curvatures(const mhe_estimator *e, mhe_workspace *k)
             real *square = k->curvature + NX + i * MHE_FREE + c;
             *square = 0;
             for (int j = 0; j < k->blocks[i].free; j++) {
-                const real value = mhe_entry(k->blocks + i, COLUMNS, j, c);
+                const real value = mhe_entry(k->blocks + i, j, c);
                 *square += value * value;
             }
         }

@@ -351,12 +351,13 @@ typedef struct {
 
 #if MHE_ROLLED
 /* Rows of a least-squares problem, and the reflections that turn them into `rank` rows, each with zeros
- * before its column `lead`; the first `free` of these are of disturbances. */
-#define MHE_COLUMNS (MHE_FREE + MHE_NX)
+ * before its column `lead`; the first `free` of these are of disturbances. Columns are padded. */
+#define MHE_COLUMNS ((MHE_FREE + MHE_NX + 3) / 4 * 4)
 #define MHE_EQUATIONS (MHE_FREE + 2 * MHE_NX + MHE_NY + MHE_STAGE_ROWS)
 typedef struct {
     mhe_real rows[MHE_EQUATIONS * MHE_COLUMNS];
-    mhe_real pivot[MHE_COLUMNS], share[MHE_COLUMNS], root[MHE_SIZE(MHE_STAGE_ROWS)];
+    mhe_real mirrors[MHE_COLUMNS * MHE_EQUATIONS], share[MHE_COLUMNS];
+    mhe_real root[MHE_SIZE(MHE_STAGE_ROWS)];
     int32_t lead[MHE_COLUMNS], other[MHE_COLUMNS], source[MHE_SIZE(MHE_STAGE_ROWS)];
     int32_t count, rank, free, inequalities;
 } mhe_block;
