@@ -23,21 +23,33 @@ static real mhe_entry(const mhe_block *b, int j, int c)
     return c < b->lead[j] ? 0 : b->rows[j * COLUMNS + c];
 }
 
+/* a'b in four sums side by side: one after the other, the latency of each addition would be most of
+ * the time. */
+static real mhe_sum_of_products(int n, const real *restrict a, const real *restrict b)
+{
+    real sums[4] = {0, 0, 0, 0};
+    int i = 0;
+    for (; i + 4 <= n; i += 4)
+        for (int l = 0; l < 4; l++) sums[l] += a[i + l] * b[i + l];
+    for (int l = 0; i < n; i++, l++) sums[l] += a[i] * b[i];
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+}
+
 /* Reflection of the rows from j on, to zeros in column c below row j, which are not written. 0 where
  * there are zeros only. Rows are updated by fours of columns, so that a compiler can keep them in
  * registers; what lies left of column c is not read again. */
 static int mhe_reflect(mhe_block *b, int j, int c)
 {
     real *restrict row = b->rows + j * COLUMNS, *restrict mirror = b->mirrors + j * EQUATIONS;
-    real norm = 0, largest = 0;
+    real largest = 0;
     const int last = b->count;
     int at = j;
     for (int i = j; i < last; i++) {
         const real value = b->rows[i * COLUMNS + c];
         mirror[i] = value;
-        norm += value * value;
         if (fabs(value) > largest) largest = fabs(value), at = i;
     }
+    const real norm = sqrt(mhe_sum_of_products(last - j, mirror + j, mirror + j));
     if (norm == 0) return 0; /* not where it is NaN */
     b->lead[j] = c;
     b->other[j] = at;
@@ -50,7 +62,6 @@ static int mhe_reflect(mhe_block *b, int j, int c)
             row[q] = other[q], other[q] = moved;
         }
     }
-    norm = sqrt(norm);
     const real first = mirror[j], pivot = first > 0 ? -norm : norm;
     const real share = 1 / (norm * (norm + fabs(first)));
     b->share[j] = share;
@@ -81,11 +92,9 @@ static void mhe_apply(const mhe_block *b, real *restrict side)
     for (int j = 0; j < b->rank; j++) {
         const real *restrict mirror = b->mirrors + j * EQUATIONS;
         const real first = side[j];
-        real sum = 0;
         side[j] = side[b->other[j]];
         side[b->other[j]] = first;
-        for (int i = j; i < b->count; i++) sum += mirror[i] * side[i];
-        sum *= b->share[j];
+        const real sum = b->share[j] * mhe_sum_of_products(b->count - j, mirror + j, side + j);
         for (int i = j; i < b->count; i++) side[i] -= sum * mirror[i];
     }
 }
