@@ -423,7 +423,7 @@ static void mhe_compare(mhe_rows *q, int rows, real tolerance, mhe_guess *guess)
             const real below = q->low[i] - q->value[i], above = q->value[i] - q->high[i];
             if (below > little) next = AT_LOWER;
             if (above > little) next = AT_UPPER;
-        } else if (next != EQUATION && next * q->force[i] < 0)
+        } else if (next != EQUATION && (next < 0 ? -q->force[i] : q->force[i]) < 0)
             next = BETWEEN;
         q->next[i] = (int8_t)next;
         guess->wrong += next != q->place[i];
@@ -550,7 +550,7 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real product)
         for (int i = 0; i < rows; i++) {
             const real limit = side ? q->high[i] : -q->low[i];
             const int there = isfinite(limit) && q->low[i] < q->high[i];
-            p->there[i] = there;
+            p->there[i] = there ? 1 : 0;
             p->limit[i] = there ? limit : 0;
             p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
             p->dual[i] = there ? product / p->slack[i] : 0;
@@ -757,7 +757,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
             length = mhe_set_changes(q, rows, target);
             if (corrector) break;
             const real ratio = mhe_set_corrections(q, rows, length) / products;
-            target = ratio * ratio * ratio * products / sides;
+            target = ratio * ratio * ratio * products / (real)sides;
         }
         length *= (real)0.995;
         if (!(length > 1e-10)) return STOPPED;
