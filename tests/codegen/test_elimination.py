@@ -150,3 +150,26 @@ def test_a_component_of_w_without_width_is_eliminated(spread):
     run = estimator(boxed, spread**2 * np.eye(2), form="box", W=W).run(Y)
     wanted = filtered(same, spread**2 * np.eye(2), Y)
     np.testing.assert_allclose(run.filtered, wanted, rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e3, 1e5])
+def test_active_bounds_of_states_and_a_vague_prior(spread):
+    """Python solves the optimality conditions with the equality rows in them."""
+    A, C, G, q = MODELS["position"]
+    runs = []
+    for engine in ("python", "compiled"):
+        mhe = qpmhe.MovingHorizonEstimator(
+            qpmhe.System(
+                lambda x: x @ A.T, lambda x: x @ C.T, n=2, p=1, disturbance_matrix=G,
+                states=qpmhe.Box([-np.inf, 0.2], [14.0, 0.3]),
+            ),
+            qpmhe.Luenberger(np.zeros((2, 1))),
+            qpmhe.QuadraticCost.from_covariances(
+                prior=spread**2 * np.eye(2), disturbance=[q], noise=np.eye(1)
+            ),
+            horizon=9, initial_state=[0.0, 0.25], engine=engine, max_qps=5,
+        )
+        runs.append(mhe.run(measured()))
+    assert np.isclose(runs[0].filtered[:, 1], 0.3).any()
+    np.testing.assert_allclose(runs[1].filtered, runs[0].filtered, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(runs[1].costs, runs[0].costs, rtol=1e-9)

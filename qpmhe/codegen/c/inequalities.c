@@ -715,6 +715,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     memset(k->step, 0, sizeof(real) * (size_t)size);
     memset(q->force, 0, sizeof q->force);
 #if MHE_ROLLED
+    (void)offset; /* roots and gradient are in place */
     mhe_set_curvatures(e, k);
 #endif
     const real outside = mhe_row_violation(e, k, k->step);
