@@ -14,6 +14,7 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 #define STALL 4
 #define SHARE (real)0.8
 #define SMALL (real)1e-3
+#define FARTHEST (sizeof(real) == 8 ? (real)1e7 : (real)1e3)
 
 /* Guesses of the active rows, and rounds of the augmented Lagrangian for each; each round makes
  * the rows' gaps smaller by about this factor. */
@@ -458,15 +459,18 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
 /* The sign of a row's value in the slack of one of its sides. */
 static real mhe_sign(int side) { return side ? -1 : 1; }
 
-/* Slacks and duals at the start, whose products are all the same; the number of sides. */
-static int mhe_start(mhe_rows *q, int rows, real missed, real product)
+/* Slacks and duals at the start, whose products are all the same; the number of sides. Sides that
+ * are more than `farthest` units away are none: beside such slacks, residuals are only rounding. */
+static int mhe_start(mhe_rows *q, int rows, real missed, real product, real farthest)
 {
     int sides = 0;
     for (int side = 0; side < 2; side++) {
         mhe_side *p = q->sides + side;
         for (int i = 0; i < rows; i++) {
             const real limit = side ? q->high[i] : -q->low[i];
-            const int there = isfinite(limit) && q->low[i] < q->high[i];
+            const real unit = mhe_max(missed * q->scale[i], q->deviation[i]);
+            const int there =
+                isfinite(limit) && q->low[i] < q->high[i] && !(limit > farthest * unit);
             p->there[i] = there;
             p->limit[i] = there ? limit : 0;
             p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
@@ -603,7 +607,10 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     const real outside = mhe_row_violation(e, k, k->step);
     const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */
-    const int sides = mhe_start(q, rows, missed, mhe_max(scale, EPSILON * EPSILON));
+    const real product = mhe_max(scale, EPSILON * EPSILON);
+    real farthest = FARTHEST;
+    int sides = mhe_start(q, rows, missed, product, farthest);
+    if (!sides) sides = mhe_start(q, rows, missed, product, farthest = INFINITY);
     if (!sides) return STOPPED;
     for (*iterations = 0;; ++*iterations) {
         real infeasible, unbalanced = 0, length = 1, target = 0;
@@ -623,6 +630,13 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         if (infeasible <= s->solver_tolerance / 100 &&
             unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
             products <= s->solver_tolerance / 1000 * scale) {
+            if (farthest < INFINITY && mhe_row_violation(e, k, k->step) > s->solver_tolerance) {
+                memset(k->step, 0, sizeof(real) * (size_t)size);
+                memset(q->force, 0, sizeof q->force);
+                sides = mhe_start(q, rows, missed, product, farthest = INFINITY);
+                far = INFINITY, stiffness = STIFFNESS;
+                continue;
+            }
             mhe_set_places(q, rows);
             return SOLVED;
         }
