@@ -71,8 +71,9 @@ class MovingHorizonEstimator:
         every QP. A solver made by ``qpmhe.solvers.create`` keeps its cap and tolerances. Several
         estimators of one thread may share it; it starts cold whenever the estimator changes.
     max_qps : int or None
-        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence, with at
-        most 100 QPs. If inequalities are dropped, at least one QP is solved without them, even
+        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence; it
+        ends before, with `Status.UNCONVERGED`, at 100 QPs, and without a cap on iterations or time
+        at three in a row that the backend has not solved to its tolerance. If inequalities are dropped, at least one QP is solved without them, even
         beyond the cap.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
