@@ -28,7 +28,7 @@ from .costs import (
     QuadraticCost,
     RobustCost,
 )
-from .errors import ObserverWarning, QpmheError
+from .errors import ModelWarning, ObserverWarning, QpmheError
 from .estimation.active_rows import ActiveRow
 from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
@@ -129,6 +129,7 @@ __all__ = [
     "MovingHorizonEstimator",
     "Observer",
     "ObserverPrior",
+    "ModelWarning",
     "ObserverWarning",
     "OutputInjection",
     "Polytope",

@@ -17,6 +17,7 @@ __all__ = [
     "EngineWarning",
     "InvalidInputError",
     "ModelError",
+    "ModelWarning",
     "ObserverWarning",
     "OptionError",
     "QpmheError",
@@ -45,6 +46,10 @@ class CompilationError(QpmheError):
 
 class ObserverWarning(UserWarning):
     """An unreliable observer, or an initial state that was projected onto the state set."""
+
+
+class ModelWarning(UserWarning):
+    """A model that its step discretises too coarsely for the size of its disturbances."""
 
 
 class EngineWarning(UserWarning):

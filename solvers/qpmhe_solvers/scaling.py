@@ -77,7 +77,7 @@ class Scale:
         scaled.key = self.key
 
     def drop_far(self, scaled: QP) -> Mask | None:
-        """Make the far limits of a scaled QP infinite; which of its limits, None if none was far."""
+        """Make far limits of a scaled QP infinite; a mask of them, None if none is far."""
         most, none = self._farthest, np.inf
         far: Mask = np.concatenate((scaled.all_lower < -most, scaled.all_upper > most))
         far &= np.isfinite(scaled.limits)
