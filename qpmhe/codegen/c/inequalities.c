@@ -258,7 +258,7 @@ static int mhe_first_guess(mhe_rows *q, int rows, int limit)
         q->force[i] = 0;
         q->place[i] = place < 0 ? AT_LOWER : place > 0 ? AT_UPPER : BETWEEN;
         if (q->low[i] == q->high[i]) q->place[i] = EQUATION;
-        else if (!isfinite(mhe_limit_of(q, i))) q->place[i] = BETWEEN;
+        else if (!(fabs(mhe_limit_of(q, i)) <= FARTHEST * q->deviation[i])) q->place[i] = BETWEEN;
         if (limit == 0) q->place[i] = BETWEEN;
         active += q->place[i] != BETWEEN;
     }
@@ -459,18 +459,18 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
 /* The sign of a row's value in the slack of one of its sides. */
 static real mhe_sign(int side) { return side ? -1 : 1; }
 
-/* Slacks and duals at the start, whose products are all the same; the number of sides. Sides that
- * are more than `farthest` units away are none: beside such slacks, residuals are only rounding. */
-static int mhe_start(mhe_rows *q, int rows, real missed, real product, real farthest)
+/* Slacks and duals at the start, whose products are all the same; the number of sides. Far sides
+ * are none, as beside their slacks residuals are only rounding: those that are many deviations away,
+ * and many times farther than the minimiser without inequalities `reach`es, in scales. */
+static int mhe_start(mhe_rows *q, int rows, real missed, real reach, real product)
 {
     int sides = 0;
     for (int side = 0; side < 2; side++) {
         mhe_side *p = q->sides + side;
         for (int i = 0; i < rows; i++) {
             const real limit = side ? q->high[i] : -q->low[i];
-            const real unit = mhe_max(missed * q->scale[i], q->deviation[i]);
-            const int there =
-                isfinite(limit) && q->low[i] < q->high[i] && !(limit > farthest * unit);
+            const real unit = mhe_max(reach * q->scale[i], q->deviation[i]);
+            const int there = q->low[i] < q->high[i] && limit <= FARTHEST * unit;
             p->there[i] = there;
             p->limit[i] = there ? limit : 0;
             p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
@@ -601,16 +601,15 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     real far = INFINITY, stiffer = 1;
     const real missed = mhe_row_violation(e, k, k->step);
     const real promise = fabs(mhe_product(size, k->gradient, k->step));
+    real reach = 0;
     if (!(missed > 0)) return SOLVED;
+    for (int i = 0; i < rows; i++) reach = mhe_max(fabs(q->value[i]) / q->scale[i], reach);
     memset(k->step, 0, sizeof(real) * (size_t)size);
     memset(q->force, 0, sizeof q->force);
     const real outside = mhe_row_violation(e, k, k->step);
     const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */
-    const real product = mhe_max(scale, EPSILON * EPSILON);
-    real farthest = FARTHEST;
-    int sides = mhe_start(q, rows, missed, product, farthest);
-    if (!sides) sides = mhe_start(q, rows, missed, product, farthest = INFINITY);
+    const int sides = mhe_start(q, rows, missed, reach, mhe_max(scale, EPSILON * EPSILON));
     if (!sides) return STOPPED;
     for (*iterations = 0;; ++*iterations) {
         real infeasible, unbalanced = 0, length = 1, target = 0;
@@ -630,13 +629,6 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         if (infeasible <= s->solver_tolerance / 100 &&
             unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
             products <= s->solver_tolerance / 1000 * scale) {
-            if (farthest < INFINITY && mhe_row_violation(e, k, k->step) > s->solver_tolerance) {
-                memset(k->step, 0, sizeof(real) * (size_t)size);
-                memset(q->force, 0, sizeof q->force);
-                sides = mhe_start(q, rows, missed, product, farthest = INFINITY);
-                far = INFINITY, stiffness = STIFFNESS;
-                continue;
-            }
             mhe_set_places(q, rows);
             return SOLVED;
         }
