@@ -211,7 +211,7 @@ class MovingHorizonEstimator:
             error = step_error(
                 system, cost, observer.initial_covariance(), self._initial_state, self._usual_input
             )
-            warn_of_step(error, system, 2)
+            warn_of_step(error, system, 3)
         self._second: SecondDerivatives | None = None
         try:
             self._engine = engine_for(

@@ -70,7 +70,7 @@ def step_error(
     if system.dt is None or system.make_timed is None:
         return None
     try:
-        prior = cost.prior_deviations(covariance, system.disturbance_matrix)
+        prior = np.sqrt(inverse(cost.initial_weight(covariance)).diagonal())
         points = _points(system, state, prior)
         step, half = (np.tile(np.append(u, one), (len(points), 1))
                       for one in (system.dt, 0.5 * system.dt))
