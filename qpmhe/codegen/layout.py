@@ -195,8 +195,8 @@ class Layout:
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         fields += [(name, r, n) for name in ("inner_lower", "inner_upper", "aside")]
         options = (
-            "metric_settled", "project", "max_qps", "uncapped", "patience", "max_iterations", "infeasible",
-            "start_at_best", "reinitialize", "smooth", "delay",
+            "metric_settled", "project", "max_qps", "uncapped", "patience", "max_iterations",
+            "infeasible", "start_at_best", "reinitialize", "smooth", "delay",
         )
         fields += [(name, np.int32) for name in options]
         if self.clock:
