@@ -37,6 +37,7 @@ from .run import Run, RunSource
 from .sensitivity import Sensitivity
 from .settings import Settings
 from .snapshot import read, written
+from .step_length import step_error, warn_of_step
 from .time_index import paired_record
 
 Array = NDArray[np.float64]
@@ -75,9 +76,10 @@ class MovingHorizonEstimator:
         every QP. A solver made by ``qpmhe.solvers.create`` keeps its cap and tolerances. Several
         estimators of one thread may share it; it starts cold whenever the estimator changes.
     max_qps : int or None
-        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence, with at
-        most 100 QPs. If inequalities are dropped, at least one QP is solved without them, even
-        beyond the cap.
+        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence; it
+        ends before, with `Status.UNCONVERGED`, at 100 QPs, and without a cap on iterations or time
+        at three in a row that the backend has not solved to its tolerance. If inequalities are
+        dropped, at least one QP is solved without them, even beyond the cap.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.
@@ -131,6 +133,15 @@ class MovingHorizonEstimator:
     ------
     InvalidInputError
         If an argument is invalid; the subclass says how (see `qpmhe.errors`).
+
+    Warns
+    -----
+    ModelWarning
+        If the step of a discretised ODE is too long: at the initial state, or at points within one
+        standard deviation of the prior and within X, one step differs from two of half the length
+        by more than 0.1 standard deviations of the disturbance, or of the prior where there is no
+        disturbance; with ``method="euler"``, a coarse map by choice, by more than 1. The input is
+        the usual one, zero but for ``parameters``. Samples are not compared.
 
     Examples
     --------
@@ -197,6 +208,11 @@ class MovingHorizonEstimator:
         self._full_input = self._usual_input.copy()  # each sample's, overwritten
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._initial_state: Array = self._checked_start(initial_state, self._own_system)
+        if not is_copy:
+            error = step_error(
+                system, cost, observer.initial_covariance(), self._initial_state, self._usual_input
+            )
+            warn_of_step(error, system, 3)
         self._second: SecondDerivatives | None = None
         try:
             self._engine = engine_for(
@@ -749,7 +765,7 @@ class MovingHorizonEstimator:
     def __setstate__(self, saved: dict[str, Any]) -> None:
         # Construction checks everything again: a snapshot is input like any other.
         options = vars(saved["settings"]) | {"engine": saved["engine"]}
-        self.settings = saved["settings"]
+        self.settings = saved["settings"]  # what the first construction warned of is known
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
             *saved["arguments"], initial_state=saved["initial_state"], **options
         )
