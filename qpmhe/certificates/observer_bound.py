@@ -44,6 +44,8 @@ from .sizes import OUTWARD, UNIT, Size, Sizes, intervals, lengths_of, weighted_l
 _SETTLED, _MOST_SAMPLES = 0.1, 10**6
 # How much of the time is for the contraction, and of the rest for the region itself.
 _CONTRACTION, _INVARIANCE = 0.8, 0.6
+# Values of two models that differ by this share of the largest along a run are rounding.
+_SAME_MODEL = 1e-9
 _SLACKS = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 
 #: Of an estimator whose observer does not run on.
@@ -309,7 +311,8 @@ class ObserverBound:
         ShapeError, OptionError, SetError, InvalidInputError
             If an argument does not fit.
         MismatchError
-            If the run's estimator is known, and had another gain.
+            If the run's estimator is known, and had another gain, or a model with other values of f
+            or h at the run's states.
         """
         if not isinstance(run, Run):
             raise InvalidInputError(
@@ -321,6 +324,8 @@ class ObserverBound:
         if source is not None:
             own = self.of_observer(source.observer, source.system)
             inputs, steps, usual = source.inputs, source.steps, source.system.dt
+            if self.stability.system is not None:
+                _check_model(self.stability.system, source.system, z[:-1], inputs)
         radius = self.radii(len(run), initial_error, disturbances, noises)
         lost, reason = own.first_event(run.flags, z[:-1], inputs, steps, usual)
         empty = self.is_empty(radius[1:], z[1:])
@@ -479,3 +484,31 @@ def largest_ratio(metric: Array, other: Array) -> float:
         if found > 0.0 and definite(rest)[0].all():
             return math.sqrt(found) * OUTWARD
     return math.inf
+
+
+def _check_model(certified: System, used: System, states: Array, inputs: Array | None) -> None:
+    """Refuse a run of another model than the certified one, judged at the run's own states."""
+    if used is certified:
+        return
+    sizes = [(one.n, one.p, one.m) for one in (certified, used)]
+    if sizes[0] != sizes[1]:
+        raise MismatchError(
+            f"the run's system has (n, p, m) = {sizes[1]}, the certified one {sizes[0]}; certify "
+            "the system of the run."
+        )
+    u = np.empty((len(states), used.m)) if inputs is None else inputs
+    for name in ("f", "h"):
+        with np.errstate(all="ignore"):
+            mine, other = (getattr(one, name).batch(states, u) for one in (certified, used))
+        # Of each component's own unit.
+        size = np.abs(mine).max(axis=0)
+        if name == "f":
+            size = np.maximum(size, np.abs(states).max(axis=0))
+        # Written so that a value that is not finite counts as another model.
+        same = (np.abs(mine - other) <= _SAME_MODEL * size).all(axis=1)
+        if not same.all():
+            t = int(same.argmin())
+            raise MismatchError(
+                f"{name} of the run's system is {other[t].tolist()} at sample {t}, and that of the "
+                f"certified one {mine[t].tolist()}; certify the system of the run."
+            )

@@ -10,7 +10,7 @@ import qpmhe
 from qpmhe import certificates
 from qpmhe.certificates import Evidence, Sizes, certify
 from qpmhe.certificates import certificate as certification
-from qpmhe.certificates.evidence import at_most
+from qpmhe.certificates.evidence import MismatchError, at_most
 from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.sizes import lengths_of
 from qpmhe.errors import OptionError, SetError, ShapeError
@@ -205,3 +205,22 @@ def test_time_up_leaves_what_was_reached(monkeypatch):
     assert certificate.observer_bound.evidence is Evidence.PROVED
     assert not certificate.constants
     assert "Not certified: detectability: the time for this search" in str(certificate)
+
+
+def test_a_run_of_another_model_with_the_same_gain_is_refused():
+    def made(a, c):
+        return qpmhe.System(lambda x: a * x, lambda x: c * x, n=1, p=1)
+
+    def run_of(system):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([[0.1]]), unit_cost(1, 1), horizon=3, initial_state=[0.0],
+            max_qps=1,
+        )
+        return mhe.run(0.05 + 0.01 * np.arange(20.0)[:, None])
+
+    bound = bound_of(made(0.8, 1.0), [[0.1]], qpmhe.Box([-2.0], [2.0]), 0.01, 0.01)
+    # Another object with the same functions is the same model.
+    assert bound.along(run_of(made(0.8, 1.0)), initial_error=0.1).lost is None
+    for name, other in (("f", made(1.0, 1.0)), ("h", made(0.8, 1.1))):
+        with pytest.raises(MismatchError, match=f"^{name} of the run's system"):
+            bound.along(run_of(other), initial_error=0.1)
