@@ -27,7 +27,7 @@ from ..model.traces import warn_of
 from ..observers import Observer
 from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
-from .contracts import check_losses, check_observer
+from .contracts import check_correction, check_observer
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .hold import WindowHold
@@ -190,7 +190,7 @@ class MovingHorizonEstimator:
         _require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
         _require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
         check_cost(system, cost)
-        check_losses(cost)
+        check_observer(system, observer)
         check_prior(observer, cost, warns=not is_copy and self.settings.max_qps != 0)
         # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(
@@ -209,6 +209,9 @@ class MovingHorizonEstimator:
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._initial_state: Array = self._checked_start(initial_state, self._own_system)
         if not is_copy:
+            check_correction(
+                self._own_system, observer, cost, self._initial_state, self._usual_input
+            )
             error = step_error(
                 system, cost, observer.initial_covariance(), self._initial_state, self._usual_input
             )
@@ -816,7 +819,6 @@ def check_start(
         state = _inside(system, observer, cost, state, name)
         system.check(state, np.zeros(system.m) if u is None else u)
         observer.check(system, state)
-        check_observer(observer, system, state, np.zeros(system.m) if u is None else u)
     except ModelError as error:
         if name == "initial_state":
             raise
