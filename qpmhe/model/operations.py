@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .stand_ins import MakingRecord, without_symbols
-from .symbols import NUMBERS, NotTraceableError, Symbol, SymbolArray, plain
+from .stand_ins import MakingRecord, with_symbols, without_symbols
+from .symbols import NUMBERS, NotTraceableError, Symbol, SymbolArray, flat, plain
 
 Objects = NDArray[np.object_]
 Form = Callable[..., Any]
@@ -166,10 +166,10 @@ class ExpressionRecord(MakingRecord):
         before = self.reason
         try:
             value = function(*arguments, **options)
-        except NotTraceableError:
+        except (NotTraceableError, ValueError):
             # With a dtype, say, or in a list of lists: what it would be without it.
             kind = options.get("dtype", arguments[1] if len(arguments) > 1 else None)
-            if kind is None or np.dtype(kind) != np.float64:
+            if self.reason == before or kind is None or np.dtype(kind) != np.float64:
                 raise
             value = function(arguments[0], dtype=np.object_)
             self.reason = before
@@ -195,7 +195,7 @@ class ExpressionRecord(MakingRecord):
         if isinstance(value, np.dtype) and value == np.object_:
             return np.dtype(np.float64)
         if isinstance(value, np.ndarray) and value.dtype == np.object_:
-            return value[()] if value.ndim == 0 else self.array(value)
+            return value[()] if value.ndim == 0 else self.array(flat(value))
         return value
 
     def _elementwise(self, ufunc: Any, inputs: Sequence[Any]) -> Any:
@@ -287,7 +287,7 @@ class ExpressionRecord(MakingRecord):
 
     @without_symbols
     def choice(self, condition: Any, chosen: Any, other: Any) -> Any:
-        """One or the other, entry by entry."""
+        """See `Record.choice`."""
         def choose(truth: Any, a: Any, b: Any) -> Any:
             if not isinstance(truth, Symbol):
                 return a if truth else b
@@ -426,9 +426,38 @@ def _no_nan(record: ExpressionRecord, *_: Any, **__: Any) -> Any:
     raise record.refuse("numpy.isnan, which has no CasADi form here")
 
 
+def _like(record: ExpressionRecord, a: Any, value: Any, dtype: Any, shape: Any) -> Any:
+    kind = np.dtype(np.float64 if dtype is None else dtype)
+    size = np.shape(_objects(a)) if shape is None else shape
+    if kind not in (np.float64, np.object_):
+        return np.full(size, value, kind)
+    found = np.empty(size, np.object_)
+    found[...] = _objects(value)
+    return record.array(found)
+
+
+def _piecewise(
+    record: ExpressionRecord, x: Any, condlist: Any, funclist: Any, *args: Any, **kw: Any
+) -> Any:
+    array = record.array(_objects(x))
+    single = not isinstance(condlist, (list, tuple, np.ndarray)) or (
+        array.ndim and not isinstance(condlist[0], (list, np.ndarray))
+    )
+    conditions = [condlist] if single else list(condlist)
+    if len(funclist) - len(conditions) not in (0, 1):
+        raise ValueError(f"{len(conditions)} conditions for {len(funclist)} functions")
+    found = np.zeros(array.shape)
+    # The last condition that holds decides, and the function without one where none holds.
+    rest = funclist[len(conditions):] or [0.0]
+    for condition, one in zip([True, *conditions], [*rest, *funclist], strict=False):
+        value = with_symbols(record, one)(array, *args, **kw) if callable(one) else one
+        found = record.choice(condition, value, found)
+    return found
+
+
 def _where(record: ExpressionRecord, condition: Any, *chosen: Any) -> Any:
     if len(chosen) != 2:
-        raise record.refuse("numpy.where with a condition alone")
+        raise record.refuse("numpy.where with a condition alone; write numpy.where(mask, a, b)")
     return record.choice(condition, *chosen)
 
 
@@ -552,5 +581,17 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: _where, np.clip: _clipped, np.select: _selected, np.round: _rounded,
     np.around: _rounded, np.interp: _interpolated, np.linalg.norm: _norm, np.dot: _dot,
     np.linalg.solve: _solved, np.linalg.inv: _inverse, np.linalg.det: _determinant,
-    np.einsum: _einsum, np.nan_to_num: _no_nan,
+    np.einsum: _einsum, np.nan_to_num: _no_nan, np.piecewise: _piecewise,
+    np.zeros_like: lambda record, a, dtype=None, *_, shape=None, **__: _like(
+        record, a, 0.0, dtype, shape
+    ),
+    np.empty_like: lambda record, prototype, dtype=None, *_, shape=None, **__: _like(
+        record, prototype, 0.0, dtype, shape
+    ),
+    np.ones_like: lambda record, a, dtype=None, *_, shape=None, **__: _like(
+        record, a, 1.0, dtype, shape
+    ),
+    np.full_like: lambda record, a, fill_value, dtype=None, *_, shape=None, **__: _like(
+        record, a, fill_value, dtype, shape
+    ),
 }

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import builtins
 import contextlib
 import dis
 import functools
+import inspect
 import math
+import operator
 import sys
 import threading
+import types
 import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
@@ -15,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from .symbols import Record, Symbol, SymbolArray
+from . import splines
+from .symbols import Record, Symbol, SymbolArray, holds_symbols
 
 # NumPy's functions that make arrays of numbers: during a trace, arrays that take symbols.
 _MAKERS = (
@@ -34,8 +39,9 @@ _OF_MATH = {
 }
 _tracing = threading.local()
 _swapping = threading.RLock()
-_swaps = 0
-_originals: dict[tuple[Any, str], Any] = {}
+# Whether each trace that runs goes deeper, and what both kinds have replaced.
+_traces: dict[object, bool] = {}
+_originals: dict[bool, dict[tuple[Any, str], Any]] = {False: {}, True: {}}
 
 
 class MakingRecord(Record):
@@ -63,42 +69,106 @@ def without_symbols(method: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+def with_symbols(record: MakingRecord, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A user's function that is called by one that `without_symbols` restored NumPy for."""
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        _tracing.record = record
+        try:
+            return function(*arguments, **options)
+        finally:
+            _tracing.record = None
+
+    return call
+
+
 @contextlib.contextmanager
-def numpy_on_symbols(record: MakingRecord) -> Iterator[None]:
+def numpy_on_symbols(record: MakingRecord, deeper: bool = False) -> Iterator[None]:
     """Let arrays that a function makes in this thread take symbols, and `math` too.
 
     NumPy does not dispatch ``numpy.zeros(2)``, into which a model then writes symbols, and
-    ``math.sin`` does not dispatch on its argument. So both are replaced during a trace, in its
-    thread.
+    ``math.sin`` does not dispatch on its argument. So code that this thread runs meanwhile finds
+    others in these modules; any other thread finds what is there.
+
+    Parameters
+    ----------
+    record : MakingRecord
+        The trace.
+    deeper : bool
+        Whether to replace Python's ``max`` and ``min`` and SciPy's splines as well. For these there
+        is no way but for all threads; for others they do what they always do.
     """
-    global _swaps
-    before = getattr(_tracing, "record", None)
-    with _swapping:
-        if not _swaps:
-            _swap()
-        _swaps += 1
-    _tracing.record = record
+    before, token = getattr(_tracing, "record", None), object()
     try:
+        with _swapping:
+            _traces[token] = deeper
+            for deep in {False, deeper}:
+                for owner, name, stand_in in _places(deep):
+                    # After an interrupt, what is there may be a stand-in already.
+                    if (owner, name) not in _originals[deep]:
+                        own = type(owner) if name == "__class__" else vars(owner).get(name)
+                        _originals[deep][owner, name] = own
+                        setattr(owner, name, stand_in)
+        _tracing.record = record
         yield
     finally:
         _tracing.record = before
         with _swapping:
-            _swaps -= 1
-            if not _swaps:
-                for (module, name), function in _originals.items():
-                    setattr(module, name, function)
-                _originals.clear()
+            _traces.pop(token, None)
+            for deep, originals in _originals.items():
+                if not any(one >= deep for one in _traces.values()):
+                    for (owner, name), own in originals.items():
+                        if own is not None:
+                            setattr(owner, name, own)
+                        elif name in vars(owner):  # inherited before
+                            delattr(owner, name)
+                    originals.clear()
 
 
-def _swap() -> None:
-    # After an interrupt, what is there may be a stand-in: the original is the one from before.
-    for name in _MAKERS:
-        original = _originals.setdefault((np, name), getattr(np, name))
-        setattr(np, name, _maker(original))
-    for name, other in _OF_MATH.items():
-        if hasattr(math, name) and hasattr(np, other):
-            original = _originals.setdefault((math, name), getattr(math, name))
-            setattr(math, name, _of_math(original, getattr(np, other)))
+def _places(deep: bool) -> list[tuple[Any, str, Any]]:
+    """What is replaced: an attribute of a module or class, and by what."""
+    if not deep:
+        return [(np, "__class__", _Module), (math, "__class__", _Module)]
+    extrema = [
+        (builtins, "max", _extremum(_MAX, operator.gt)),
+        (builtins, "min", _extremum(_MIN, operator.lt)),
+    ]
+    found = splines.forms() if "scipy.interpolate" in sys.modules else []
+    return [*extrema, *((kind, "__call__", _table(kind, pieces)) for kind, pieces in found)]
+
+
+class _Module(types.ModuleType):
+    """A module in which a thread that traces finds stand-ins."""
+
+    def __getattribute__(self, name: str) -> Any:
+        found = super().__getattribute__(name)
+        record = getattr(_tracing, "record", None)
+        if record is None or record.closed:
+            return found
+        stand_in = _STAND_INS.get((super().__getattribute__("__name__"), name))
+        return stand_in if stand_in and _is_looked_up(sys._getframe(1), name) else found
+
+
+def _is_looked_up(frame: Any, name: str) -> bool:
+    """Whether the Python code of a frame looks up this name itself.
+
+    Not a compiled function that this code calls: it takes an array for what it has asked for,
+    and writes numbers over objects. Nor a module that is imported and keeps what it finds.
+    """
+    code = frame.f_code
+    if "from_buffer" in code.co_names:  # it may pass on the memory to others, unseen
+        return False
+    found = _looked_up.get(code)
+    if found is None:
+        found = _looked_up[code] = {
+            one.offset: one.argval for one in dis.get_instructions(code)
+            if one.opname in ("LOAD_ATTR", "LOAD_METHOD")
+            or (one.opname == "IMPORT_FROM" and code.co_flags & inspect.CO_NEWLOCALS)
+        }
+    return found.get(frame.f_lasti) == name
+
+
+_looked_up: weakref.WeakKeyDictionary[Any, dict[int, str]] = weakref.WeakKeyDictionary()
 
 
 def _maker(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -107,61 +177,11 @@ def _maker(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def make(*arguments: Any, **options: Any) -> Any:
         record = getattr(_tracing, "record", None)
-        if record is None or record.closed or not _is_called_by(sys._getframe(1), name):
+        if record is None or record.closed:
             return function(*arguments, **options)
         return record.made(function, arguments, options)
 
-    name = function.__name__
     return make
-
-
-def _is_called_by(frame: Any, name: str) -> bool:
-    """Whether the Python code of a frame is calling a function of this name itself.
-
-    Not a compiled function that this code calls: it takes an array for what it has asked for,
-    and writes numbers over objects.
-    """
-    code = frame.f_code
-    if "from_buffer" in code.co_names:  # it may pass on the memory to others, unseen
-        return False
-    try:
-        called = _calls.get(code)
-        if called is None:
-            called = _calls[code] = _called_names(code)
-    except Exception:  # without positions, nothing is known
-        return False
-    return called.get(frame.f_lasti) == name
-
-
-_calls: weakref.WeakKeyDictionary[Any, dict[int, str]] = weakref.WeakKeyDictionary()
-
-
-def _called_names(code: Any) -> dict[int, str]:
-    """The name of what is called at each instruction that calls.
-
-    That is the longest name or attribute that begins where the call's text does.
-    """
-    instructions = list(dis.get_instructions(code))
-    ends = [one.offset for one in instructions[1:]] + [len(code.co_code)]
-    names: dict[Any, list[tuple[Any, str]]] = {}
-    for one in instructions:
-        at = one.positions
-        if one.opname.startswith("LOAD_") and isinstance(one.argval, str) and at is not None:
-            names.setdefault((at.lineno, at.col_offset), []).append(
-                ((at.end_lineno, at.end_col_offset), one.argval)
-            )
-    found = {}
-    for one, end in zip(instructions, ends, strict=True):
-        at = one.positions
-        if one.opname.startswith("CALL") and at is not None:
-            within = [
-                name for name in names.get((at.lineno, at.col_offset), [])
-                if name[0] < (at.end_lineno, at.end_col_offset)
-            ]
-            if within:
-                # A frame may stand at the instruction, or at the end of its cache.
-                found.update(dict.fromkeys(range(one.offset, end), max(within)[1]))
-    return found
 
 
 def _of_math(function: Callable[..., Any], ufunc: Any) -> Callable[..., Any]:
@@ -180,5 +200,49 @@ def _of_math(function: Callable[..., Any], ufunc: Any) -> Callable[..., Any]:
         if np.ndim(value):
             raise symbols[0].record.refuse(f"math.{function.__name__} of several numbers")
         return value
+
+    return call
+
+
+_STAND_INS = {
+    **{("numpy", name): _maker(getattr(np, name)) for name in _MAKERS},
+    **{("math", name): _of_math(getattr(math, name), getattr(np, other))
+       for name, other in _OF_MATH.items() if hasattr(math, name) and hasattr(np, other)},
+}
+
+
+_MAX, _MIN = max, min
+
+
+def _extremum(function: Callable[..., Any], exceeds: Callable[..., Any]) -> Callable[..., Any]:
+    """Python's ``max`` or ``min``, that takes symbols."""
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        record = getattr(_tracing, "record", None)
+        if record is None or record.closed or options or not arguments:
+            return function(*arguments, **options)
+        values = list(arguments[0]) if len(arguments) == 1 else list(arguments)
+        if not any(isinstance(one, Symbol) for one in values) or any(
+            np.ndim(one) for one in values
+        ):
+            return function(values)
+        return functools.reduce(
+            lambda first, one: record.choice(exceeds(one, first), one, first), values
+        )
+
+    return call
+
+
+def _table(kind: Any, pieces: Callable[..., Any]) -> Callable[..., Any]:
+    """The call of one of SciPy's splines, that takes symbols."""
+    own = kind.__call__
+
+    @functools.wraps(own)
+    def call(self: Any, x: Any, *arguments: Any, **options: Any) -> Any:
+        record = getattr(_tracing, "record", None)
+        if record is None or record.closed or not holds_symbols(x):
+            return own(self, x, *arguments, **options)
+        return without_symbols(pieces)(record, self, x, *arguments, **options)
 
     return call

@@ -20,7 +20,7 @@ _HERE = Path(__file__).parent
 # Frames of these files and folders are never the user's code that asked for something.
 _MACHINERY = (
     *(str(_HERE / f"{name}.py") for name in (
-        "symbols", "operations", "stand_ins", "tracing", "functions",
+        "symbols", "operations", "stand_ins", "splines", "tracing", "functions",
     )),
     str(_HERE.parent / "adapters"), str(Path(np.__file__).parent),
 )
@@ -105,6 +105,10 @@ class Record(ABC):
     def call(self, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Call any other function of NumPy."""
 
+    @abstractmethod
+    def choice(self, condition: Any, chosen: Any, other: Any) -> Any:
+        """One or the other, entry by entry."""
+
 
 NUMBERS = (bool, int, float, complex, np.generic)
 
@@ -167,17 +171,24 @@ class Symbol:
     __gt__, __ge__ = _binary(np.greater, after=False), _binary(np.greater_equal, after=False)
     __eq__ = _binary(np.equal, after=False)
     __ne__ = _binary(np.not_equal, after=False)
-    __float__, __int__ = _value(
-        "float() of a symbol, or to store it in an array of numbers"
-    ), _value("int() of a symbol")
-    __index__ = _value("an index from a symbol")
+    __float__ = _value(
+        "float() of a symbol, or to store it in an array of numbers; write numpy.sin(...) and "
+        "numpy.zeros(...) by these names, not sin or zeros that were imported alone"
+    )
+    __int__ = _value(
+        "int() of a symbol; write numpy.floor for a number, numpy.interp for a table"
+    )
+    __index__ = _value("an index from a symbol; write numpy.interp or numpy.select for a table")
     __complex__, __round__ = _value("complex() of a symbol"), _value("round() of a symbol")
     __trunc__ = __floor__ = __ceil__ = _value("an integer from a symbol")
     __hash__ = _value("the hash of a symbol")
     __reduce__ = _value("a pickle of a symbol")
 
     def __bool__(self) -> bool:
-        return bool(_value("the truth of a comparison: a branch or a loop on a value")(self))
+        return bool(_value(
+            "the truth of a comparison: a branch or a loop on a value; write numpy.where, "
+            "numpy.clip or numpy.select"
+        )(self))
 
     def _text(self, *_: Any) -> str:
         return str(_value("the text of a symbol")(self))
@@ -189,6 +200,12 @@ class Symbol:
 
     def __deepcopy__(self, memo: Any) -> Symbol:
         return self
+
+    # As of a number of NumPy: what holds for an array of no dimension.
+    __iter__ = None
+
+    def __getitem__(self, key: Any) -> Any:
+        return wrapped(self.record, in_arrays(as_nan(self) if self.record.closed else self)[key])
 
     def conjugate(self) -> Any:
         """Return the symbol itself: a state is real."""
@@ -209,6 +226,13 @@ class Symbol:
         return np.bool_ if self.logical else np.float64
 
     def __getattr__(self, name: str) -> Any:
+        if name == "dtype" and self.record.as_numbers and not sys._getframe(
+            1
+        ).f_code.co_filename.startswith(_MACHINERY):
+            return np.dtype(self.__class__)
+        if name in _OF_ARRAYS:
+            found = getattr(self.record.array(in_arrays(self)), name)
+            return _numbers(found) if callable(found) else found
         # NumPy's compiled code asks for how the number lies in memory, and takes no for an answer.
         if (
             hasattr(np.float64, name) and not name.startswith("__array") and not self.record.closed
@@ -224,6 +248,23 @@ class Symbol:
         return _call(self.record, function, args, kwargs)
 
 
+# Attributes of NumPy's numbers that are those of an array of no dimension.
+_OF_ARRAYS = frozenset((
+    "reshape", "ravel", "flatten", "squeeze", "transpose", "T", "ndim", "shape", "size", "copy",
+     "astype", "sum", "mean", "min", "max", "prod", "clip", "round", "repeat", "any", "all",
+))
+
+
+def _numbers(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of an array that returns numbers in place of arrays of no dimension."""
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        value = method(*arguments, **options)
+        return value[()] if isinstance(value, SymbolArray) and not value.ndim else value
+
+    return call
+
+
 # NumPy calls methods of these names on the entries of plain arrays of objects.
 for _ufunc in (
     np.sin, np.cos, np.tan, np.arcsin, np.arccos, np.arctan, np.sinh, np.cosh, np.tanh,
@@ -231,6 +272,12 @@ for _ufunc in (
     np.log1p, np.sqrt, np.cbrt, np.rint, np.fabs, np.degrees, np.radians, np.deg2rad, np.rad2deg,
 ):
     setattr(Symbol, _ufunc.__name__, _unary(_ufunc))
+
+
+_BY_SYMBOLS = (
+    "an entry by a symbol as index, or by a mask of symbols; write numpy.where(mask, a, b) or "
+    "numpy.interp"
+)
 
 
 class SymbolArray(np.ndarray[Any, Any]):
@@ -258,15 +305,18 @@ class SymbolArray(np.ndarray[Any, Any]):
         return _call(self.record, function, args, kwargs)
 
     def __getitem__(self, key: Any) -> Any:
-        if not self.record.closed and _holds_symbols(key):
-            raise self.record.refuse("an entry by a symbol as index, or by a mask of symbols")
+        if not self.record.closed and holds_symbols(key):
+            raise self.record.refuse(_BY_SYMBOLS)
         return wrapped(self.record, plain(self)[key])
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        if not self.record.closed and _holds_symbols(key):
-            raise self.record.refuse("an entry by a symbol as index, or by a mask of symbols")
         if not self.record.closed and not self.flags.writeable:
-            raise self.record.refuse("a change of its argument")
+            raise self.record.refuse("a change of its argument; write x = x.copy() first")
+        if not self.record.closed and holds_symbols(key):
+            # One number under a mask is a choice for each entry.
+            if np.shape(key) != self.shape or np.ndim(plain(value)) or not _is_mask(key):
+                raise self.record.refuse(_BY_SYMBOLS)
+            key, value = ..., self.record.choice(key, value, self)
         plain(self)[key] = plain(value)
 
     def dot(self, other: Any, out: Any = None) -> Any:
@@ -293,10 +343,21 @@ class SymbolArray(np.ndarray[Any, Any]):
     ctypes: Any = property(_refuse)
 
 
-def _holds_symbols(value: Any) -> bool:
+def holds_symbols(value: Any) -> bool:
+    """Whether it is a symbol, or a list or an array that holds objects."""
     if isinstance(value, (tuple, list)):
-        return any(_holds_symbols(item) for item in value)
+        return any(holds_symbols(item) for item in value)
     return isinstance(value, Symbol) or getattr(value, "dtype", None) == np.object_
+
+
+def _is_mask(key: Any) -> bool:
+    entries = np.asarray(plain(key), np.object_).ravel()
+    return all(
+        # Labels do not tell truths, but numbers are no index.
+        one.logical or not one.record.as_numbers
+        if isinstance(one, Symbol) else isinstance(one, (bool, np.bool_))
+        for one in entries
+    )
 
 
 def plain(value: Any) -> Any:
@@ -339,9 +400,17 @@ def wrapped(record: Record, value: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return type(value)(wrapped(record, item) for item in value)
     if isinstance(value, np.ndarray) and value.dtype == np.object_:
-        value = value.view(SymbolArray)
-        value.record = record
+        return record.array(flat(value))
     return value
+
+
+def flat(values: Any) -> Any:
+    """An array of objects with the entries of arrays of no dimension that NumPy left in it."""
+    if any(isinstance(one, np.ndarray) for one in values.flat):
+        for index, one in np.ndenumerate(values):
+            if isinstance(one, np.ndarray) and not one.ndim:
+                values[index] = one[()]
+    return values
 
 
 def _apply(

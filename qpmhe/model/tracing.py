@@ -106,6 +106,10 @@ class _LabelRecord(Record):
             function(*in_arrays(args), **{key: in_arrays(one) for key, one in kwargs.items()}),
         )
 
+    def choice(self, condition: Any, chosen: Any, other: Any) -> Any:
+        """See `Record.choice`."""
+        return self.symbols(_together((condition, chosen, other)))
+
     def _contracted(self, left: Any, right: Any) -> Any:
         """Labels of a matrix product."""
         a, b = _labels(left), _labels(right)
@@ -259,10 +263,15 @@ def expressed(
     """The expression that a function computes from symbols, not compared with the function yet."""
     import casadi  # late: `import qpmhe` does without
 
-    record = ExpressionRecord(casadi, watched)
     columns = [casadi.SX.sym(f"a{k}", size) for k, size in enumerate(sizes)]
-    with numpy_on_symbols(record), _watch(record) if watched else contextlib.nullcontext():
-        value, error = run(record, function, [record.symbols(one) for one in columns])
+    for deeper in (False, True):  # a model that needs no more is traced without
+        record = ExpressionRecord(casadi, watched)
+        watch = _watch(record) if watched else contextlib.nullcontext()
+        with numpy_on_symbols(record, deeper), watch:
+            value, error = run(record, function, [record.symbols(one) for one in columns])
+        if error is None and not record.refused:
+            break
+        record.closed = not deeper
     try:
         if error is not None and not record.refused:
             return Traced(None, _failure(error))
