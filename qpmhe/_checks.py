@@ -53,6 +53,10 @@ def _floats(value: ArrayLike) -> Array:
                 array[place] = np.nan
             elif isinstance(item, (np.datetime64, np.timedelta64)):
                 raise TypeError(_TIMES)
+            elif isinstance(item, (str, bytes)):
+                raise TypeError(f"{shown(item)} is {_TEXT}")
+    elif array.dtype.kind in "SU":
+        raise TypeError(_TEXT)
     elif array.dtype.kind in "mM":
         if not (np.isnat(np.ma.getdata(array)) | np.ma.getmaskarray(array)).all():
             raise TypeError(_TIMES)
@@ -63,6 +67,7 @@ def _floats(value: ArrayLike) -> Array:
     return np.ma.filled(floats, np.nan) if masked else floats
 
 
+_TEXT = "text; expected numbers, as float(...) or pandas.to_numeric make of it"
 _TIMES = "dates or durations; for seconds, give (t - t[0]) / numpy.timedelta64(1, 's')"
 
 

@@ -227,6 +227,9 @@ class MovingHorizonEstimator:
                 f"{system.n} states do not fit into memory ({error}); take a shorter horizon."
             ) from error
 
+    # Whether an update runs: its model must not call another one.
+    _stepping = False
+
     def _checked_start(self, initial_state: ArrayLike, system: System) -> Array:
         state = vector("initial_state", initial_state, system.n)
         return check_start(system, self.observer, self.cost, state, u=self._usual_input)
@@ -363,7 +366,8 @@ class MovingHorizonEstimator:
         Raises
         ------
         ShapeError, WeightError, OptionError, SetError, InvalidInputError
-            If an argument is invalid; the estimator stays unchanged.
+            If an argument is invalid, or an update of this estimator runs already; the estimator
+            stays unchanged.
 
         Notes
         -----
@@ -371,6 +375,25 @@ class MovingHorizonEstimator:
         `set` changes them for all samples.
         """
         began = perf_counter()
+        if self._stepping:
+            raise InvalidInputError(
+                "update was called within an update of the same estimator: by its own model, "
+                "observer, cost or solver, or by another thread. Take another estimator there."
+            )
+        self._stepping = True
+        try:
+            return self._updated(
+                y, u, dt, noise_weight, disturbance_weight, bounds, parameters, sensors, began
+            )
+        finally:
+            self._stepping = False
+
+    def _updated(
+        self, y: ArrayLike | None, u: ArrayLike | None, dt: float | None,
+        noise_weight: ArrayLike | None, disturbance_weight: ArrayLike | None,
+        bounds: Mapping[str, ConvexSet] | None, parameters: ArrayLike | None,
+        sensors: ArrayLike | None, began: float,
+    ) -> Estimate:
         own: Conditions | None = None
         if sensors is None:
             y_array = self._measurement(y)

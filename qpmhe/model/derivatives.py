@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from .functions import BatchedFunction, Probes, Trusted
+from .functions import NO_INPUT, BatchedFunction, Probes, Trusted, missing_input
 from .residuals import Residual
 from .sets import ConvexSet
 
@@ -92,8 +92,10 @@ class Jacobian:
         else:
             self._choose(probes)
 
-    def __call__(self, x: Array, u: Array) -> Array:
-        """The Jacobian (d, n) at one state."""
+    def __call__(self, x: Array, u: Array = NO_INPUT) -> Array:
+        """The Jacobian (d, n) at one state and input, which may be left out if m is 0."""
+        if u is NO_INPUT and self._inputs:
+            raise missing_input(f"{self.function.name}_jacobian", self._inputs)
         if self._given is not None:
             return self._taken(self._given, x, u)
         value: Array = self.batch(x[None], u[None])[0]
@@ -102,7 +104,7 @@ class Jacobian:
     @property
     def direct(self) -> Callable[..., Any]:
         """A function of one state, and of the input where there are any."""
-        return self if self._inputs else partial(self, u=np.zeros(0))
+        return self if self._inputs else partial(self, u=NO_INPUT)
 
     def use_scales(self, scales: Array, outputs: Array | None, probes: Probes) -> None:
         """Take these magnitudes of states, and values if known; choose or compare anew.

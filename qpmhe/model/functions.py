@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.values import shown
 
-from ..errors import ModelError, QpmheError
-from .tracing import trace
+from ..errors import InvalidInputError, ModelError, QpmheError
+from .tracing import trace, unmasked
 
 Array = NDArray[Any]
 Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
+#: The input of a system without inputs.
+NO_INPUT = np.zeros(0)
 # Relative change of a number in its last six bits.
 _LAST_DIGITS = 2.0**-46
 
@@ -38,10 +40,11 @@ class Trusted(NamedTuple):
 
 
 class Parametric(NamedTuple):
-    """A user's f(x, u, theta), or f(x, theta) without inputs, as one of x and (u, theta)."""
+    """A user's f(x, u, theta), or f(x, theta), as one of x and (u, theta)."""
 
     function: Callable[..., Any]
     inputs: int
+    takes_input: bool
 
     def by_rows(self, x: Array, known: Array) -> Any:
         """The value where the last axis counts components."""
@@ -52,7 +55,7 @@ class Parametric(NamedTuple):
         return self._called(x, known[: self.inputs], known[self.inputs :])
 
     def _called(self, x: Array, u: Array, theta: Array) -> Any:
-        return self.function(x, u, theta) if self.inputs else self.function(x, theta)
+        return self.function(x, u, theta) if self.takes_input else self.function(x, theta)
 
 
 def contained(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -141,12 +144,14 @@ class BatchedFunction:
         self._short = False
         self.reads_only = self._trusted
         self._returns_array = True
-        self._holds_objects = False
+        self._is_odd = False  # returns objects, or masks
         self.mode = "unknown"
         self._detect(probes)
 
-    def __call__(self, x: Array, u: Array) -> Array:
-        """The value at one state x (n,) and input u (m,)."""
+    def __call__(self, x: Array, u: Array = NO_INPUT) -> Array:
+        """The value at one state x (n,) and input u (m,), which may be left out if m is 0."""
+        if u is NO_INPUT and self._inputs:
+            raise missing_input(self.name, self._inputs)
         if self.reads_only:
             value = self.function(x, u) if self.takes_input else self.function(x)
             return np.asarray(value).reshape(self.shape) if self._short else value
@@ -157,7 +162,7 @@ class BatchedFunction:
 
     def _as_value(self, raw: Any) -> Array:
         """The checked value of a function that was not traced."""
-        value = np.asarray(raw)
+        value = np.asarray(unmasked(raw))
         if value.dtype == np.object_:
             value = np.array(value.tolist())
         if value.dtype.kind not in "fciub":
@@ -203,7 +208,7 @@ class BatchedFunction:
             return
         states, inputs = points[0][0].size, self._inputs
         self.reads_only = self._trusted or (
-            not self._holds_objects and self._same_everywhere(states)
+            not self._is_odd and self._same_everywhere(states)
         )
         # All points, and more than any dimension of the value, so that axes cannot be mixed up.
         size = max(len(points), 3, *(d + 1 for d in (*self.shape, states, inputs)))
@@ -299,7 +304,7 @@ class BatchedFunction:
         try:
             with np.errstate(all="ignore"):
                 raw = self.function(*((x_given, u_given) if self.takes_input else (x_given,)))
-            value = np.array(raw, dtype=np.float64)  # a copy: it may be one buffer
+            value = np.array(unmasked(raw), dtype=np.float64)  # a copy: it may be one buffer
         except Exception:  # outside its domain; the estimator checks at the initial state
             return None
         if not (np.array_equal(x_given, x) and np.array_equal(u_given, u)):
@@ -314,7 +319,9 @@ class BatchedFunction:
             )
         self._short = value.shape != self.shape
         self._returns_array = self._returns_array and isinstance(raw, np.ndarray)
-        self._holds_objects = getattr(raw, "dtype", None) == np.object_
+        self._is_odd |= (
+            isinstance(raw, np.ma.MaskedArray) or getattr(raw, "dtype", None) == np.object_
+        )
         return value.reshape(self.shape) if np.isfinite(value).all() else None
 
     def evaluated_by(self, function: Trusted) -> BatchedFunction:
@@ -332,7 +339,7 @@ class BatchedFunction:
         """A function of one state, and of the input where there are any: the user's if it may."""
         if self.reads_only and not self._short and self.takes_input == (self._inputs > 0):
             return self.function
-        return self if self._inputs else partial(self, u=np.zeros(0))
+        return self if self._inputs else partial(self, u=NO_INPUT)
 
     @property
     def plain(self) -> bool:
@@ -362,6 +369,13 @@ class BatchedFunction:
                 f"{self.name} is {value.tolist()} at the initial state {x.tolist()}; "
                 "expected finite numbers. Change the initial state or bound the states."
             )
+
+
+def missing_input(name: str, inputs: int) -> InvalidInputError:
+    """The error of a call without u of a function of a system with inputs."""
+    return InvalidInputError(
+        f"u is missing: the system has {inputs} input{'s' * (inputs != 1)}; call {name}(x, u)."
+    )
 
 
 def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:

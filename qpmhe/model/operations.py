@@ -568,6 +568,26 @@ def _dot(record: ExpressionRecord, a: Any, b: Any, out: Any = None) -> Any:
     return value
 
 
+def _cross(
+    record: ExpressionRecord, a: Any, b: Any, axisa: int = -1, axisb: int = -1, axisc: int = -1,
+    axis: int | None = None,
+) -> Any:
+    ends = (axisa, axisb, axisc) if axis is None else (axis,) * 3
+    left, right = (np.moveaxis(_objects(one), end, -1) for one, end in zip((a, b), ends[:2],
+                                                                           strict=True))
+    if not {left.shape[-1], right.shape[-1]} <= {2, 3}:
+        raise ValueError(f"cross product of shapes {left.shape} and {right.shape}")
+    (a0, a1, a2), (b0, b1, b2) = (
+        [record.finished(np.asarray(one[..., k])) if k < one.shape[-1] else 0.0 for k in range(3)]
+        for one in (left, right)
+    )
+    last = a0 * b1 - a1 * b0
+    if left.shape[-1] == right.shape[-1] == 2:
+        return last
+    parts = np.broadcast_arrays(*map(_objects, (a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, last)))
+    return record.finished(np.moveaxis(np.stack(parts, axis=-1), -1, ends[2]))
+
+
 def _einsum(record: ExpressionRecord, *operands: Any, **options: Any) -> Any:
     options.pop("optimize", None)
     if options:
@@ -581,7 +601,7 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: _where, np.clip: _clipped, np.select: _selected, np.round: _rounded,
     np.around: _rounded, np.interp: _interpolated, np.linalg.norm: _norm, np.dot: _dot,
     np.linalg.solve: _solved, np.linalg.inv: _inverse, np.linalg.det: _determinant,
-    np.einsum: _einsum, np.nan_to_num: _no_nan, np.piecewise: _piecewise,
+    np.einsum: _einsum, np.cross: _cross, np.nan_to_num: _no_nan, np.piecewise: _piecewise,
     np.zeros_like: lambda record, a, dtype=None, *_, shape=None, **__: _like(
         record, a, 0.0, dtype, shape
     ),

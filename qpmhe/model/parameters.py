@@ -61,13 +61,13 @@ def augment_parameters(
     Parameters
     ----------
     f : callable or System
-        f(x, u, theta), or f(x, theta) if m is 0: maps x (n,), u (m,) and all parameters theta (k,)
+        f(x, u, theta), or f(x, theta): maps x (n,), u (m,) and all parameters theta (k,)
         to (n,). Functions of (..., n), (..., m), (..., k) are called once for a whole window, as
         with `System`. With dt, f is the rate, in units of x per unit of time. Or a system of m + k
         inputs, the last k of which are the parameters; it has its own sizes, sets and sampling
         time, so leave out h, n, p, m, dt, method and the sets.
     h : callable
-        h(x, u, theta), or h(x, theta) if m is 0, to (p,), or a scalar if p is 1.
+        h(x, u, theta), or h(x, theta), to (p,), or a scalar if p is 1.
     nominal : (k,) array_like
         Values of all parameters, each in its unit: prior means of the estimated ones, constants for
         the others.
@@ -328,11 +328,12 @@ def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> Bat
             "another language, make a System with the parameters as its last inputs, and pass that "
             "as f."
         )
-    arguments = ("x", "u", "theta") if m else ("x", "theta")
     try:
         signature = inspect.signature(written)
     except (TypeError, ValueError):  # some compiled functions have no signature
         signature = None
+    takes_input = m > 0 and not (signature and _is_of_state(signature))
+    arguments = ("x", "u", "theta") if takes_input else ("x", "theta")
     try:
         if signature is not None:
             signature.bind(*arguments)
@@ -343,7 +344,8 @@ def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> Bat
             f"with {inputs} is, whether it uses all of them or not ({error})."
         ) from error
     x, known = probes[0]
-    function = BatchedFunction(name, Parametric(written, m), (size,), known.size, probes)
+    parametric = Parametric(written, m, takes_input)
+    function = BatchedFunction(name, parametric, (size,), known.size, probes)
     if function.mode == "unknown":
         try:
             with np.errstate(all="ignore"):
@@ -357,6 +359,15 @@ def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> Bat
         except Exception:  # outside its domain; the estimator checks at the initial state
             pass
     return function
+
+
+def _is_of_state(signature: inspect.Signature) -> bool:
+    """Whether a function is one of x and theta alone, of a model with inputs."""
+    parameters = list(signature.parameters.values())
+    return (
+        len(parameters) == 2 and parameters[1].name != "u"
+        and all(q.kind in (q.POSITIONAL_ONLY, q.POSITIONAL_OR_KEYWORD) for q in parameters)
+    )
 
 
 def _probes(probes: Probes, nominal: Array, moved: Index, bounds: ConvexSet | None) -> Probes:

@@ -276,6 +276,8 @@ def expressed(
         if error is not None and not record.refused:
             return Traced(None, _failure(error))
         if not record.refused:
+            if isinstance(value, np.ma.MaskedArray):
+                return Traced(None, "it returns a masked array; write numpy.where(mask, a, b)")
             values = np.asarray(plain(value))
             if values.dtype.kind not in "fiubO":
                 return Traced(None, f"it returns {values.dtype}; expected numbers")
@@ -413,6 +415,13 @@ def difference(
     return ""
 
 
+def unmasked(value: Any) -> Any:
+    """The same with NaN for what is masked: there is no value."""
+    if not isinstance(value, np.ma.MaskedArray):
+        return value
+    return value if value.dtype == np.object_ else np.ma.filled(value.astype(np.float64), np.nan)
+
+
 def _shown(arguments: Sequence[Array]) -> str:
     return ", ".join(str(one.tolist()) for one in arguments if one.size)
 
@@ -421,7 +430,7 @@ def _called(function: Callable[..., Any], arguments: Sequence[Array]) -> Array |
     """The function's value, a copy; None where it raises."""
     try:
         with np.errstate(all="ignore"):
-            return np.array(function(*(one.copy() for one in arguments)), np.float64)
+            return np.array(unmasked(function(*(one.copy() for one in arguments))), np.float64)
     except KeyboardInterrupt:
         raise
     except BaseException:  # outside of its domain

@@ -203,6 +203,8 @@ TRACED = {
     "rotation matrices in a batch": rotated_batch,
     "skew matrix": skew,
     "quaternion, cross": quaternion,
+    "cross with numbers": lambda x, u: np.cross(np.array([x[0], u[1], 1.0]), [1.0, 2.0, 3.0]),
+    "cross by rows": lambda x, u: np.cross(x[..., None, :], A)[..., 0, :],
     "ranges by broadcasting": ranges,
     "ranges by a list": ranges_by_list,
     "hypot, arctan2": lambda x, u: np.array([np.hypot(x[0], x[1]), np.arctan2(x[1], x[0])]),
