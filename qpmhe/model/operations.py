@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .stand_ins import MakingRecord, with_symbols, without_symbols
-from .symbols import NUMBERS, NotTraceableError, Symbol, SymbolArray, flat, plain
+from .symbols import INSTEAD, NUMBERS, NotTraceableError, Symbol, SymbolArray, flat, plain
 
 Objects = NDArray[np.object_]
 Form = Callable[..., Any]
@@ -33,6 +33,7 @@ _OF_TRUTHS = {
     "minimum": "logical_and", "bitwise_and": "logical_and", "bitwise_or": "logical_or",
     "bitwise_xor": "logical_xor", "invert": "logical_not", "absolute": "positive",
 }
+_NO_FORM = f"which has no CasADi form here{INSTEAD}"
 _NUMBERS_ONLY = {"bitwise_and", "bitwise_or", "bitwise_xor", "invert"}
 
 
@@ -76,6 +77,8 @@ class ExpressionRecord(MakingRecord):
     @without_symbols
     def operate(self, ufunc: Any, operands: tuple[Any, ...]) -> Any:
         """See `Record.operate`."""
+        if ufunc in _PARTS:
+            return tuple(self.operate(one, operands) for one in _PARTS[ufunc])
         name = ufunc.__name__
         truths = [
             one.logical if isinstance(one, Symbol) else isinstance(one, (bool, np.bool_))
@@ -91,7 +94,7 @@ class ExpressionRecord(MakingRecord):
             raise self.refuse(f"numpy.{name} of numbers")
         form = _forms().get(name)
         if form is None or not _is_numpys(ufunc):
-            raise self.refuse(f"{_full_name(ufunc)}, which has no CasADi form here")
+            raise self.refuse(f"{_full_name(ufunc)}, {_NO_FORM}")
         logical = name in _LOGICAL or (name == "positive" and all(truths))
         return self.symbol(form(*(self.expression(one) for one in operands)), logical)
 
@@ -113,7 +116,7 @@ class ExpressionRecord(MakingRecord):
         if method == "__call__" and ufunc is np.matmul:
             value = self.product(*inputs)
         elif ufunc.signature is not None:
-            raise self.refuse(f"{_full_name(ufunc)}, which has no CasADi form here")
+            raise self.refuse(f"{_full_name(ufunc)}, {_NO_FORM}")
         elif method == "__call__" and not options:
             value = self._elementwise(ufunc, inputs)
         elif method == "outer" and not options:
@@ -204,7 +207,7 @@ class ExpressionRecord(MakingRecord):
         if parts is not None:
             return tuple(self._elementwise(one, inputs) for one in parts)
         if ufunc.nout != 1:
-            raise self.refuse(f"{_full_name(ufunc)}, which has no CasADi form here")
+            raise self.refuse(f"{_full_name(ufunc)}, {_NO_FORM}")
         each = np.frompyfunc(lambda *one: self.operate(ufunc, one), len(arrays), 1)
         return self.finished(np.asarray(each(*arrays), np.object_))
 
@@ -423,7 +426,7 @@ def _forms() -> dict[str, Form]:
 
 def _no_nan(record: ExpressionRecord, *_: Any, **__: Any) -> Any:
     # NumPy's own code takes objects for numbers that are never NaN.
-    raise record.refuse("numpy.isnan, which has no CasADi form here")
+    raise record.refuse(f"numpy.isnan, {_NO_FORM}")
 
 
 def _like(record: ExpressionRecord, a: Any, value: Any, dtype: Any, shape: Any) -> Any:
@@ -527,7 +530,7 @@ def _norm(
             return np.sum(np.abs(array), axis=axis, keepdims=keepdims)
         if ord == np.inf:
             return np.max(np.abs(array), axis=axis, keepdims=keepdims)
-    raise record.refuse(f"numpy.linalg.norm of order {ord}")
+    raise record.refuse(f"numpy.linalg.norm of order {ord}{INSTEAD}")
 
 
 def _square(record: ExpressionRecord, a: Any) -> Any:

@@ -27,6 +27,11 @@ _MAKERS = (
     "zeros", "ones", "empty", "full", "eye", "identity", "array", "asarray", "asanyarray",
     "ascontiguousarray",
 )
+# Functions that do not take lists of symbols as they take lists of numbers.
+_OF_LISTS = (
+    "max", "min", "amax", "amin", "maximum", "minimum", "fmax", "fmin", "clip", "arctan2", "hypot",
+    "interp", "sign", "heaviside",
+)
 # Python's functions of numbers, as NumPy calls them.
 _OF_MATH = {
     "acos": "arccos", "acosh": "arccosh", "asin": "arcsin", "asinh": "arcsinh", "atan": "arctan",
@@ -128,7 +133,7 @@ def numpy_on_symbols(record: MakingRecord, deeper: bool = False) -> Iterator[Non
 def _places(deep: bool) -> list[tuple[Any, str, Any]]:
     """What is replaced: an attribute of a module or class, and by what."""
     if not deep:
-        return [(np, "__class__", _Module), (math, "__class__", _Module)]
+        return [(module, "__class__", _Module) for module in (np, np.linalg, math)]
     extrema = [
         (builtins, "max", _extremum(_MAX, operator.gt)),
         (builtins, "min", _extremum(_MIN, operator.lt)),
@@ -184,6 +189,26 @@ def _maker(function: Callable[..., Any]) -> Callable[..., Any]:
     return make
 
 
+class _OfLists:
+    """One of NumPy's functions, that takes lists of symbols in a thread that traces."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        record = getattr(_tracing, "record", None)
+        if record is None or record.closed:
+            return self._function(*arguments, **options)
+        return self._function(*(
+            record.made(np.array, (one,), {})
+            if isinstance(one, (list, tuple)) and holds_symbols(one) else one for one in arguments
+        ), **options)
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._function, name)
+        return _OfLists(found) if name in ("reduce", "accumulate", "outer") else found
+
+
 def _of_math(function: Callable[..., Any], ufunc: Any) -> Callable[..., Any]:
     """One of Python's functions of numbers, that takes symbols."""
 
@@ -205,6 +230,8 @@ def _of_math(function: Callable[..., Any], ufunc: Any) -> Callable[..., Any]:
 
 
 _STAND_INS = {
+    **{("numpy", name): _OfLists(getattr(np, name)) for name in _OF_LISTS},
+    **{("numpy.linalg", name): _OfLists(getattr(np.linalg, name)) for name in ("inv", "det")},
     **{("numpy", name): _maker(getattr(np, name)) for name in _MAKERS},
     **{("math", name): _of_math(getattr(math, name), getattr(np, other))
        for name, other in _OF_MATH.items() if hasattr(math, name) and hasattr(np, other)},

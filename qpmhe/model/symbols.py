@@ -28,6 +28,10 @@ _PACKAGE = str(_HERE.parent)
 _LIBRARIES = (str(Path(np.__file__).parents[1]), str(Path(os.__file__).parent))
 
 
+#: What to do about operations that have no symbolic form.
+INSTEAD = "; write it with the functions of NumPy that the table in how-to/speed lists"
+
+
 class NotTraceableError(Exception):
     """The function asks for the value of a symbol."""
 
@@ -161,6 +165,7 @@ class Symbol:
     __truediv__, __rtruediv__ = _binary(np.divide), _binary(np.divide, True)
     __floordiv__, __rfloordiv__ = _binary(np.floor_divide), _binary(np.floor_divide, True)
     __mod__, __rmod__ = _binary(np.remainder), _binary(np.remainder, True)
+    __divmod__, __rdivmod__ = _binary(np.divmod), _binary(np.divmod, True)
     __pow__, __rpow__ = _binary(np.power), _binary(np.power, True)
     __and__, __rand__ = _binary(np.bitwise_and), _binary(np.bitwise_and, True)
     __or__, __ror__ = _binary(np.bitwise_or), _binary(np.bitwise_or, True)
@@ -172,14 +177,16 @@ class Symbol:
     __eq__ = _binary(np.equal, after=False)
     __ne__ = _binary(np.not_equal, after=False)
     __float__ = _value(
-        "float() of a symbol, or to store it in an array of numbers; write numpy.sin(...) and "
-        "numpy.zeros(...) by these names, not sin or zeros that were imported alone"
+        "float() of a symbol, or to store it in an array of numbers; write no float(), and "
+        "numpy.sin(...) or numpy.zeros(...) by these names, not sin or zeros imported alone"
     )
     __int__ = _value(
         "int() of a symbol; write numpy.floor for a number, numpy.interp for a table"
     )
     __index__ = _value("an index from a symbol; write numpy.interp or numpy.select for a table")
-    __complex__, __round__ = _value("complex() of a symbol"), _value("round() of a symbol")
+    __complex__, __round__ = _value("complex() of a symbol"), _value(
+        "round() of a symbol; write numpy.round"
+    )
     __trunc__ = __floor__ = __ceil__ = _value("an integer from a symbol")
     __hash__ = _value("the hash of a symbol")
     __reduce__ = _value("a pickle of a symbol")

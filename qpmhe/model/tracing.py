@@ -25,6 +25,7 @@ from .operations import ExpressionRecord
 from .stand_ins import numpy_on_symbols
 from .symbols import (
     _MACHINERY,
+    INSTEAD,
     NotTraceableError,
     Record,
     Symbol,
@@ -362,7 +363,7 @@ def _failure(error: BaseException) -> str:
         return str(error)
     frames = [one for one, _ in traceback.walk_tb(error.__traceback__)]
     where = place(frames[-1]) if frames else ""
-    text = f"raises {type(error).__name__} on symbols: {error}"
+    text = f"raises {type(error).__name__} on symbols: {error}{INSTEAD}"
     return f"{where} {text}" if where else f"it {text}"
 
 

@@ -12,6 +12,7 @@ from scipy.interpolate import (
     interp1d,
     make_interp_spline,
 )
+from scipy.special import gamma
 
 A = np.array([[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.05, 0.0, 0.95]])
 B = np.array([[0.1, 0.0], [0.0, 0.2], [0.3, -0.1]])
@@ -214,6 +215,12 @@ TRACED = {
     "clip": lambda x, u: np.clip(x, -1.0, 1.0) + x.clip(0.0, None),
     "maximum": lambda x, u: np.maximum(x, 0.0) - np.minimum(x, u[0]),
     "max and min": saturated_by_max,
+    "functions of lists": lambda x, u: np.array([
+        np.max([x[0], u[0], 0.0]), np.hypot([x[1], x[2]], 1.0)[1], np.minimum.reduce([x[0], x[1]]),
+        np.linalg.norm([x[0] - 1.0, x[2]]), np.linalg.det([[2.0 + x[0] ** 2, x[1]], [u[0], 3.0]]),
+        np.interp([x[0], x[1]], GRID, TABLE)[1], np.clip([x[0], x[2]], -1.0, 1.0)[0],
+    ]),
+    "divmod": lambda x, u: np.array([divmod(x[0], 2.0)[1]]),
     "mask times value": lambda x, u: (x > 0.0) * x + (x <= 0.0) * 0.5 * x,
     "assignment by a mask": masked,
     "select": lambda x, u: np.select([x < -1.0, x > 1.0], [-(x**2), x**2], default=x),
@@ -243,11 +250,13 @@ TRACED = {
     "interp1d of all kinds": lambda x, u: np.array([kind(x[1]) for kind in KINDS]),
     "B-spline": lambda x, u: B_SPLINE(x),
 }
-# What is not, and a part of the text that says what to write instead.
+# What is not traced, and a part of the text that says what to write instead.
 OTHERS = {
     "a branch": (branch, "numpy.where"),
     "an index from a value": (chosen_by_index, "numpy.interp"),
     "values by a mask": (masked_by_values, "numpy.where"),
     "from math import sin": (with_imported_sin, "numpy.sin"),
+    "a special function": (lambda x, u: gamma(np.abs(x)), "table in how-to/speed"),
+    "eigenvalues": (lambda x, u: np.linalg.eigvalsh(np.outer(x, x)), "table in how-to/speed"),
     "from numpy import zeros": (into_imported_zeros, "numpy.zeros"),
 }
