@@ -165,10 +165,14 @@ def _is_looked_up(frame: Any, name: str) -> bool:
         return False
     found = _looked_up.get(code)
     if found is None:
+        instructions = list(dis.get_instructions(code))
+        ends = [*(one.offset for one in instructions[1:]), len(code.co_code)]
         found = _looked_up[code] = {
-            one.offset: one.argval for one in dis.get_instructions(code)
+            # A frame may stand at the instruction, or at the end of its cache.
+            place: one.argval for one, end in zip(instructions, ends, strict=True)
             if one.opname in ("LOAD_ATTR", "LOAD_METHOD")
             or (one.opname == "IMPORT_FROM" and code.co_flags & inspect.CO_NEWLOCALS)
+            for place in range(one.offset, end)
         }
     return found.get(frame.f_lasti) == name
 
