@@ -62,6 +62,28 @@ class Directions:
         return max(int(space.noise_free.shape[1]), 1)
 
     @property
+    def free(self) -> int | None:
+        """Directions in which trials have disturbances; None where these are all."""
+        count = int(self.constraints.basis.shape[1])
+        return None if count == self.system.n else count
+
+    def elimination(self, system: System, cost: Cost) -> dict[str, Array]:
+        """A basis F of the free directions, F^+ and c, with d = F e + c for all d of trials."""
+        constraints, n = self.constraints_of(system, cost), system.n
+        space, basis = cost.space, constraints.basis
+        if space is None:
+            shift = np.zeros(n)
+            shift[constraints.noise_free] = constraints.constant
+            return {"free": basis, "free_inverse": basis.T, "shift": shift}
+        directions = constraints.directions
+        shift = np.zeros(n) if directions is None else directions.offset
+        # In scaled numbers, the basis is orthonormal.
+        return {
+            "free": basis, "free_inverse": (basis / space.scale[:, None]).T / space.scale,
+            "shift": shift,
+        }
+
+    @property
     def rows(self) -> Rows | None:
         """The rows on d in place of the set W; None where W itself is on d."""
         return None if self.cost.space is None else self.constraints.disturbances

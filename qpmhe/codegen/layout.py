@@ -89,6 +89,8 @@ class Layout:
     #: Directions without a disturbance, and the numbers of W's rows in `DroppedRow` then.
     quiet: int = 0
     numbers: tuple[int, ...] | None = None
+    #: Directions in which there are disturbances, where not all have some; else None.
+    free: int | None = None
     #: States that are held where the window does not see them.
     held: int = 0
 
@@ -122,10 +124,10 @@ class Layout:
             covariance=own.prior is not None and (kind > 0 or weighs or projects),
             innovation=0 if own.innovation is None else 1 if own.innovation.rejects else 2,
             sensors=len(observer.sensors), observer_prior=weighs,
-            lapack=lapack and system.n >= _LAPACK_STATES, clock=clock,
+            lapack=lapack and system.n >= _LAPACK_STATES and directions.free is None, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
-            held=len(system.held),
+            free=directions.free, held=len(system.held),
         )
 
     @property
@@ -147,6 +149,7 @@ class Layout:
             "observer_prior": int(self.observer_prior),
             "innovation": self.innovation, "sensors": self.sensors,
             "turns": int(self.turns), "quiet": self.quiet, "held": self.held,
+            "rolled": int(self.free is not None), "free": self.free or 0,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
@@ -189,9 +192,12 @@ class Layout:
             ("solver_tolerance", r),
         ]
         fields += [(name, self.set_type(name)) for name in SET_NAMES]
+        if self.free is not None:
+            free = max(n * self.free, 1)
+            fields += [("free", r, free), ("free_inverse", r, free), ("shift", r, n)]
         if self.quiet:
             fields += [
-                ("keep", r, n * n), ("shift", r, n), ("candidate_keep", r, n * n),
+                ("keep", r, n * n), ("candidate_keep", r, n * n),
                 ("quiet", r, self.quiet * n),
             ]
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
@@ -274,8 +280,9 @@ class Layout:
         """``mhe_estimator``."""
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
         terms = _struct([
-            ("f_jacobian", r, (n, n)), ("h_jacobian", r, (p, n)), ("hessian", r, (n, n)),
-            ("coupling", r, (n, n)), ("own", r, n), ("following", r, n),
+            ("f_jacobian", r, (n, n)), ("h_jacobian", r, (p, n)),
+            *((name, r, (n, n)) for name in ("hessian", "coupling") if self.free is None),
+            ("own", r, n), ("following", r, n),
             ("disturbance_scale", r, n if self.loss else 1),
             ("noise_scale", r, p if self.loss else 1),
         ])
@@ -407,6 +414,9 @@ def _filled(
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
+    if layout.free is not None:
+        for name, matrix in directions.elimination(system, cost).items():
+            _fill(record, name, matrix)
     if layout.held:
         basis = directions.constraints_of(system, cost).basis
         hold = Hold(system.held, inverse(regular), basis, cost.disturbance)
@@ -452,8 +462,7 @@ def _fill_directions(record: Any, constraints: Constraints, space: Subspace) -> 
         ):
             part[f"row_{name}"][: values.size] = values
     if directions is not None:
-        keep, shift = directions.roll_out(of_candidate=False)
-        record["keep"], record["shift"] = keep.ravel(), shift
+        record["keep"] = directions.projection.ravel()
         record["candidate_keep"] = directions.candidate_projection.ravel()
         record["quiet"][: space.noise_free.size] = space.noise_free.T.ravel()
 
@@ -464,7 +473,7 @@ def _kind(residual: Residual | None) -> int:
 
 def _fill(record: NDArray[Any], name: str, value: NDArray[Any] | None) -> None:
     """Fill a field where there is something to fill in."""
-    if value is not None:
+    if value is not None and value.size:
         record[name] = value.ravel()
 
 

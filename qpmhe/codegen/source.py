@@ -15,6 +15,7 @@ from .._version import __version__
 from ..errors import CompilationError
 from ..model.expressions import CasadiModel, import_casadi
 from .layout import TERMS, Layout
+from .single import in_single_precision
 
 #: The file that holds a whole estimator.
 MAIN = "mhe.c"
@@ -53,7 +54,7 @@ def prologue() -> str:
     )
 
 
-def model_source(model: CasadiModel) -> str:
+def model_source(model: CasadiModel, single: bool = False) -> str:
     """The model in C: CasADi's code for f, h and their Jacobians, and the discretisation."""
     if model.n > _MOST_STATES:
         raise CompilationError(
@@ -114,7 +115,9 @@ def model_source(model: CasadiModel) -> str:
         # CasADi writes out some functions that are not called, and arguments without use.
         "#if defined(__GNUC__)\n#pragma GCC diagnostic push\n"
         '#pragma GCC diagnostic ignored "-Wunused-function"\n'
-        '#pragma GCC diagnostic ignored "-Wunused-parameter"\n#endif',
+        '#pragma GCC diagnostic ignored "-Wunused-parameter"\n'
+        # Its tables compute with indices, which are exact in double precision alone.
+        + '#pragma GCC diagnostic ignored "-Wconversion"\n' * single + "#endif",
         "#define casadi_real mhe_real", code,
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif",
         *calls, template("model.c"),
@@ -195,14 +198,18 @@ def estimator_files(
     head = header(name, {**layout.header_values(name), "version": __version__})
     parts = (
         "algebra.c", "residuals.c", "conditions.c", "cost.c", "observer.c", "projection.c",
-        "window.c", "prior.c", "hold.c", "sets.c", "trial.c", "factor.c", "budget.c",
-        "inequalities.c", "optimizer.c", "step.c",
+        "window.c", "prior.c", "hold.c", "sets.c", "trial.c",
+        "factor.c" if layout.free is None else "elimination.c", "budget.c", "inequalities.c",
+        "optimizer.c", "step.c",
     )
-    body = prologue() + model_source(model) + "\n".join(template(part) for part in parts)
+    single = layout.real == "float"
+    body = prologue() + model_source(model, single) + "\n".join(template(part) for part in parts)
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
         f"const mhe_settings mhe_default_settings = {_initializer(settings)};\n"
     )
+    if single:
+        body, data = in_single_precision(body), in_single_precision(data)
     text = renamed(f'#include "mhe.h"\n{body}{data}', name).replace('"mhe.h"', f'"{name}.h"')
     return {f"{name}.h": head, f"{name}.c": text}
 

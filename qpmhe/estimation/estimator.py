@@ -27,6 +27,7 @@ from ..model.traces import warn_of
 from ..observers import Observer
 from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
+from .contracts import check_losses, check_observer
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .hold import WindowHold
@@ -178,6 +179,7 @@ class MovingHorizonEstimator:
         _require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
         _require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
         check_cost(system, cost)
+        check_losses(cost)
         check_prior(observer, cost, warns=not is_copy and self.settings.max_qps != 0)
         # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(
@@ -798,6 +800,7 @@ def check_start(
         state = _inside(system, observer, cost, state, name)
         system.check(state, np.zeros(system.m) if u is None else u)
         observer.check(system, state)
+        check_observer(observer, system, state, np.zeros(system.m) if u is None else u)
     except ModelError as error:
         if name == "initial_state":
             raise

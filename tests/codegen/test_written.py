@@ -121,6 +121,47 @@ def test_compiles_without_warnings(name, tmp_path):
     assert set(re.findall(r"^#include (.*)", source.read_text(), re.M)) <= HEADERS
 
 
+# A time budget is kept by a clock that counts seconds in double precision.
+SINGLE = [name for name in SOME if "in time" not in name]
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_single_precision_computes_nothing_in_double(name, tmp_path):
+    _, source = write(case(name).estimator("python"), tmp_path, real="float")
+    command = [CC, "-std=c99", *STRICT, *EXACT, "-Wdouble-promotion", "-fsyntax-only", source]
+    subprocess.run(command, check=True)
+
+
+@pytest.mark.skipif(
+    not (shutil.which("arm-none-eabi-gcc") and shutil.which("arm-none-eabi-nm")),
+    reason="there is no compiler for microcontrollers",
+)
+@pytest.mark.parametrize("name", SINGLE[::4])
+def test_a_microcontroller_needs_no_double_precision(name, tmp_path):
+    _, source = write(case(name).estimator("python"), tmp_path, real="float")
+    made = tmp_path / "mhe.o"
+    cortex = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
+    subprocess.run(
+        ["arm-none-eabi-gcc", "-std=c99", *cortex, "-O2", *STRICT, "-c", "-o", made, source],
+        check=True,
+    )
+    called = subprocess.run(
+        ["arm-none-eabi-nm", "-u", made], capture_output=True, text=True, check=True
+    ).stdout.split()
+    functions = "a?(cos|sin|tan)h?|sqrt|exp|log|log1p|pow|fabs|fmax|fmin|atan2|floor"
+    wide = re.compile(rf"__aeabi_(d\w*|\w+2d)|{functions}")
+    assert "memcpy" in called
+    assert not [one for one in called if wide.fullmatch(one)]
+
+
+@pytest.mark.parametrize("level", ["-O1", "-O2", "-O3"])
+@pytest.mark.parametrize("name", ["extended", "fewer disturbances in sets", "unscented prior"])
+def test_compiles_without_warnings_when_it_is_optimised(name, level, tmp_path):
+    _, source = write(case(name).estimator("python"), tmp_path)
+    command = [CC, "-std=c99", level, *STRICT, *EXACT, "-c", "-o", tmp_path / "mhe.o", source]
+    subprocess.run(command, check=True)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["mixed losses", "states in both"])
 def test_levels_differ_by_contraction_only(name, tmp_path):

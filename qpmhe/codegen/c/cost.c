@@ -180,14 +180,13 @@ static int mhe_dense_terms(const real *Q, const real *w, mhe_terms *t)
 #define mhe_dense_terms(Q, w, t) 0
 #endif
 
-/* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v),
- * following = Q w; A and C are in place. Q and R are of the form that touches the cost. */
+/* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, which elimination.c does not need;
+ * own = -(A' Q w + C' R v), following = Q w; A and C are in place. Q and R are of the form that touches the cost. */
 static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
                           const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
 {
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
-    real *H = t->hessian, *QA = t->coupling;
     if (MHE_LOSS && t == &stage->terms && !isfinite(stage->cost)) {
         /* Of the candidate where the model failed: no residual, and the weight itself. */
         for (int j = 0; j < NX; j++) t->disturbance_scale[MHE_LOSS ? j : 0] = 1;
@@ -199,6 +198,16 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
     mhe_times(NX, Q, w, t->following);
     for (int i = 0; i < NX; i++)
         t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
+#if MHE_ROLLED
+    for (int j = 0; j < NX; j++) t->own[j] = 0;
+    for (int k = 0; k < NX; k++)
+        for (int j = 0; j < NX; j++) t->own[j] -= t->following[k] * A[k * NX + j];
+    for (int k = 0; k < NY; k++) {
+        const real force = mhe_scaled(mhe_dot(NY, R + k * NY, v), t->noise_scale, k);
+        for (int j = 0; j < NX; j++) t->own[j] -= force * C[k * NX + j];
+    }
+#else
+    real *H = t->hessian, *QA = t->coupling;
     if (MHE_LOSS || !mhe_dense_terms(Q, w, t)) {
         for (int i = 0; i < NX * NX; i++) H[i] = QA[i] = 0;
         for (int i = 0; i < NX; i++)
@@ -238,4 +247,5 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
         }
         for (int j = 0; j < NX; j++) t->own[j] -= v[k] * RC[j];
     }
+#endif
 }

@@ -58,6 +58,8 @@ typedef $real mhe_real;
 #define MHE_SENSORS $sensors    /* sensors whose innovations are tested */
 #define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_QUIET $quiet /* directions of x(t+1) - f without a disturbance */
+#define MHE_ROLLED $rolled /* whether some directions of x(t+1) - f have no disturbance in any trial */
+#define MHE_FREE $free /* the other directions, where there are such */
 #define MHE_HELD $held    /* states that are held where the window does not see them */
 #define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
@@ -209,9 +211,14 @@ typedef struct {
     mhe_w_set disturbances;
     mhe_v_set noises;
     mhe_x_set states;
+#if MHE_ROLLED
+    /* x(i+1) - f = free e + shift, and e = free_inverse (x(i+1) - f). */
+    mhe_real free[MHE_SIZE(MHE_NX * MHE_FREE)], free_inverse[MHE_SIZE(MHE_FREE * MHE_NX)];
+    mhe_real shift[MHE_NX];
+#endif
 #if MHE_QUIET
     /* x(i+1) = f + keep (x(i+1) - f) + shift; of the candidate, along the rows of `quiet` alone. */
-    mhe_real keep[MHE_NX * MHE_NX], shift[MHE_NX];
+    mhe_real keep[MHE_NX * MHE_NX];
     mhe_real candidate_keep[MHE_NX * MHE_NX], quiet[MHE_QUIET * MHE_NX];
 #endif
     /* The observer's metric: as a covariance, before it has settled or for good; and the weight in the
@@ -241,8 +248,10 @@ extern const mhe_settings mhe_default_settings;
 /* The cost of one stage to second order, in the increments of x(i) and x(i+1). */
 typedef struct {
     mhe_real f_jacobian[MHE_NX * MHE_NX], h_jacobian[MHE_NY * MHE_NX];
+#if !MHE_ROLLED
     mhe_real hessian[MHE_NX * MHE_NX];  /* A' Q A + C' R C */
     mhe_real coupling[MHE_NX * MHE_NX]; /* -A' Q: rows of x(i), columns of x(i+1) */
+#endif
     mhe_real own[MHE_NX], following[MHE_NX];
     /* What the rows of the weights Q and R are multiplied with where a loss is not quadratic. */
     mhe_real disturbance_scale[MHE_LOSS ? MHE_NX : 1], noise_scale[MHE_LOSS ? MHE_NY : 1];
@@ -342,6 +351,20 @@ typedef struct {
     mhe_side sides[2];
 } mhe_rows;
 
+#if MHE_ROLLED
+/* Rows of a least-squares problem, and the reflections that turn them into `rank` rows, each with zeros
+ * before its column `lead`; the first `free` of these are of disturbances. Columns are padded. */
+#define MHE_COLUMNS ((MHE_FREE + MHE_NX + 3) / 4 * 4)
+#define MHE_EQUATIONS (MHE_FREE + 2 * MHE_NX + MHE_NY + MHE_STAGE_ROWS)
+typedef struct {
+    mhe_real rows[MHE_EQUATIONS * MHE_COLUMNS];
+    mhe_real mirrors[MHE_COLUMNS * MHE_EQUATIONS], share[MHE_COLUMNS];
+    mhe_real root[MHE_SIZE(MHE_STAGE_ROWS)];
+    int32_t lead[MHE_COLUMNS], other[MHE_COLUMNS], source[MHE_SIZE(MHE_STAGE_ROWS)];
+    int32_t count, rank, free, inequalities;
+} mhe_block;
+#endif
+
 /* The prior of the present window: its mean, its weight, and one to judge distances by. */
 typedef struct {
     const mhe_real *mean, *weight, *distance_weight;
@@ -366,8 +389,23 @@ typedef struct {
     const mhe_terms *at[MHE_HORIZON]; /* the terms of the present QP */
     mhe_real factors[MHE_HORIZON + 1]; /* discounts: of the prior, then of each stage */
     mhe_prior prior;
+#if MHE_ROLLED
+    mhe_block blocks[MHE_HORIZON + 1];
+    mhe_block start;                  /* of the first state alone */
+    int32_t order[MHE_NX];            /* of its columns */
+    mhe_real sides_of[(MHE_HORIZON + 1) * MHE_EQUATIONS]; /* right-hand sides of the blocks' rows */
+    mhe_real targets[MHE_HORIZON * (MHE_FREE + MHE_NY)], drift[(MHE_HORIZON + 1) * MHE_NX];
+    mhe_real free_root[MHE_SIZE(MHE_FREE * MHE_FREE)], noise_root[MHE_NY * MHE_NY];
+    mhe_real free_roots[MHE_HORIZON * MHE_SIZE(MHE_FREE * MHE_FREE)];
+    mhe_real noise_roots[MHE_HORIZON * MHE_NY * MHE_NY];
+    mhe_real prior_root[MHE_NX * MHE_NX], prior_gradient[MHE_NX], first_target[MHE_NX];
+    mhe_real curvature[MHE_NX + MHE_HORIZON * MHE_FREE];
+    const mhe_real *limits_w;         /* disturbances about which the limits are */
+    const mhe_trial *around;          /* the trial that the QP is around */
+#else
     mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
     mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
+#endif
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real residual[(MHE_HORIZON + 1) * MHE_NX], direction[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real product[(MHE_HORIZON + 1) * MHE_NX];

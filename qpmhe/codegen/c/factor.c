@@ -36,7 +36,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         if (i == 0) {
             mhe_times(NX, weight, offset, g);
             for (int j = 0; j < NX; j++) g[j] *= mhe_scaled(factor, scale, j);
-            mhe_add_hold(e, k, factor);
+            mhe_add_hold(e, k, factor, k->panels, WIDTH);
         } else {
             for (int j = 0; j < NX; j++) g[j] = factor * k->at[i - 1]->following[j];
         }
@@ -166,4 +166,12 @@ static void mhe_build(mhe_estimator *e, mhe_workspace *k, const real *offset, in
 {
     mhe_assemble(e, k, offset);
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);
+}
+
+/* Factorise the QP and solve it without inequalities; the increments are in k->step. */
+static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
+{
+    mhe_build(e, k, offset, nearest);
+    for (int j = 0; j < (e->length + 1) * NX; j++) k->step[j] = -k->gradient[j];
+    return mhe_factorise(k, e->length) && mhe_solve(k, e->length, k->step);
 }

@@ -140,8 +140,9 @@ static real mhe_hold_cost(const mhe_estimator *e, const mhe_workspace *k, const 
 #endif
 }
 
-/* Add it to the first panel and gradient of the QP. */
-static void mhe_add_hold(const mhe_estimator *e, mhe_workspace *k, real factor)
+/* Add it to the first state's matrix, by rows of this width, and to the gradient of the QP. */
+static void mhe_add_hold(const mhe_estimator *e, mhe_workspace *k, real factor, real *matrix,
+                         int width)
 {
 #if MHE_HELD
     const int32_t *at = e->settings->hold.components;
@@ -151,9 +152,9 @@ static void mhe_add_hold(const mhe_estimator *e, mhe_workspace *k, real factor)
         const real *row = k->prior.held + r * MHE_HELD;
         k->gradient[at[r]] += factor * mhe_dot(MHE_HELD, row, offset);
         for (int c = 0; c < MHE_HELD; c++)
-            k->panels[at[r] * MHE_PANEL_WIDTH + at[c]] += factor * row[c];
+            matrix[at[r] * width + at[c]] += factor * row[c];
     }
 #else
-    (void)e; (void)k; (void)factor;
+    (void)e; (void)k; (void)factor; (void)matrix; (void)width;
 #endif
 }

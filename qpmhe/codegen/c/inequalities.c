@@ -1,5 +1,6 @@
 /* The QP with inequalities: a primal-dual active-set method, and where that does not settle an
- * interior-point method of Mehrotra's kind. The matrices of both have the form of factor.c.
+ * interior-point method of Mehrotra's kind. The matrices of both have the form of factor.c, or of
+ * elimination.c where some directions have no disturbance.
  *
  *     min d'H d / 2 + g'd   s.t.   low <= c(d) <= high
  *
@@ -23,9 +24,22 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 #define FEW 10
 #define ROUNDS 20
 #define STIFFNESS (sizeof(real) == 8 ? (real)1e6 : (real)1e3)
+#if MHE_ROLLED /* reflections bear more */
+#define STIFFER STIFFNESS
+#else
 #define STIFFER (sizeof(real) == 8 ? (real)1e3 : (real)1e2)
+#endif
 
 #if CONSTRAINED
+
+#if MHE_ROLLED
+/* Whether a row of a stage is one on a direction that has no disturbance in any trial. */
+static int mhe_is_eliminated(const mhe_settings *s, int r)
+{
+    const mhe_w_set *set = &s->disturbances;
+    return r < NX ? set->lower[r] == set->upper[r] : r < W_COUNT && set->row_fixed[r - NX];
+}
+#endif
 
 /* Limits of all rows about a trajectory x with residuals w and v. */
 static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
@@ -39,8 +53,16 @@ static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, co
             const int at = i * ROWS + r, out = k->left_out[at];
             k->rows.low[at] = out & MHE_LOWER ? -INFINITY : low[r];
             k->rows.high[at] = out & MHE_UPPER ? INFINITY : high[r];
+#if MHE_ROLLED
+            if (!mhe_is_eliminated(e->settings, r)) continue;
+            k->rows.low[at] = -INFINITY;
+            k->rows.high[at] = INFINITY;
+#endif
         }
     }
+#if MHE_ROLLED
+    k->limits_w = w;
+#endif
 }
 
 static void mhe_values_of(int n, int count, const real *q, const real *rows, real *out)
@@ -121,6 +143,80 @@ static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *
     (void)s;
 }
 
+/* The place of a row in the active set: at its lower or upper limit, or between them. Of an
+ * equation, the limits are the same. */
+enum { AT_LOWER = -1, BETWEEN = 0, AT_UPPER = 1, EQUATION = 2 };
+
+#if MHE_X_SET
+/* The diagonal of the Hessian's block of d(i). */
+static void mhe_stage_curvature(mhe_estimator *e, const mhe_workspace *k, int i, real *diagonal)
+{
+#if MHE_ROLLED
+    const mhe_settings *s = e->settings;
+    for (int j = 0; j < NX; j++) diagonal[j] = 0;
+    if (i == 0)
+        for (int j = 0; j < NX; j++) diagonal[j] = k->factors[0] * k->prior.weight[j * NX + j];
+    else
+        for (int j = 0; j < NX; j++)
+            diagonal[j] = k->factors[i] * mhe_scaled(mhe_disturbance_weight(
+                s, mhe_stage_at(e, i - 1))[j * NX + j], k->at[i - 1]->disturbance_scale, j);
+    if (i == e->length) return;
+    const mhe_terms *t = k->at[i];
+    const real *Q = mhe_disturbance_weight(s, mhe_stage_at(e, i));
+    const real *R = mhe_stage_at(e, i)->noise_weight, next = k->factors[i + 1];
+    for (int r = 0; r < NX; r++)
+        for (int c = 0; c < NX; c++) {
+            const real weight = next * mhe_scaled(Q[r * NX + c], t->disturbance_scale, r);
+            for (int j = 0; j < NX; j++)
+                diagonal[j] += weight * t->f_jacobian[r * NX + j] * t->f_jacobian[c * NX + j];
+        }
+    for (int r = 0; r < NY; r++)
+        for (int c = 0; c < NY; c++) {
+            const real weight = next * mhe_scaled(R[r * NY + c], t->noise_scale, r);
+            for (int j = 0; j < NX; j++)
+                diagonal[j] += weight * t->h_jacobian[r * NX + j] * t->h_jacobian[c * NX + j];
+        }
+#else
+    const real *panel = k->panels + i * NX * WIDTH;
+    for (int j = 0; j < NX; j++) diagonal[j] = panel[j * WIDTH + j];
+    (void)e;
+#endif
+}
+#endif
+
+/* Weights of the active rows. Those of W and V have the standard deviation of a disturbance or
+ * noise. Rows of X have only that of the prior, which may be vague: so they are stiffer than what
+ * the Hessian opposes to them. */
+static void mhe_set_stiffness(mhe_estimator *e, mhe_workspace *k)
+{
+    mhe_rows *q = &k->rows;
+    for (int i = 0; i < mhe_row_stages(e); i++) {
+        const int own = i * ROWS;
+        for (int at = own; at < own + ROWS; at++)
+            q->weight[at] =
+                q->place[at] == BETWEEN ? 0 : STIFFNESS / (q->deviation[at] * q->deviation[at]);
+#if MHE_X_SET
+        const int first = own + W_COUNT + V_COUNT;
+        real diagonal[NX];
+        int active = 0;
+        for (int r = 0; r < NX + MHE_X_ROWS; r++) active += q->place[first + r] != BETWEEN;
+        if (!active) continue;
+        mhe_stage_curvature(e, k, i, diagonal);
+        for (int j = 0; j < NX; j++)
+            if (q->place[first + j] != BETWEEN) q->weight[first + j] = STIFFER * diagonal[j];
+        for (int r = 0; r < MHE_X_ROWS; r++) {
+            const real *row = e->settings->states.rows + r * NX;
+            real pliancy = 0;
+            if (q->place[first + NX + r] == BETWEEN) continue;
+            for (int j = 0; j < NX; j++)
+                if (row[j] != 0) pliancy += row[j] * row[j] / diagonal[j];
+            q->weight[first + NX + r] = STIFFER / pliancy;
+        }
+#endif
+    }
+}
+
+#if !MHE_ROLLED
 /* panel += weight a a' (upper half). */
 static void mhe_add_square(real *panel, real weight, const real *a)
 {
@@ -190,19 +286,6 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
     (void)s;
 }
 
-/* The largest miss of a row in its scale; rows.value = c(d) afterwards. */
-static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const real *d)
-{
-    const mhe_rows *q = &k->rows;
-    real worst = 0;
-    mhe_rows_times(e, k, d);
-    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
-        const real missed = mhe_max(q->low[i] - q->value[i], q->value[i] - q->high[i]);
-        if (missed > 0) worst = mhe_max(missed / q->scale[i], worst);
-    }
-    return worst;
-}
-
 /* out = H d, from the panels before they are factorised. */
 static void mhe_hessian_times(const mhe_workspace *k, int count, const real *d, real *out)
 {
@@ -223,6 +306,69 @@ static void mhe_hessian_times(const mhe_workspace *k, int count, const real *d, 
     }
 }
 
+/* Factorise the QP around a trajectory, with the active rows' weights. */
+static int mhe_factorise_weighted(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
+                                  int active)
+{
+    mhe_build(e, k, offset, nearest);
+    if (active) {
+        mhe_set_stiffness(e, k);
+        mhe_add_weights(e, k);
+    }
+    return mhe_factorise(k, e->length);
+}
+
+/* The increments that minimise the QP with the rows' loads, or these alone. */
+static int mhe_solve_loaded(mhe_estimator *e, mhe_workspace *k, int nearest, int active)
+{
+    (void)nearest; /* the gradient is zero then */
+    for (int j = 0; j < (e->length + 1) * NX; j++) k->step[j] = -k->gradient[j];
+    if (active) mhe_add_loads(e, k, k->step);
+    return mhe_solve(k, e->length, k->step);
+}
+
+static int mhe_solve_loads(mhe_estimator *e, mhe_workspace *k)
+{
+    memset(k->direction, 0, sizeof(real) * (size_t)(e->length + 1) * NX);
+    mhe_add_loads(e, k, k->direction);
+    return mhe_solve(k, e->length, k->direction);
+}
+#else
+static int mhe_factorise_weighted(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
+                                  int active)
+{
+    mhe_assemble(e, k, offset);
+    if (nearest) memset(k->gradient, 0, sizeof k->gradient);
+    if (active) mhe_set_stiffness(e, k);
+    return mhe_factorise(e, k, active);
+}
+
+static int mhe_solve_loaded(mhe_estimator *e, mhe_workspace *k, int nearest, int active)
+{
+    (void)active; /* there are no rows without weights */
+    mhe_set_targets(e, k, 0, nearest);
+    return mhe_solve(e, k, 0, k->step);
+}
+
+static int mhe_solve_loads(mhe_estimator *e, mhe_workspace *k)
+{
+    return mhe_solve(e, k, 1, k->direction);
+}
+#endif
+
+/* The largest miss of a row in its scale; rows.value = c(d) afterwards. */
+static real mhe_row_violation(const mhe_estimator *e, mhe_workspace *k, const real *d)
+{
+    const mhe_rows *q = &k->rows;
+    real worst = 0;
+    mhe_rows_times(e, k, d);
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
+        const real missed = mhe_max(q->low[i] - q->value[i], q->value[i] - q->high[i]);
+        if (missed > 0) worst = mhe_max(missed / q->scale[i], worst);
+    }
+    return worst;
+}
+
 /* Sums and maxima are taken in strands, side by side: one after the other, the latency of each
  * operation would be most of their time. */
 #define STRANDS 8
@@ -237,10 +383,6 @@ static real mhe_product(int n, const real *a, const real *b)
     for (int s = 1; s < STRANDS; s++) sums[0] += sums[s];
     return sums[0];
 }
-
-/* The place of a row in the active set: at its lower or upper limit, or between them. Of an
- * equation, the limits are the same. */
-enum { AT_LOWER = -1, BETWEEN = 0, AT_UPPER = 1, EQUATION = 2 };
 
 static real mhe_limit_of(const mhe_rows *q, int i)
 {
@@ -281,7 +423,7 @@ static void mhe_compare(mhe_rows *q, int rows, real tolerance, mhe_guess *guess)
             const real below = q->low[i] - q->value[i], above = q->value[i] - q->high[i];
             if (below > little) next = AT_LOWER;
             if (above > little) next = AT_UPPER;
-        } else if (next != EQUATION && next * q->force[i] < 0)
+        } else if (next != EQUATION && (next < 0 ? -q->force[i] : q->force[i]) < 0)
             next = BETWEEN;
         q->next[i] = (int8_t)next;
         guess->wrong += next != q->place[i];
@@ -345,56 +487,6 @@ static int mhe_exclude(mhe_rows *q, int rows, real open)
     return changes;
 }
 
-#if MHE_QUIET || MHE_X_SET
-/* a' D^-1 a, with the diagonal D of the Hessian's block of a stage. */
-static real mhe_pliancy(const real *panel, const real *a)
-{
-    real sum = 0;
-    for (int j = 0; j < NX; j++)
-        if (a[j] != 0) sum += a[j] * a[j] / panel[j * WIDTH + j];
-    return sum;
-}
-#endif
-
-/* Weights of the active rows. Those of W and V have the standard deviation of a disturbance or
- * noise. Rows of X and of the directions without disturbances have only that of the prior, which
- * may be vague: so they are stiffer than what the Hessian in the panels opposes to them. */
-static void mhe_set_stiffness(const mhe_estimator *e, mhe_workspace *k)
-{
-    mhe_rows *q = &k->rows;
-    for (int i = 0; i < mhe_row_stages(e); i++) {
-        const int own = i * ROWS;
-        for (int at = own; at < own + ROWS; at++)
-            q->weight[at] =
-                q->place[at] == BETWEEN ? 0 : STIFFNESS / (q->deviation[at] * q->deviation[at]);
-#if MHE_QUIET
-        const real *panel = k->panels + i * NX * WIDTH;
-        for (int r = 0; r < MHE_QUIET && i < e->length; r++) {
-            const int at = own + W_COUNT - MHE_QUIET + r;
-            const real *row = e->settings->disturbances.rows + (W_COUNT - NX - MHE_QUIET + r) * NX;
-            real a[NX];
-            if (q->place[at] == BETWEEN) continue;
-            for (int j = 0; j < NX; j++) {
-                a[j] = 0;
-                for (int c = 0; c < NX; c++) a[j] -= row[c] * k->at[i]->f_jacobian[c * NX + j];
-            }
-            q->weight[at] = STIFFER / (mhe_pliancy(panel, a) + mhe_pliancy(panel + NX * WIDTH, row));
-        }
-#endif
-#if MHE_X_SET
-        const real *block = k->panels + i * NX * WIDTH;
-        const int first = own + W_COUNT + V_COUNT;
-        for (int j = 0; j < NX; j++)
-            if (q->place[first + j] != BETWEEN)
-                q->weight[first + j] = STIFFER * block[j * WIDTH + j];
-        for (int r = 0; r < MHE_X_ROWS; r++)
-            if (q->place[first + NX + r] != BETWEEN)
-                q->weight[first + NX + r] =
-                    STIFFER / mhe_pliancy(block, e->settings->states.rows + r * NX);
-#endif
-    }
-}
-
 /* Guess which rows are active, solve the QP with these as equations, guess anew: the primal-dual
  * active-set method of Hintermueller, Ito and Kunisch (SIAM Journal on Optimization 13, 2002),
  * which mostly ends after a few factorisations, with an exact solution. The equations are those of
@@ -404,7 +496,7 @@ static void mhe_set_stiffness(const mhe_estimator *e, mhe_workspace *k)
 static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest,
                           int limit, int again, int *iterations)
 {
-    const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
+    const int size = (e->length + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     const real tolerance = e->settings->solver_tolerance / 100;
     mhe_rows *q = &k->rows;
     int active = mhe_first_guess(q, rows, limit);
@@ -415,18 +507,11 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
         *iterations += active > 0;
         if (!again) {
             if (active && mhe_time_is_up(k)) return STOPPED;
-            mhe_build(e, k, offset, nearest);
-            if (active) {
-                mhe_set_stiffness(e, k);
-                mhe_add_weights(e, k);
-            }
-            if (!mhe_factorise(k, count)) return STOPPED;
+            if (!mhe_factorise_weighted(e, k, offset, nearest, active > 0)) return STOPPED;
         }
         for (int i = 0; i < rows; i++)
             q->load[i] = q->weight[i] * mhe_limit_of(q, i) - q->force[i];
-        for (int j = 0; j < size; j++) k->step[j] = -k->gradient[j];
-        if (active) mhe_add_loads(e, k, k->step);
-        if (!mhe_solve(k, count, k->step)) return STOPPED;
+        if (!mhe_solve_loaded(e, k, nearest, active > 0)) return STOPPED;
         mhe_rows_times(e, k, k->step);
         if (active) open = mhe_push_back(q, rows, &energy);
         mhe_compare(q, rows, tolerance, &guess);
@@ -440,9 +525,7 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
             }
             if (round == ROUNDS) return STOPPED;
             last = energy;
-            memset(k->direction, 0, sizeof(real) * (size_t)size);
-            mhe_add_loads(e, k, k->direction);
-            if (!mhe_solve(k, count, k->direction)) return STOPPED;
+            if (!mhe_solve_loads(e, k)) return STOPPED;
             for (int j = 0; j < size; j++) k->step[j] += k->direction[j];
             mhe_rows_times(e, k, k->step);
             open = mhe_push_back(q, rows, &energy);
@@ -467,7 +550,7 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real product)
         for (int i = 0; i < rows; i++) {
             const real limit = side ? q->high[i] : -q->low[i];
             const int there = isfinite(limit) && q->low[i] < q->high[i];
-            p->there[i] = there;
+            p->there[i] = there ? 1 : 0;
             p->limit[i] = there ? limit : 0;
             p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
             p->dual[i] = there ? product / p->slack[i] : 0;
@@ -511,21 +594,52 @@ static real mhe_set_residuals(mhe_rows *q, int rows, real stiffer, real *infeasi
     return products;
 }
 
-/* Right-hand side of the Newton equations for a target of the complementarity products. */
-static void mhe_set_loads(const mhe_estimator *e, mhe_workspace *k, real target)
+/* Solve the Newton equations for a target of the complementarity products. */
+static int mhe_set_direction(mhe_estimator *e, mhe_workspace *k, real target)
 {
     const int rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
-    for (int i = 0; i < rows; i++) q->load[i] = -q->weight[i] * q->missed[i];
+    /* Elimination takes the loads as they are, not what they add to those in the residual. */
+    for (int i = 0; i < rows; i++)
+        q->load[i] = -q->weight[i] * q->missed[i] - (MHE_ROLLED ? q->force[i] : 0);
     for (int side = 0; side < 2; side++) {
         const mhe_side *p = q->sides + side;
         const real sign = mhe_sign(side);
         for (int i = 0; i < rows; i++)
             q->load[i] += sign * ((target - p->correction[i] - p->dual[i] * p->residual[i]) *
-                                      p->inverse[i] - p->dual[i]);
+                                      p->inverse[i] - (MHE_ROLLED ? 0 : p->dual[i]));
     }
+#if MHE_ROLLED
+    return mhe_solve(e, k, 0, k->direction);
+#else
     memcpy(k->direction, k->residual, sizeof(real) * (size_t)(e->length + 1) * NX);
     mhe_add_loads(e, k, k->direction);
+    return mhe_solve(k, e->length, k->direction);
+#endif
+}
+
+/* The largest square of a force on the increments that the rows' loads leave, by its curvature. The
+ * forces are what `mhe_set_direction` balances. */
+static real mhe_unbalanced(mhe_estimator *e, mhe_workspace *k, int nearest)
+{
+    const int size = (e->length + 1) * NX;
+#if MHE_ROLLED
+    mhe_set_targets(e, k, k->step, nearest);
+    memset(k->residual, 0, sizeof(real) * (size_t)size);
+    mhe_add_loads(e, k, k->residual);
+    return mhe_largest_force(e, k);
+#else
+    real worst = 0;
+    (void)nearest; /* the gradient is zero then */
+    mhe_hessian_times(k, e->length, k->step, k->product);
+    for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
+    mhe_add_loads(e, k, k->residual);
+    for (int j = 0; j < size; j++) {
+        const real curvature = k->panels[j * WIDTH + j % NX];
+        worst = mhe_max(k->residual[j] * k->residual[j] / curvature, worst);
+    }
+    return worst;
+#endif
 }
 
 /* Changes of slacks and duals along the direction, whose c is in rows.value; the length of the
@@ -592,7 +706,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
                               int nearest, int limit, int *iterations)
 {
     const mhe_settings *s = e->settings;
-    const int count = e->length, size = (count + 1) * NX, rows = mhe_row_stages(e) * ROWS;
+    const int size = (e->length + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     mhe_rows *q = &k->rows;
     real far = INFINITY, stiffer = 1;
     const real missed = mhe_row_violation(e, k, k->step);
@@ -600,26 +714,26 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     if (!(missed > 0)) return SOLVED;
     memset(k->step, 0, sizeof(real) * (size_t)size);
     memset(q->force, 0, sizeof q->force);
+#if MHE_ROLLED
+    (void)offset; /* roots and gradient are in place */
+    mhe_set_curvatures(e, k);
+#endif
     const real outside = mhe_row_violation(e, k, k->step);
     const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */
     const int sides = mhe_start(q, rows, missed, mhe_max(scale, EPSILON * EPSILON));
     if (!sides) return STOPPED;
     for (*iterations = 0;; ++*iterations) {
-        real infeasible, unbalanced = 0, length = 1, target = 0;
+        real infeasible, length = 1, target = 0;
+#if !MHE_ROLLED
         mhe_build(e, k, offset, nearest);
-        mhe_hessian_times(k, count, k->step, k->product);
+#endif
         mhe_rows_times(e, k, k->step);
         mhe_set_stiffness(e, k);
         const real products = mhe_set_residuals(q, rows, stiffer, &infeasible);
         stiffer = mhe_max(stiffer, scale / products);
         if (!(stiffer < STIFFNESS)) stiffer = STIFFNESS;
-        for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
-        mhe_add_loads(e, k, k->residual);
-        for (int j = 0; j < size; j++) {
-            const real curvature = k->panels[j * WIDTH + j % NX];
-            unbalanced = mhe_max(k->residual[j] * k->residual[j] / curvature, unbalanced);
-        }
+        const real unbalanced = mhe_unbalanced(e, k, nearest);
         if (infeasible <= s->solver_tolerance / 100 &&
             unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
             products <= s->solver_tolerance / 1000 * scale) {
@@ -632,16 +746,19 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
             if (infeasible > SMALL && infeasible > SHARE * far) return STOPPED;
             far = infeasible;
         }
+#if MHE_ROLLED
+        if (!mhe_factorise(e, k, 1)) return *iterations ? STOPPED : FAILED;
+#else
         mhe_add_weights(e, k);
-        if (!mhe_factorise(k, count)) return *iterations ? STOPPED : FAILED;
+        if (!mhe_factorise(k, e->length)) return *iterations ? STOPPED : FAILED;
+#endif
         for (int corrector = 0; corrector < 2; corrector++) {
-            mhe_set_loads(e, k, target);
-            if (!mhe_solve(k, count, k->direction)) return *iterations ? STOPPED : FAILED;
+            if (!mhe_set_direction(e, k, target)) return *iterations ? STOPPED : FAILED;
             mhe_rows_times(e, k, k->direction);
             length = mhe_set_changes(q, rows, target);
             if (corrector) break;
             const real ratio = mhe_set_corrections(q, rows, length) / products;
-            target = ratio * ratio * ratio * products / sides;
+            target = ratio * ratio * ratio * products / (real)sides;
         }
         length *= (real)0.995;
         if (!(length > 1e-10)) return STOPPED;

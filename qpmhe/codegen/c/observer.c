@@ -115,7 +115,7 @@ static void mhe_rows_of(const mhe_seen *seen, const real *C, real *rows)
 static void mhe_kalman_gain(const real *P, const mhe_seen *seen, const real *A, const real *C,
                             real *gain)
 {
-    real cross[NY * NX], innovation[NY * NY];
+    real cross[NY * NX] = {0}, innovation[NY * NY] = {0}; /* compilers cannot tell */
     mhe_multiply(seen->count, NX, NX, C, P, cross);
     mhe_multiply_transposed(seen->count, NX, seen->count, cross, C, innovation);
     for (int i = 0; i < seen->count * seen->count; i++) innovation[i] += seen->noise[i];
@@ -161,7 +161,7 @@ static real mhe_draw_inside(const mhe_x_set *set, const real *z, real *one, real
     real share = inwards > 0 ? allowed[1] : allowed[0];
     if (share < CLOSEST && farther >= CLOSEST) {
         share = farther;
-        signs[0] = signs[1] = inwards;
+        signs[0] = signs[1] = (real)inwards;
     }
     share = share < CLOSEST ? CLOSEST : share < 1 ? share : 1;
     for (int j = 0; j < NX; j++) {

@@ -103,14 +103,6 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
     return 1;
 }
 
-/* Factorise the QP and solve it without inequalities; the increments are in k->step. */
-static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
-{
-    mhe_build(e, k, offset, nearest);
-    for (int j = 0; j < (e->length + 1) * NX; j++) k->step[j] = -k->gradient[j];
-    return mhe_factorise(k, e->length) && mhe_solve(k, e->length, k->step);
-}
-
 /* Solve the QP around a trial; the increments are in k->step. With `again`, only
  * limits have changed since the last one. */
 static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
@@ -120,6 +112,9 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
     real offset[NX];
 #if MHE_HELD
     k->prior.first = around->x;
+#endif
+#if MHE_ROLLED
+    k->around = around;
 #endif
     for (int j = 0; j < NX; j++) offset[j] = around->x[j] - prior[j];
     mhe_wrap_state(e->settings, around->x, offset);
