@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -40,6 +41,13 @@ class ModelValues:
         values = [_values(system, point) for point in points]
         return cls(points, *(np.array(each) for each in zip(*values, strict=True)))
 
+    @cached_property
+    def _rounding(self) -> tuple[Array, Array]:
+        """Differences of each component of f and h that are rounding."""
+        states = np.abs(self.points[:, : self.f.shape[1]])
+        largest = np.maximum(np.abs(self.f), states), np.abs(self.h)
+        return SAME_MODEL * largest[0].max(axis=0), SAME_MODEL * largest[1].max(axis=0)
+
     def difference(self, system: System, among: Sequence[int] | None = None) -> str:
         """Where a system has other values, in words; empty if all are the same.
 
@@ -50,27 +58,27 @@ class ModelValues:
         sizes, own = (system.n, system.p, system.m), (n, p, self.points.shape[1] - n)
         if sizes != own:
             return f"(n, p, m) is {sizes}, and was {own} when it was certified"
-        largest = np.maximum(np.abs(self.f), np.abs(self.points[:, :n])), np.abs(self.h)
         for k in range(len(self.points)) if among is None else among:
-            x = self.points[k, :n].tolist()
+            point = self.points[k]
             try:
-                found = _values(system, self.points[k])
+                found = _values(system, point)
             except Exception as error:  # a user's function may raise anything
-                return f"f or h raises {type(error).__name__} at x = {x}, and did not before"
-            for name, now, then, size in zip(
-                "fh", found, (self.f[k], self.h[k]), largest, strict=True
+                where = point[:n].tolist()
+                return f"f or h raises {type(error).__name__} at x = {where}, and did not before"
+            for name, now, then, most in zip(
+                "fh", found, (self.f[k], self.h[k]), self._rounding, strict=True
             ):
                 # Written so that a value that is not finite is another one.
-                if not (np.abs(now - then) <= SAME_MODEL * size.max(axis=0)).all():
+                if not (np.abs(now - then) <= most).all():
                     return (
-                        f"{name} is {now.tolist()} at x = {x}, and was {then.tolist()} when it was "
-                        "certified"
+                        f"{name} is {now.tolist()} at x = {point[:n].tolist()}, and was "
+                        f"{then.tolist()} when it was certified"
                     )
         return ""
 
 
 def _values(system: System, point: Array) -> tuple[Array, Array]:
-    """F and h at one point."""
+    """The values of f and h at one point."""
     x, u = point[: system.n], point[system.n :]
     with np.errstate(all="ignore"):
         return np.array(system.f(x, u), np.float64), np.array(system.h(x, u), np.float64)

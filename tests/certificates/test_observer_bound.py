@@ -227,7 +227,7 @@ def test_a_run_of_another_model_with_the_same_gain_is_refused():
 
 
 def test_where_the_bound_ends_the_model_need_not_be_defined():
-    """The observer leaves the domain of the root: the run is of the certified model all the same."""
+    """The observer leaves the domain of the root, in a run of the certified model."""
     system = qpmhe.System(lambda x: 0.5 * np.sqrt(x) + 0.3, lambda x: 1.0 * x, n=1, p=1)
     bound = bound_of(system, [[0.1]], box(0.1, 2.0), 0.01, 0.01)
     mhe = qpmhe.MovingHorizonEstimator(
