@@ -28,7 +28,7 @@ from .costs import (
     QuadraticCost,
     RobustCost,
 )
-from .errors import ObserverWarning, PriorWarning, QpmheError
+from .errors import ModelWarning, ObserverWarning, PriorWarning, QpmheError
 from .estimation.active_rows import ActiveRow
 from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
@@ -126,6 +126,7 @@ __all__ = [
     "HuberInnovation",
     "Loss",
     "Luenberger",
+    "ModelWarning",
     "MovingHorizonEstimator",
     "Observer",
     "ObserverPrior",

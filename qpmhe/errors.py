@@ -17,6 +17,7 @@ __all__ = [
     "EngineWarning",
     "InvalidInputError",
     "ModelError",
+    "ModelWarning",
     "ObserverWarning",
     "OptionError",
     "PriorWarning",
@@ -50,6 +51,10 @@ class ObserverWarning(UserWarning):
 
 class PriorWarning(ObserverWarning):
     """A constant weight of the prior beside an observer that has a covariance."""
+
+
+class ModelWarning(UserWarning):
+    """A model that its step discretises too coarsely for the size of its disturbances."""
 
 
 class EngineWarning(UserWarning):

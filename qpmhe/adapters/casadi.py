@@ -110,6 +110,7 @@ def from_casadi(
 
     system = made(False)
     system.symbolic, system.dt = model, model.dt
+    system.method = None if model.dt is None else method
     if model.dt is not None:
         system.make_timed = lambda: made(True)
 

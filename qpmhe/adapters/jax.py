@@ -121,7 +121,7 @@ def from_jax(
         None if length is None else method, sources,
     )
     if length is not None:
-        system.dt = length
+        system.dt, system.method = length, method
         system.make_timed = partial(
             _assembled, _Model(programs, None), m + 1, timed_options(options)
         )

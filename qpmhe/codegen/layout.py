@@ -203,8 +203,8 @@ class Layout:
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         fields += [(name, r, n) for name in ("inner_lower", "inner_upper", "aside")]
         options = (
-            "metric_settled", "project", "max_qps", "max_iterations", "infeasible",
-            "start_at_best", "reinitialize", "smooth", "delay",
+            "metric_settled", "project", "max_qps", "uncapped", "patience", "max_iterations",
+            "infeasible", "start_at_best", "reinitialize", "smooth", "delay",
         )
         fields += [(name, np.int32) for name in options]
         if self.clock:
@@ -431,6 +431,7 @@ def _filled(
         record["metric_settled"] = metric is not None or layout.covariance
     record["project"] = settings.project_observer
     record["max_qps"] = min(settings.qp_limit, _MOST)
+    record["uncapped"], record["patience"] = settings.max_qps is None, settings.patience
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)
     record["infeasible"] = _POLICIES.index(settings.infeasible)

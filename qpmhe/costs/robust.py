@@ -12,6 +12,7 @@ from qpmhe_solvers.errors import report_unknown_options
 from .._checks import Array, check_prior_size, positive_definite, representation
 from ..errors import InvalidInputError
 from .base import Cost, CostConstants, CostForm, ObserverPrior
+from .contracts import check_loss
 from .losses import Loss, Quadratic
 
 
@@ -42,6 +43,8 @@ class RobustCost(Cost):
     WeightError, ShapeError, OptionError
         If a weight is not symmetric positive definite, dimensions differ, or the discount is
         outside (0, 1].
+    ModelError
+        If a loss of your own returns a wrong shape, or a value or slope below zero.
     """
 
     def __init__(
@@ -50,6 +53,8 @@ class RobustCost(Cost):
     ) -> None:
         self.disturbance_loss = _loss("disturbance", disturbance)
         self.noise_loss = _loss("noise", noise)
+        for loss in (self.disturbance_loss, self.noise_loss):
+            check_loss(loss)
         r = self.disturbance_loss.dimension
         weight: Array | ObserverPrior | None
         if prior is None or isinstance(prior, ObserverPrior):
@@ -57,6 +62,7 @@ class RobustCost(Cost):
             self.prior_loss: Loss = Quadratic(np.eye(r))
         else:
             self.prior_loss = _loss("prior", prior)
+            check_loss(self.prior_loss)
             weight = check_prior_size(positive_definite("prior", self.prior_loss.weight), r)
         self.graduation = max(self.disturbance_loss.graduation, self.noise_loss.graduation)
         super().__init__(weight, self.disturbance_loss.weight, self.noise_loss.weight, discount)

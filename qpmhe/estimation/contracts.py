@@ -1,124 +1,126 @@
-"""Whether a user's own observer and losses return what the estimator takes, at a few points."""
+"""What users' own observers have to return, checked once at a few points."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import NDArray
 
-from qpmhe_solvers.values import shown
-
-from .._checks import Array
-from ..costs import Cost, Loss, RobustCost
-from ..errors import InvalidInputError
+from .._checks import positive_definite
+from .._linalg import inverse
+from ..costs import Cost, QuadraticCost, RobustCost
+from ..costs.contracts import check_own_cost, numbers_of, spare
+from ..errors import ModelError, QpmheError
+from ..model.functions import EvaluationError
 from ..model.system import System
 from ..observers import Observer, Sample
 
-# Forms q at which a loss is tried, in squares of standard deviations.
-_FORMS = np.array([0.0, 1e-6, 0.1, 1.0, 10.0, 1e4])
+Array = NDArray[np.float64]
+
+# Corrections at v = 0, in standard deviations of the prior, that are rounding.
+_ROUNDING = 1e-6
 
 
-def check_observer(observer: Observer, system: System, state: Array, u: Array) -> None:
-    """Check what a user's observer returns at a state, without and with a fitting error.
-
-    Raises
-    ------
-    InvalidInputError
-        If `Observer.correct` does not return a correction (n,) and a covariance (n, n) or None, or
-        `Observer.filter` something else than such a pair or None, or the metric is no matrix.
-    """
-    name, n = type(observer).__name__, system.n
-    if _is_ours(observer):
-        return
+def check_observer(system: System, observer: Observer) -> None:
+    """Check the matrices that an observer states about itself; raise a `ModelError`."""
+    name, n, p = type(observer).__name__, system.n, system.p
     metric = observer.metric
-    if metric is not None and np.shape(metric) != (n, n):
-        raise InvalidInputError(
-            f"{name}.metric is {shown(metric)}; expected a matrix ({n}, {n}) in which the error "
-            "contracts, or None. Call an attribute of your own something else."
-        )
-    covariance = observer.initial_covariance()
-    slopes: tuple[Array | None, Array | None] = (None, None)
-    if observer.needs_jacobians:
-        slopes = system.f_jacobian(state, u), system.h_jacobian(state, u)
-    counts = np.zeros(len(observer.sensors), np.int64)
-    for size in (0.0, 1e-3):
-        v = np.full(system.p, size)
-        for method in ("correct", "filter"):
-            sample = Sample(
-                system, u, *slopes,
-                covariance=None if covariance is None else covariance.copy(),
-                rejections=counts, next_rejections=counts.copy(),
-            )
-            try:
-                with np.errstate(all="ignore"):
-                    found = getattr(observer, method)(state.copy(), v.copy(), sample)
-            except Exception:  # bad luck at this point: the step falls back there
-                continue
-            if not (found is None and method == "filter"):
-                _check_pair(f"{name}.{method}", found, n, covariance is not None)
+    if metric is not None:
+        try:
+            positive_definite("metric", metric)
+        except QpmheError as error:
+            raise ModelError(
+                f"{name}.metric is no matrix of an error's norm ({error}) The package projects an "
+                "observer onto X in its metric, (n, n) or None; if yours is something else, give "
+                "it another name."
+            ) from error
+    for attribute, matrix, shape in (
+        ("initial_covariance", observer.initial_covariance(), (n, n)),
+        ("constant_gain", observer.constant_gain, (n, p)),
+    ):
+        # The package's own observers name the parameter that has the wrong size.
+        if matrix is not None and not type(observer).__module__.startswith("qpmhe."):
+            numbers_of(f"{name}.{attribute}", matrix, shape)
 
 
-def _check_pair(name: str, found: Any, n: int, has_covariance: bool) -> None:
-    """Raise unless something is a vector (n,) and a covariance (n, n) or None."""
-    expected = (
-        f"expected a pair: a vector ({n},) and "
-        + (f"a covariance ({n}, {n})" if has_covariance else f"None, or a covariance ({n}, {n})")
-    )
-    if not isinstance(found, (tuple, list)) or len(found) != 2:
-        raise InvalidInputError(f"{name} returned {shown(found)}; {expected}.")
-    vector, covariance = found
-    if np.shape(vector) != (n,):
-        raise InvalidInputError(
-            f"{name} returned a first value of shape {np.shape(vector)}; {expected}."
-        )
-    if np.shape(covariance) != (n, n) and (has_covariance or covariance is not None):
-        raise InvalidInputError(
-            f"{name} returned a second value of shape {np.shape(covariance)}; {expected}."
-        )
+def check_correction(
+    system: System, observer: Observer, cost: Cost, state: Array, u: Array
+) -> None:
+    """Check what an observer's methods, and an own cost's, return at the initial state.
 
-
-def check_losses(cost: Cost) -> None:
-    """Check values and slopes of the losses that a user has written.
+    The correction has shape (n,), is real, and is zero where the error is; the covariance has shape
+    (n, n), and is None if and only if the observer has no initial one.
 
     Raises
     ------
-    InvalidInputError
-        If a loss does not return one number for each of many forms q, is negative or not 0 at 0, or
-        falls: rho must rise from rho(0) = 0, so that rho' >= 0.
+    ModelError
+        With the method's name, the shape that was found, and the one that is expected.
     """
-    if not isinstance(cost, RobustCost):
-        return
-    for part in ("prior", "disturbance", "noise"):
-        loss: Loss = getattr(cost, f"{part}_loss")
-        if _is_ours(loss):
-            continue
-        name = type(loss).__name__
-        for method, what in (("_value", "rho(q)"), ("_slope", "rho'(q)")):
-            try:
-                with np.errstate(all="ignore"):
-                    found = getattr(loss, method)(_FORMS.copy())
-            except Exception as error:
-                raise InvalidInputError(
-                    f"{name}.{method} raised {type(error).__name__}: {error}, for the forms q = "
-                    f"{_FORMS.tolist()}; expected {what} of each."
-                ) from error
-            if np.shape(found) != _FORMS.shape:
-                raise InvalidInputError(
-                    f"{name}.{method} returned shape {np.shape(found)} for forms q of shape "
-                    f"{_FORMS.shape}; expected {what} of each."
-                )
-            values = np.asarray(found, np.float64)
-            wrong = ~(values >= 0.0)
-            if method == "_value" and not wrong[0]:
-                wrong[0] = values[0] != 0.0
-            if wrong.any():
-                k = int(np.argmax(wrong))
-                raise InvalidInputError(
-                    f"{name}.{method}({_FORMS[k]:g}) is {values[k]:g}; expected {what} >= 0, and "
-                    "rho(0) = 0: a loss rises from 0."
-                )
+    prior = cost.initial_weight(observer.initial_covariance())
+    if type(cost) not in (QuadraticCost, RobustCost):
+        check_own_cost(cost, prior)
+    noise = np.sqrt(inverse(cost.noise).diagonal())
+    deviations = cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
+    tried = spare(observer)
+    for v in (np.zeros(system.p), noise, -3.0 * noise):
+        try:
+            with np.errstate(all="ignore"):
+                sample = _sample(system, observer, state, u)
+                answer = tried.correct(state.copy(), v.copy(), sample)
+                filtered = tried.filter(state.copy(), v.copy(), sample)
+        except (ArithmeticError, np.linalg.LinAlgError, EvaluationError, QpmheError):
+            continue  # bad luck is for the run
+        except Exception as error:
+            raise ModelError(
+                f"{type(observer).__name__}.correct or filter raised {type(error).__name__}: "
+                f"{error} at the initial state {state.tolist()}."
+            ) from error
+        correction = _checked_pair(observer, answer, filtered, system.n)
+        # Beside zero: rounding, in the prior's units. What is not finite is bad luck, for the run.
+        size = _ROUNDING * (deviations + np.abs(state))
+        if not v.any() and (np.abs(correction) > size).any() and np.isfinite(correction).all():
+            raise ModelError(
+                f"{type(observer).__name__}.correct returned the correction {correction.tolist()} "
+                "for the error v = 0; expected zero, L(z, 0) = 0."
+            )
 
 
-def _is_ours(thing: object) -> bool:
-    """Whether a class is of this package, and tested there."""
-    return type(thing).__module__.partition(".")[0] == "qpmhe"
+def _sample(system: System, observer: Observer, state: Array, u: Array) -> Sample:
+    sample = Sample(system, u, covariance=observer.initial_covariance())
+    if observer.needs_jacobians:
+        sample.f_jacobian, sample.h_jacobian = (
+            np.array(jacobian(state, u)) for jacobian in (system.f_jacobian, system.h_jacobian)
+        )
+    if observer.sensors:
+        count = len(observer.sensors)
+        sample.rejections, sample.next_rejections = np.zeros((2, count), np.int64)
+    return sample
+
+
+def _checked_pair(observer: Observer, answer: object, filtered: object, n: int) -> Array:
+    """The correction of an answer of the right form."""
+    name = type(observer).__name__
+    covariance = observer.initial_covariance() is not None
+    second = f"the covariance, shape ({n}, {n})" if covariance else "None"
+    if not isinstance(answer, (tuple, list)) or len(answer) != 2:
+        shape = f" of shape {answer.shape}" if isinstance(answer, np.ndarray) else ""
+        raise ModelError(
+            f"{name}.correct returned {type(answer).__name__}{shape}; expected the pair of the "
+            f"correction, shape ({n},), and {second}."
+        )
+    correction = numbers_of(f"{name}.correct, as its correction,", answer[0], (n,))
+    if covariance:
+        numbers_of(f"{name}.correct, as its covariance,", answer[1], (n, n))
+    elif answer[1] is not None:
+        raise ModelError(
+            f"{name}.correct returned a covariance, but its initial_covariance is None; return "
+            "None as the second, or write initial_covariance."
+        )
+    if filtered is not None:
+        if not isinstance(filtered, (tuple, list)) or len(filtered) != 2:
+            raise ModelError(
+                f"{name}.filter returned {type(filtered).__name__}; expected None, or the pair of "
+                f"estimate, shape ({n},), and covariance, shape ({n}, {n})."
+            )
+        numbers_of(f"{name}.filter, as its estimate,", filtered[0], (n,))
+        numbers_of(f"{name}.filter, as its covariance,", filtered[1], (n, n))
+    return correction

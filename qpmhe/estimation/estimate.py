@@ -38,6 +38,7 @@ class Status(enum.Flag):
     GRADUATED = enum.auto()
     SENSORS_REJECTED = enum.auto()
     ALL_REJECTED = enum.auto()
+    UNCONVERGED = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what to do about it, in sentences."""
@@ -108,6 +109,11 @@ _TEXTS = {
         "These are all sensors of the sample, so the observer only predicted. If this persists, "
         "the observer is lost until its gate reopens: raise the covariances of prior or "
         "disturbance, or lower the gate's reopen."
+    ),
+    Status.UNCONVERGED: (
+        "With max_qps=None, the sequence of QPs ended before it converged: at 100 QPs, or where "
+        "several in a row were not solved to the solver's tolerance. Use another backend, such as "
+        "'auto'; or in place of a loss with a kink, as Power(1), a Huber loss."
     ),
 }
 
@@ -182,7 +188,7 @@ class Estimate:
         Outcome and events.
     message : str
         What a failed model, observer or cost raised, and at which state; or the message of a failed
-        QP solver.
+        QP solver, or which backend did not solve the QPs.
     qps, corrections, nearest_points : int
         Numbers of QPs solved, of second-order corrections, and of QPs for a feasible trajectory
         near an infeasible candidate.

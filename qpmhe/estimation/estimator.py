@@ -27,7 +27,7 @@ from ..model.traces import warn_of
 from ..observers import Observer
 from ..observers.projection import NearestPoint
 from .conditions import ConditionReader, Conditions
-from .contracts import check_losses, check_observer
+from .contracts import check_correction, check_observer
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .hold import WindowHold
@@ -37,6 +37,7 @@ from .run import Run, RunSource
 from .sensitivity import Sensitivity
 from .settings import Settings
 from .snapshot import read, written
+from .step_length import step_error, warn_of_step
 from .time_index import paired_record
 
 Array = NDArray[np.float64]
@@ -75,9 +76,10 @@ class MovingHorizonEstimator:
         every QP. A solver made by ``qpmhe.solvers.create`` keeps its cap and tolerances. Several
         estimators of one thread may share it; it starts cold whenever the estimator changes.
     max_qps : int or None
-        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence, with at
-        most 100 QPs. If inequalities are dropped, at least one QP is solved without them, even
-        beyond the cap.
+        QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence; it
+        ends before, with `Status.UNCONVERGED`, at 100 QPs, and without a cap on iterations or time
+        at three in a row that the backend has not solved to its tolerance. If inequalities are
+        dropped, at least one QP is solved without them, even beyond the cap.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.
@@ -132,6 +134,15 @@ class MovingHorizonEstimator:
     InvalidInputError
         If an argument is invalid; the subclass says how (see `qpmhe.errors`).
 
+    Warns
+    -----
+    ModelWarning
+        If the step of a discretised ODE is too long: at the initial state, or at points within one
+        standard deviation of the prior and within X, one step differs from two of half the length
+        by more than 0.1 standard deviations of the disturbance, or of the prior where there is no
+        disturbance; with ``method="euler"``, a coarse map by choice, by more than 1. The input is
+        the usual one, zero but for ``parameters``. Samples are not compared.
+
     Examples
     --------
     >>> import numpy as np, qpmhe
@@ -179,7 +190,7 @@ class MovingHorizonEstimator:
         _require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
         _require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
         check_cost(system, cost)
-        check_losses(cost)
+        check_observer(system, observer)
         check_prior(observer, cost, warns=not is_copy and self.settings.max_qps != 0)
         # A copy: this estimator may change how f and h are called (batched, or one by one).
         self._own_system = system.copy(
@@ -197,6 +208,14 @@ class MovingHorizonEstimator:
         self._full_input = self._usual_input.copy()  # each sample's, overwritten
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._initial_state: Array = self._checked_start(initial_state, self._own_system)
+        if not is_copy:
+            check_correction(
+                self._own_system, observer, cost, self._initial_state, self._usual_input
+            )
+            error = step_error(
+                system, cost, observer.initial_covariance(), self._initial_state, self._usual_input
+            )
+            warn_of_step(error, system, 3)
         self._second: SecondDerivatives | None = None
         try:
             self._engine = engine_for(
@@ -749,7 +768,7 @@ class MovingHorizonEstimator:
     def __setstate__(self, saved: dict[str, Any]) -> None:
         # Construction checks everything again: a snapshot is input like any other.
         options = vars(saved["settings"]) | {"engine": saved["engine"]}
-        self.settings = saved["settings"]
+        self.settings = saved["settings"]  # what the first construction warned of is known
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
             *saved["arguments"], initial_state=saved["initial_state"], **options
         )
@@ -800,7 +819,6 @@ def check_start(
         state = _inside(system, observer, cost, state, name)
         system.check(state, np.zeros(system.m) if u is None else u)
         observer.check(system, state)
-        check_observer(observer, system, state, np.zeros(system.m) if u is None else u)
     except ModelError as error:
         if name == "initial_state":
             raise

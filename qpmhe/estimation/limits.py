@@ -29,6 +29,10 @@ CORRECTIONS = 2
 #: A second-order correction is lengthened by this share of itself, to end inside the set.
 BEYOND = 0.1
 
+#: A sequence without a cap ends at this many QPs in a row that the solver, at its own cap, has not
+#: solved to its tolerance: further ones cost as much, and approach no minimum.
+PATIENCE = 3
+
 #: Largest number of QPs for one feasible trajectory near an infeasible one. A whole step solves at
 #: most this many for each QP of its sequence, and this many more.
 NEAREST_POINTS = 5

@@ -32,6 +32,16 @@ from .subproblem import Subproblem
 Array = NDArray[np.float64]
 
 
+# Other reasons for the end of a sequence than its cap.
+_ENDS = (
+    Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED | Status.MODEL_FAILED
+    | Status.TIME_UP
+)
+
+# What no longer holds where another sequence begins.
+_OUTDATED = Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED
+
+
 class Outcome:
     """The result of the sequence of QPs, updated while it runs.
 
@@ -46,6 +56,8 @@ class Outcome:
         Why the sequence stopped, and what happened.
     followed : array or None
         The minimiser of a surrogate of the cost, from which the next step starts.
+    unsolved : int
+        Number of the last QPs that were not solved to the solver's tolerance.
     dropped, message, qps, corrections, nearest_points, solver_iterations, solve_time
         As in `Estimate`.
     """
@@ -55,6 +67,7 @@ class Outcome:
     events: Status = Status(0)
     message: str = ""
     qps: int = 0
+    unsolved: int = 0
     corrections: int = 0
     nearest_points: int = 0
     solver_iterations: int | None = 0
@@ -109,6 +122,8 @@ class Optimizer:
     ) -> None:
         self._subproblem, self._solver = subproblem, solver
         self._limit, self._tolerance = settings.qp_limit, settings.tolerance
+        self._uncapped, self._patience = settings.max_qps is None, settings.patience
+        self._backend = settings.backend_name
         self._warm_start = settings.warm_start
         self._may_drop = settings.infeasible == "drop_rows"
         # Most estimators have no soft rows and no nonlinear constraints.
@@ -152,6 +167,8 @@ class Optimizer:
             outcome.improved = outcome.trial is not candidate
         else:
             self._restore(problem, outcome, start, shifted)
+        if self._uncapped and outcome.qps >= self._limit and not outcome.events & _ENDS:
+            outcome.events |= Status.UNCONVERGED
         return outcome
 
     def _search_from_rolled_out(self, problem: Problem, outcome: Outcome) -> None:
@@ -162,7 +179,7 @@ class Optimizer:
         candidate, rolled_out = outcome.trial, problem.evaluate(problem.candidate.trajectory)
         if rolled_out.cost < math.inf and outcome.qps < self._limit:
             outcome.trial = rolled_out
-            outcome.events &= ~(Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED)
+            outcome.events &= ~_OUTDATED
             self._search(problem, outcome, None, self._limit - outcome.qps)
             if outcome.trial is rolled_out:
                 outcome.trial = candidate
@@ -193,7 +210,7 @@ class Optimizer:
         outcome.trial = candidate  # (c), if dropping rows is not allowed or does not help
         if not self._may_drop or outcome.time_is_up():
             return
-        outcome.events &= ~(Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED)
+        outcome.events &= ~_OUTDATED
         relaxed = problem.without_violated()  # (b)
         outcome.trial = relaxed.candidate
         self._search(relaxed, outcome, start, max(1, self._limit - outcome.qps))
@@ -226,6 +243,8 @@ class Optimizer:
             trial = problem.evaluate(problem.clipped(start.copy()))
             if trial.cost < _target(outcome.trial):
                 outcome.trial = trial
+        outcome.unsolved = 0
+        outcome.events &= ~Status.UNCONVERGED
         for _ in range(limit):
             if outcome.time_is_up():
                 break
@@ -271,6 +290,7 @@ class Optimizer:
             outcome.message = solution.message
             return False
         solved = solution.status is SolveStatus.SOLVED
+        outcome.unsolved = 0 if solved else outcome.unsolved + 1
         if not solved:
             outcome.events |= Status.SOLVER_STOPPED
         best = outcome.trial
@@ -287,6 +307,13 @@ class Optimizer:
             outcome.trial = trial
             if solved and best.cost - trial.cost <= negligible:
                 outcome.events |= Status.CONVERGED
+                return False
+            if self._patience and outcome.unsolved >= self._patience:
+                outcome.events |= Status.UNCONVERGED
+                outcome.message = (
+                    f"Backend {self._backend!r} did not solve the last {self._patience} QPs to "
+                    f"its tolerance{f': {solution.message}' if solution.message else ''}."
+                )
                 return False
             return True
         at_minimum = solved and predicted <= max(

@@ -9,6 +9,7 @@ from qpmhe_solvers import Solver, SolverOptions
 
 from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, OptionError
+from .limits import PATIENCE
 
 Infeasible = Literal["drop_rows", "keep_candidate"]
 Candidate = Literal["observer", "reinitialized"]
@@ -132,6 +133,17 @@ class Settings:
         """Whether these settings ask for a QP solver, which only the Python step uses."""
         is_own = isinstance(self.backend, str) and self.backend in ("auto", "banded")
         return self.isolated or not is_own
+
+    @property
+    def patience(self) -> int:
+        """QPs in a row that may stay unsolved; 0 for any number, where a cap asks for that."""
+        own_cap = self.max_solver_iterations is not None or self.time_budget is not None
+        return 0 if self.max_qps is not None or own_cap else PATIENCE
+
+    @property
+    def backend_name(self) -> str:
+        """The backend, as messages name it."""
+        return self.backend if isinstance(self.backend, str) else type(self.backend).__name__
 
     @property
     def qp_limit(self) -> int:

@@ -112,7 +112,7 @@ def _without_memory(held: System, errors: slice, options: SystemOptions) -> Syst
         f_jacobian=Trusted(zeroed(held.f_jacobian)) if exact[0] else None,
         h_jacobian=Trusted(output(held.h_jacobian)) if exact[1] else None, **options,
     )
-    made.dt, made.held = held.dt, held.held
+    made.dt, made.method, made.held = held.dt, held.method, held.held
     if held.make_timed is not None:
         made.make_timed = lambda: _without_memory(held.timed, errors, options)
     made.make_augmented = lambda change, others: _without_memory(

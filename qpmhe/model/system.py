@@ -222,6 +222,8 @@ class System:
         self.held: dict[int, float] = {}
         #: Sampling time of a discretised ODE; None for a discrete-time model.
         self.dt: float | None = None
+        #: How it is discretised; None for a discrete-time model.
+        self.method: str | None = None
         #: Evaluates f, h and their Jacobians in one call, where the model can.
         self.kernel: ModelKernel | None = None
         #: f and h as expressions, where they have such; None where ``symbolic`` was given.
@@ -295,7 +297,8 @@ class System:
         n, p, m : int
             Numbers of states, outputs and inputs; m is 0 for a system without inputs.
         method : {"rk4", "euler"}
-            Runge-Kutta of order 4, or one explicit Euler step.
+            Runge-Kutta of order 4, or one explicit Euler step. Where a step is too long for the
+            disturbance's size, the estimator warns; see `qpmhe.MovingHorizonEstimator`.
         rate_jacobian : callable, optional
             Derivative of the rate with respect to x, (n, n).
         h_jacobian, **options
@@ -328,7 +331,7 @@ class System:
             h_jacobian=h_jacobian, **others,
         )
         check_inputs(m, rate=batched.takes_input, h=system.h.takes_input)
-        system.dt, system.rate_jacobian = length, compared
+        system.dt, system.method, system.rate_jacobian = length, method, compared
         system.tracing = ModelTrace(
             batched, system.h, n, system.p, m, system.states, length, method
         )

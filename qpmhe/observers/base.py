@@ -128,6 +128,11 @@ class Observer(ABC):
         """
         return self._metric
 
+    @metric.setter
+    def metric(self, value: Array | None) -> None:
+        """Keep a metric of an observer of your own; the estimator checks it."""
+        self._metric = value
+
     def _check_metric(self, system: System) -> None:
         """Check the size of a metric that was given."""
         if self._metric is not None and self._metric.shape[0] != system.n:

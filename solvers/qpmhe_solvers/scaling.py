@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from .qp import QP, Places
 
+Mask = NDArray[np.bool_]
+
 # Scales kept at a time: for QPs of other sizes, and for projections between estimations.
 _KEPT = 4
 # A scale is held while the peaks of the scaled numbers stay between these. Steps have more room
@@ -19,9 +21,9 @@ _STEP_PEAKS = 2.0**-10, 2.0**3
 # Spread of the Hessian's diagonal over the stages at which the least known stage, rather than the
 # best, is what the accuracy is for; and below which share double precision has none.
 _SPREAD, _LEAST = 2.0**10, 2.0**-34
-# A limit so many scaled units away is none: a step has some units, and interior points lose their
-# way between such limits. Whoever takes the step checks it against the limits themselves.
-_FAR = 1e7
+# A limit that is farther away than this many units of the unknown, or of the step if that is
+# longer, is not handed to a solver: interior points lose their accuracy beside such limits.
+_FARTHEST = 2.0**24
 # Largest exponent: products of two factors do not overflow.
 _MOST = 500
 
@@ -44,7 +46,9 @@ class Scale:
     ``cost`` is the value of the objective, t squared over c.
     """
 
-    __slots__ = ("_factors", "_unknown", "cost", "duals", "key", "sizes", "step", "units")
+    __slots__ = (
+        "_factors", "_farthest", "_unknown", "cost", "duals", "key", "sizes", "step", "units",
+    )
 
     def __init__(
         self, exponents: NDArray[np.int64], odd: int, sizes: tuple[int, int, int], key: int
@@ -62,16 +66,26 @@ class Scale:
         factors.row_lower = factors.row_upper = R / t
         self._factors = factors.numbers
         self.cost = float(t * t / c)
+        # In units of S where the step is shorter: else the limits would go as a sequence converges.
+        self._farthest = _FARTHEST * max(1.0, 1.0 / float(t))
         self.units, self.duals = 1.0 / factors.all_lower, factors.all_lower * self.cost
         self.step = self.units[: stages * n].reshape(stages, n)
 
     def apply(self, qp: QP, scaled: QP) -> None:
         """Write the scaled numbers of a QP."""
         np.multiply(qp.numbers, self._factors, out=scaled.numbers)
-        lower, upper = scaled.all_lower, scaled.all_upper
-        lower[lower < -_FAR] = -np.inf
-        upper[upper > _FAR] = np.inf
         scaled.key = self.key
+
+    def drop_far(self, scaled: QP) -> Mask | None:
+        """Make far limits of a scaled QP infinite; a mask of them, None if none is far."""
+        most, none = self._farthest, np.inf
+        far: Mask = np.concatenate((scaled.all_lower < -most, scaled.all_upper > most))
+        far &= np.isfinite(scaled.limits)
+        if not far.any():
+            return None
+        lower, upper = np.split(far, 2)
+        scaled.all_lower[lower], scaled.all_upper[upper] = -none, none
+        return far
 
     def leave_out(self, peaks: list[float]) -> None:
         """Note the parts whose unit is not known, because all their numbers are zero."""

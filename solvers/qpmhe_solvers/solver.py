@@ -11,6 +11,7 @@ from itertools import count
 from typing import Any, ClassVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import InvalidInputError
 from .options import SolverOptions
@@ -153,6 +154,17 @@ class Solver(ABC):
             return Solution(None, SolveStatus.FAILED, message=fault)
         scale, scaled = self._scale(qp)
         usable = self._usable(start, qp, scale)
+        far = scale.drop_far(scaled)
+        solution = self._answer(qp, scale, scaled, usable)
+        if far is not None and solution.d is not None and _crosses(qp, solution.d, far):
+            scale.apply(qp, scaled)
+            first, solution = solution, self._answer(qp, scale, scaled, usable)
+            if first.iterations is not None and solution.iterations is not None:
+                solution.iterations += first.iterations
+        return solution
+
+    def _answer(self, qp: QP, scale: Scale, scaled: QP, usable: Array | None) -> Solution:
+        """Solve the scaled QP, and judge."""
         if self._builtin:
             return self._judged(scaled, scale, self._solve(scaled, usable))
         solution = self._judged(scaled, scale, self._solve_lent(scaled, usable))
@@ -330,6 +342,12 @@ def _as_solution(found: object, qp: QP) -> Solution:
         d, status, count, residuals, _as_multipliers(found.bound_duals, qp.size),
         _as_multipliers(found.row_duals, qp.stages * qp.rows), message,
     )
+
+
+def _crosses(qp: QP, d: Array, far: NDArray[np.bool_]) -> bool:
+    """Whether an iterate misses one of the far limits."""
+    value = np.concatenate((d, qp.rows_times(d)), axis=None)
+    return bool((np.append(qp.all_lower > value, qp.all_upper < value) & far).any())
 
 
 def _expect_qp(qp: object) -> None:

@@ -100,3 +100,20 @@ def test_rows_that_exclude_each_other(shape, name):
         assert status != SOLVED
         assert np.isfinite(d).all()
         assert iterations <= 60
+
+
+@shapes
+@pytest.mark.parametrize("far", [1e12, 1e20, 1e150])
+def test_a_far_side_is_none(shape, far):
+    """Sides that are far away change nothing, as deviations count."""
+    solver, rng = solver_of(shape), np.random.default_rng(8)
+    for tight in (1.0, 0.03, 0.001):
+        for qp in drawn(shape, 21, tight, 0.0) + drawn(shape, 22, tight, 0.0, 0.6):
+            places = rng.choice([-1, 0, 1], solver.layout.rows).astype(np.int8)
+            best = reference(qp)
+            for name, (matrix, low, high) in qp.sets.items():
+                sides = np.maximum(low, -far), np.minimum(high, far)
+                qp.sets[name] = matrix, *sides
+            for status, d, _ in (solver(qp), solver(qp, limit=100, places=places)):
+                assert status == SOLVED
+                assert objective(qp, d) == pytest.approx(best, rel=1e-7, abs=1e-7)

@@ -108,7 +108,8 @@ def main(description, run):
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    warnings.simplefilter("ignore", qpmhe.ObserverWarning)
+    for known in (qpmhe.ObserverWarning, qpmhe.ModelWarning):
+        warnings.simplefilter("ignore", known)
     counts, faults = run(arguments.steps, arguments.seed)
     for name, count in counts.most_common():
         print(f"{name:20}{count:>10,}")

@@ -19,7 +19,10 @@ from .fuzz_independent import fuzz, table
 from .independent import Held
 from .problems import WRITINGS
 
-pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning"),
+    pytest.mark.filterwarnings("ignore::qpmhe.ModelWarning"),  # random models have long steps
+]
 # Steps of each by default, and in the sample: whatever is compiled takes its time to be made.
 FEW = {"numpy": (120, 40), "casadi": (180, 90), "jax": (90, 45)}
 WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing in writings]

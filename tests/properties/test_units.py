@@ -13,7 +13,11 @@ from qpmhe import Status
 from .problems import Problem, Units
 
 STEPS = 14
-pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning"),
+    # Some of the random models have long steps, in which units do not matter either.
+    pytest.mark.filterwarnings("ignore::qpmhe.errors.ModelWarning"),
+]
 PLAIN = {
     "ode": 0.6, "irregular": 0.5, "inputs": 0.6, "parameters": 0.2, "states": 0.4,
     "disturbances": 0.3, "noises": 0.3, "rows": 0.5, "discount": 0.5, "loss": 0.5, "angles": 0.5,

@@ -231,6 +231,8 @@ typedef struct {
     int32_t metric_settled;    /* whether `metric` is for good */
     int32_t project;           /* keep the observer in X */
     int32_t max_qps;           /* QPs for each sample */
+    int32_t uncapped;          /* whether that only ends a sequence that does not converge */
+    int32_t patience;          /* QPs in a row that may stay unsolved; 0: any number */
     int32_t max_iterations;    /* interior-point iterations in each; 0: no inequalities */
     int32_t infeasible;        /* MHE_DROP_ROWS or MHE_KEEP_CANDIDATE */
     int32_t start_at_best;     /* start at the shifted previous estimate where it is better */

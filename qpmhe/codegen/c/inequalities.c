@@ -15,6 +15,7 @@ enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 #define STALL 4
 #define SHARE (real)0.8
 #define SMALL (real)1e-3
+#define FARTHEST (sizeof(real) == 8 ? (real)1e7 : (real)1e3)
 
 /* Guesses of the active rows, and rounds of the augmented Lagrangian for each; each round makes
  * the rows' gaps smaller by about this factor. */
@@ -399,7 +400,7 @@ static int mhe_first_guess(mhe_rows *q, int rows, int limit)
         q->force[i] = 0;
         q->place[i] = place < 0 ? AT_LOWER : place > 0 ? AT_UPPER : BETWEEN;
         if (q->low[i] == q->high[i]) q->place[i] = EQUATION;
-        else if (!isfinite(mhe_limit_of(q, i))) q->place[i] = BETWEEN;
+        else if (!(fabs(mhe_limit_of(q, i)) <= FARTHEST * q->deviation[i])) q->place[i] = BETWEEN;
         if (limit == 0) q->place[i] = BETWEEN;
         active += q->place[i] != BETWEEN;
     }
@@ -541,15 +542,18 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
 /* The sign of a row's value in the slack of one of its sides. */
 static real mhe_sign(int side) { return side ? -1 : 1; }
 
-/* Slacks and duals at the start, whose products are all the same; the number of sides. */
-static int mhe_start(mhe_rows *q, int rows, real missed, real product)
+/* Slacks and duals at the start, whose products are all the same; the number of sides. Far sides
+ * are none, as beside their slacks residuals are only rounding: those that are many deviations away,
+ * and many times farther than the minimiser without inequalities `reach`es, in scales. */
+static int mhe_start(mhe_rows *q, int rows, real missed, real reach, real product)
 {
     int sides = 0;
     for (int side = 0; side < 2; side++) {
         mhe_side *p = q->sides + side;
         for (int i = 0; i < rows; i++) {
             const real limit = side ? q->high[i] : -q->low[i];
-            const int there = isfinite(limit) && q->low[i] < q->high[i];
+            const real unit = mhe_max(reach * q->scale[i], q->deviation[i]);
+            const int there = q->low[i] < q->high[i] && limit <= FARTHEST * unit;
             p->there[i] = there ? 1 : 0;
             p->limit[i] = there ? limit : 0;
             p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
@@ -711,7 +715,9 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     real far = INFINITY, stiffer = 1;
     const real missed = mhe_row_violation(e, k, k->step);
     const real promise = fabs(mhe_product(size, k->gradient, k->step));
+    real reach = 0;
     if (!(missed > 0)) return SOLVED;
+    for (int i = 0; i < rows; i++) reach = mhe_max(fabs(q->value[i]) / q->scale[i], reach);
     memset(k->step, 0, sizeof(real) * (size_t)size);
     memset(q->force, 0, sizeof q->force);
 #if MHE_ROLLED
@@ -721,7 +727,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     const real outside = mhe_row_violation(e, k, k->step);
     const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */
-    const int sides = mhe_start(q, rows, missed, mhe_max(scale, EPSILON * EPSILON));
+    const int sides = mhe_start(q, rows, missed, reach, mhe_max(scale, EPSILON * EPSILON));
     if (!sides) return STOPPED;
     for (*iterations = 0;; ++*iterations) {
         real infeasible, length = 1, target = 0;

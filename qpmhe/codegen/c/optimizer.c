@@ -9,9 +9,14 @@ typedef struct {
     mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */
     int outside; /* the candidate misses rows: as a trial, it has no finite cost */
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
+    int unsolved;   /* the last QPs that were not solved to the tolerance */
     int followed;   /* the next step starts from a surrogate's minimiser */
     int factorised; /* the QP's matrix, with its active rows, is in the panels */
 } mhe_outcome;
+
+/* Other reasons for the end of a sequence than its cap, and what no longer holds in another one. */
+#define ENDS (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED | MHE_MODEL_FAILED | MHE_TIME_UP)
+#define OUTDATED (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED)
 
 /* Whether no time is left; it is an event then. */
 static int mhe_is_late(const mhe_workspace *k, mhe_outcome *o)
@@ -306,6 +311,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         o->events |= MHE_SOLVER_FAILED;
         return 0;
     }
+    o->unsolved = solved ? 0 : o->unsolved + 1;
     if (!solved) o->events |= MHE_SOLVER_STOPPED;
     const real before = mhe_best_cost(o), target = mhe_target(o);
     /* Where the cost is infinite, no decrease is negligible. */
@@ -315,8 +321,12 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
     if (o->spare->cost < target) {
         const real lowered = before - o->spare->cost;
         mhe_take(k, o);
-        if (!solved || !(lowered <= negligible)) return 1;
-        o->events |= MHE_CONVERGED;
+        if (solved && lowered <= negligible) {
+            o->events |= MHE_CONVERGED;
+            return 0;
+        }
+        if (!e->settings->patience || o->unsolved < e->settings->patience) return 1;
+        o->events |= MHE_UNCONVERGED;
         return 0;
     }
     real little = MHE_STALLED * negligible;
@@ -346,6 +356,8 @@ static void mhe_descend(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
         mhe_shift(e, k, o, before);
         if (o->spare->cost < mhe_target(o)) mhe_take(k, o);
     }
+    o->unsolved = 0;
+    o->events &= ~MHE_UNCONVERGED;
     while (limit-- > 0 && !mhe_is_late(k, o) && mhe_improve_once(e, k, o)) continue;
 }
 
@@ -445,7 +457,7 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     if (o->best != o->candidate) o->spare = o->best;
     o->best = o->candidate;
     if (e->settings->infeasible == MHE_KEEP_CANDIDATE || mhe_is_late(k, o)) return;
-    o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
+    o->events &= ~OUTDATED;
     const real *w = mhe_candidate_disturbances(e, k);
     mhe_violation(e, o->candidate, w, 0, k->left_out);
     o->candidate->violation = mhe_violation(e, o->candidate, w, k->left_out, 0);
@@ -516,7 +528,7 @@ static void mhe_search_from_rolled_out(mhe_estimator *e, mhe_workspace *k, mhe_o
     const real before = o->spare->cost;
     if (!isfinite(before) || left <= 0) return;
     mhe_take(k, o);
-    o->events &= ~(MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED);
+    o->events &= ~OUTDATED;
     mhe_search(e, k, o, -1, left);
     if (o->best->cost < before) return;
     o->spare = o->best;
@@ -570,5 +582,6 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
 #if CONSTRAINED
     memcpy(e->places, k->rows.place, sizeof e->places);
 #endif
+    if (s->uncapped && o->qps >= s->max_qps && !(o->events & ENDS)) o->events |= MHE_UNCONVERGED;
     o->events |= o->best != o->candidate ? MHE_IMPROVED : MHE_CANDIDATE;
 }

@@ -112,7 +112,8 @@ _NUMBERS: tuple[tuple[str, str, float | None], ...] = (
 )
 _ORDER = ("time median (µs)", "RMSE", "mean J")
 _WHY = {
-    "CONVERGED": "converged", "NO_DECREASE": "no decrease", "SOLVER_STOPPED": "solver stopped",
+    "CONVERGED": "converged", "UNCONVERGED": "not converged", "NO_DECREASE": "no decrease",
+    "SOLVER_STOPPED": "solver stopped",
     "SOLVER_FAILED": "solver failed", "MODEL_FAILED": "model failed", "TIME_UP": "time up",
     "ROWS_DROPPED": "rows dropped", "CANDIDATE_OUTSIDE": "candidate outside",
 }

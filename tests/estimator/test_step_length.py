@@ -1,0 +1,136 @@
+"""The estimator's check of the step by which an ODE is discretised."""
+
+import copy
+import warnings
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import qpmhe
+from qpmhe.estimation.step_length import step_error
+from qpmhe.models import catalogue
+
+
+def decay(rate):
+    """x1' = -rate (x1 - x2^2), x2' = -0.1 x2."""
+
+    def f(x):
+        return np.stack([-rate * (x[..., 0] - x[..., 1] ** 2), -0.1 * x[..., 1]], axis=-1)
+
+    return f
+
+
+def h(x):
+    return x[..., 1:]
+
+
+STIFF, MILD = decay(40.0), decay(1.0)
+
+
+def made(rate=STIFF, w=(1e-2, 1e-2), dt=0.1, method="rk4", **options):
+    system = qpmhe.System.from_ode(rate, h, dt=dt, n=2, p=1, method=method)
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=0.1**2 * np.eye(2), disturbance=np.diag(w) ** 2, noise=[[0.01]])
+    return system, qpmhe.Luenberger([0.0, 0.1]), cost, {
+        "horizon": 5, "initial_state": [0.5, 1.0], **options}
+
+
+def build(system, observer, cost, options):
+    return qpmhe.MovingHorizonEstimator(system, observer, cost, **options)
+
+
+def test_a_stiff_model_warns_once_with_number_and_remedy():
+    parts = made()
+    with pytest.warns(qpmhe.ModelWarning, match=r"dt = 0.1 is too long.* state 0 .*stiff") as seen:
+        mhe = build(*parts)
+    assert len(seen) == 1
+    assert seen[0].filename == __file__
+    # Whoever copies an estimator, or loads it, knows.
+    copy.deepcopy(mhe).update([1.0])
+    mhe.reset([0.4, 1.0])
+    mhe.update([1.0])
+
+
+def test_a_mild_model_does_not():
+    build(*made(MILD))
+    build(*made(w=(100.0, 1e-2)))  # nor one whose disturbance covers the error
+    build(*made(STIFF, dt=0.005))
+    discrete = qpmhe.System(lambda x: 0.9 * x, h, n=2, p=1)
+    assert step_error(discrete, made()[2], None, np.ones(2), np.zeros(0)) is None
+
+
+@pytest.mark.parametrize("rate", [STIFF, MILD])
+def test_the_number_is_the_error_of_the_step(rate):
+    """Against SciPy's Radau: two half steps are far nearer than one."""
+    system, _, cost, options = made(rate, dt=0.05)
+    found = step_error(system, cost, None, np.array(options["initial_state"]), np.zeros(0))
+    exact = solve_ivp(
+        lambda t, x: rate(x), (0.0, 0.05), found.point, "Radau", rtol=1e-12, atol=1e-14).y[:, -1]
+    missed = np.abs(system.f(found.point, np.zeros(0)) - exact) / 1e-2
+    assert found.component == np.argmax(missed)
+    assert found.deviations == pytest.approx(missed.max(), rel=0.15)
+
+
+def test_where_there_is_no_disturbance_the_prior_is_the_unit():
+    system, _, cost, options = made(dt=0.05)
+    start, none = np.array(options["initial_state"]), np.zeros(0)
+    usual = step_error(system, cost, None, start, none)
+    bound = qpmhe.Box([0.0, -np.inf], [0.0, np.inf])
+    fixed = qpmhe.System.from_ode(STIFF, h, dt=0.05, n=2, p=1, disturbances=bound)
+    # sd 1e-2 of w, sd 0.1 of the prior
+    assert step_error(fixed, cost, None, start, none).deviations == pytest.approx(
+        0.1 * usual.deviations)
+    of_second = qpmhe.System.from_ode(
+        STIFF, h, dt=0.05, n=2, p=1, disturbance_matrix=[[0.0], [1.0]])
+    lifted = qpmhe.QuadraticCost.from_covariances(
+        prior=0.1**2 * np.eye(2), disturbance=[[1e-4]], noise=[[0.01]])
+    assert step_error(of_second, lifted, None, start, none).deviations == pytest.approx(
+        0.1 * usual.deviations)
+
+
+def test_euler_is_a_coarse_map_by_choice():
+    build(*made(MILD, method="euler"))  # 0.2 deviations
+    with pytest.warns(qpmhe.ModelWarning, match=r"expected at most 1\)"):
+        build(*made(STIFF, method="euler", dt=0.03))
+
+
+def test_a_model_outside_of_its_domain_is_no_error():
+    def rate(x):
+        if np.any(x > 0.55):
+            raise ValueError("outside")
+        return -40.0 * x
+
+    system = qpmhe.System.from_ode(
+        rate, lambda x: x, dt=0.1, n=1, p=1, states=qpmhe.Box([0.0], [0.55]))
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=1.0, noise=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        step_error(system, cost, None, np.array([0.5]), np.zeros(0))
+
+
+@pytest.mark.parametrize("name", list(catalogue()))
+def test_no_model_of_the_zoo_warns(name):
+    system, observer, cost, scenario = catalogue()[name]()
+    qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=5, initial_state=scenario.initial_estimate)
+
+
+def test_the_step_loop_does_not_pay():
+    """The model is called as often in a step with and without a warning at construction."""
+    calls = []
+
+    def rate(x):
+        calls.append(1)
+        return MILD(x)
+
+    system, observer, cost, options = made(rate, max_qps=0)
+    mhe = build(system, observer, cost, options | {"engine": "python"})
+    mhe.update([1.0])
+    counts = []
+    for _ in range(3):
+        calls.clear()
+        mhe.update([1.0])
+        counts.append(len(calls))
+    assert len(set(counts)) == 1
+    assert counts[0] <= 8
