@@ -14,7 +14,7 @@ from ..observers import Luenberger, Observer
 from .deadline import DEFAULT_SECONDS, PART_SECONDS, Deadline
 from .enclosures import evaluated
 from .evidence import CertificateError, NotCertifiedError, at_most
-from .inequalities import Matrices, euclidean_constants, norm_bound
+from .inequalities import Matrices, congruence, euclidean_constants, norm_bound
 from .properties import Detectability, ObserverStability, sealed
 from .regions import Region, bounded_region
 from .sdp import NoiseSizes, started
@@ -81,11 +81,12 @@ def certify_detectability(
     found = search.answer("eta", eta, (), _undetectable)
     form = found.form
     notes = (*found.notes, *_left_out(search), _PAIR_STAYS)
+    P, W = _norms(search, form.P)
     return sealed(
         Detectability(
-            form.rate, *euclidean_constants(form.P, form.R, form.rate), form=search.kind,
+            form.rate, *euclidean_constants(form.P, form.R, form.rate, W), form=search.kind,
             region=search.region, notes=notes if form.injection is None else (*notes, _NOT_AFFINE),
-            P=embedded(form.P, search.free, system.n), V=form.R, cells=found.cells,
+            P=P, W=W, V=form.R, cells=found.cells,
         ),
         system, found.evidence,
     )
@@ -238,26 +239,28 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
     found = search.answer("rho", rho, others, _unstable)
     form = found.form
     assert form.gain is not None
-    gain = Matrices.exact(form.gain)
-    product = gain.T @ Matrices.exact(form.P) @ gain
-    # V is L^T P L, with what rounding may have made of it on the diagonal.
-    V = 0.5 * (product.middle + product.middle.T)
-    V += 2.0 * float(product.radius.sum()) * np.eye(V.shape[0])
+    V, (P, W) = congruence(form.P, form.gain), _norms(search, form.P)
     kappa = float(norm_bound(Matrices.exact(form.gain[None]))[0])
     system = search.system
     full = np.zeros((system.n, system.p))
     full[search.free] = form.gain
     return sealed(
         ObserverStability(
-            form.rate, *euclidean_constants(form.P, V, form.rate), kappa, gain=full,
+            form.rate, *euclidean_constants(form.P, V, form.rate, W), kappa, gain=full,
             region=search.region,
             notes=(*found.notes, *search.notes, *_left_out(search), _RUN_STAYS),
-            P=embedded(form.P, search.free, system.n), V=V,
+            P=P, W=W, V=V,
             Q=embedded(form.Q, search.acting, system.r) if form.Q.size else None,
-            R=form.R if form.R.size else None, cells=found.cells,
+            R=form.R if form.R.size else None, room=search.room, cells=found.cells,
         ),
         system, found.evidence,
     )
+
+
+def _norms(search: Search, P: Array) -> tuple[Array, Array | None]:
+    """P as a norm of all states, and the one of the disturbances; None where it is P."""
+    full, G = embedded(P, search.free, search.system.n), search.system.disturbance_matrix
+    return full, None if G is None else congruence(full, G)
 
 
 def _left_out(search: Search) -> tuple[str, ...]:

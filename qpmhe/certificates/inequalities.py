@@ -240,16 +240,38 @@ def norm_bound(matrices: Matrices) -> Array:
     return np.where(usable, found * (1.0 + 1e-15), np.inf)
 
 
-def euclidean_constants(P: Array, V: Array, rate: float) -> tuple[float, float, float]:
+def congruence(P: Array, matrix: Array) -> Array:
+    r"""A weight :math:`W \succeq M^\top P M`, larger by no more than rounding in any unit.
+
+    So that :math:`|M s|_P \le |s|_W` for all s.
+    """
+    factor = Matrices.exact(matrix)
+    product = factor.T @ Matrices.exact(P) @ factor
+    W: Array = 0.5 * (product.middle + product.middle.T)
+    # As 2 |s_i s_j| <= a s_i^2 + s_j^2 / a, with a of the components' own sizes.
+    size = np.sqrt(np.maximum(W.diagonal(), _TINY))
+    radius = np.maximum(product.radius, product.radius.T) * np.divide.outer(size, size)
+    return W + 2.0 * np.diag(radius.sum(axis=1))
+
+
+def euclidean_constants(
+    P: Array, V: Array, rate: float, W: Array | None = None
+) -> tuple[float, float, float]:
     r"""c_p, c_w and c_v of the sums in def:RGES and def:eIOSS, rounded up.
 
-    They follow from :math:`|e^+|_P \le \rho |e|_P + |w|_P + |v|_V` by induction.
+    They follow from :math:`|e^+|_P \le \rho |e|_P + |w|_W + |v|_V` by induction. W is P if left
+    out.
     """
     low, high = eigenvalue_bounds(P)
-    size = 2.0 * float(np.linalg.norm(V))
-    # Of V, the upper bound alone is needed; shifted, it has the lower one that is verified.
-    output = eigenvalue_bounds(V + size * np.eye(len(V)))[1] - size if size > 0.0 else 0.0
-    output = max(output, 0.0) + 1e-15 * size
     up = 1.0 + 8.0 * _UNIT
     c_p = math.sqrt(high / low) * up
-    return c_p, c_p / rate * up, max(math.sqrt(output / low) / rate * up, 1e-300)
+    entry = c_p if W is None else math.sqrt(_most(W) / low) * up
+    return c_p, entry / rate * up, max(math.sqrt(_most(V) / low) / rate * up, 1e-300)
+
+
+def _most(weight: Array) -> float:
+    """An upper bound on the largest eigenvalue of a weight, which may be singular."""
+    size = 2.0 * float(np.linalg.norm(weight))
+    # Shifted, the weight has the lower bound that is verified beside the upper one.
+    top = eigenvalue_bounds(weight + size * np.eye(len(weight)))[1] - size if size > 0.0 else 0.0
+    return max(top, 0.0) + 1e-15 * size

@@ -25,6 +25,7 @@ from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import Evidence, MismatchError, json_ready
 from .inequalities import Form
 from .invariance import supports
+from .model_values import ModelValues
 from .observer_bound import initial_length, largest_ratio
 from .regions import Region, bounded_region
 from .sdp import started
@@ -69,6 +70,8 @@ class Design:
         The evidence for the inequality.
     notes : tuple of str
         Further remarks.
+    model : ModelValues or None
+        Values of f and h when it was made, of which `along` refuses others.
     """
 
     system: System
@@ -79,6 +82,7 @@ class Design:
     horizon: int
     evidence: Evidence
     notes: tuple[str, ...] = ()
+    model: ModelValues | None = None
 
     @property
     def prior(self) -> Array:
@@ -160,7 +164,8 @@ class Design:
         Raises
         ------
         MismatchError
-            If the estimator has another system, cost, candidate or arrival than the bound.
+            If the estimator has another system, cost, candidate or arrival than the bound, or the
+            system has changed since.
         ShapeError, OptionError, SetError
             If an argument does not fit.
         """
@@ -226,6 +231,12 @@ class Design:
         ):
             if differs:
                 raise MismatchError(f"the estimator {text}.")
+        changed = "" if self.model is None else self.model.difference(source.system)
+        if changed:
+            raise MismatchError(
+                f"the estimator's system is another than was certified: {changed}; make a design "
+                "for the system as it is now."
+            )
 
     def code(self) -> str:
         """Python code that makes the cost, with the horizon and candidate that belong to it."""
@@ -320,7 +331,7 @@ def design(
     proposed = _least(gamma, (_ROOM**2 - 1.0) / (4.0 * _ROOM**2 - 1.0))
     return Design(
         system, place, form, gamma, known, horizon or proposed, found.evidence,
-        found.notes,
+        found.notes, ModelValues.of(system, place),
     )
 
 

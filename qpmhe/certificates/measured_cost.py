@@ -29,17 +29,18 @@ class MeasuredCost:
         self, detectability: Detectability, cost: Cost, bound: ObserverBound, sizes: Sizes,
         least_prior: Array,
     ) -> None:
-        P, V = detectability.P, detectability.V
+        P, W, V = detectability.P, detectability.entry, detectability.V
         assert P is not None
+        assert W is not None
         assert V is not None
         self._eta = detectability.eta
         self._start, self._noise, self._disturbance = (
             largest_ratio(mine, theirs) ** 2
-            for mine, theirs in ((P, least_prior), (V, cost.noise), (P, cost.disturbance))
+            for mine, theirs in ((P, least_prior), (V, cost.noise), (W, cost.disturbance))
         )
         self._entry = largest_ratio(P, bound.metric)
         self._length = largest_ratio(np.eye(len(P)), P)
-        self._w = float(lengths_of("disturbance", sizes.disturbance, P))
+        self._w = float(lengths_of("disturbance", sizes.disturbance, W))
         self._v = float(lengths_of("noise", sizes.noise, V))
 
     @staticmethod

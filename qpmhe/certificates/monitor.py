@@ -63,8 +63,10 @@ class Reading:
 class Monitor:
     """Follows an estimator from sample to sample, with what is proved about it.
 
-    It takes one evaluation of f and two of h a sample; for a `Certificate` with the theorem's
-    constants, which need more, two for each sample of the window.
+    It takes two evaluations of f and three of h a sample; for a `Certificate` with the theorem's
+    constants, which need more, two for each sample of the window. One of each is at a point of the
+    region, in turn, where the model must have the value that was certified: any other one at these
+    eight points ends the bound within eight samples.
 
     Parameters
     ----------
@@ -82,7 +84,8 @@ class Monitor:
     ShapeError, OptionError, SetError, InvalidInputError
         If an argument does not fit, or there is no bound of the observer.
     MismatchError
-        If the certificate is for another system or gain than the estimator's.
+        If the certificate is for another system or gain than the estimator's, or the system has
+        changed since.
 
     Attributes
     ----------
@@ -133,6 +136,13 @@ class Monitor:
             raise MismatchError(
                 "the bound is for another System object than the estimator's; certify the same "
                 "objects that the estimator uses."
+            )
+        self._model = bound.stability.model
+        changed = "" if self._model is None else self._model.difference(self._system)
+        if changed:
+            raise MismatchError(
+                f"the estimator's system is another than was certified: {changed}; certify the "
+                "system as it is now."
             )
         self.bound = bound.of_observer(estimator.observer, self._system)
         self.sizes = bound.sizes if sizes is None else sizes
@@ -256,6 +266,11 @@ class Monitor:
                     "the observer's step was not f(z) + L v: it had another length (dt), other "
                     "parameters or another gain"
                 )
+        if self._model is not None:
+            turn = self.steps % len(self._model.points)
+            changed = self._model.difference(system, (turn,))
+            if changed:
+                return f"the system is another than was certified: {changed}"
         self._radius = bound.advanced(self._radius, self._entering)
         return CONTRADICTION if bound.is_empty(self._radius, z) else ""
 

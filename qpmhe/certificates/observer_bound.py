@@ -3,9 +3,10 @@ r"""The proved bound on the observer's error, and the set around it that contain
 Where the observer is shown to contract on a region (`Form`), any two x, z of it have
 
 .. math::
-    |e^+|_P \le \rho |e|_P + |w|_P + |v|_V \quad \text{and} \quad
+    |e^+|_P \le \rho |e|_P + |w|_W + |v|_V \quad \text{and} \quad
     |e^+|_P^2 \le \rho^2 |e|_P^2 + |w|_Q^2 + |v|_R^2, \qquad e = x - z,
 
+with W = P or, of a system with a ``disturbance_matrix`` G, :math:`W = G^\top P G`,
 so that the same recursions of b bound :math:`|x(t) - z(t)|_P` from a bound of the initial error
 on, and x(t) is in :math:`\{\xi : |\xi - z(t)|_P \le b(t)\}`.
 Every estimate is at most as far from x(t) as from the farthest point of this set. No cost, horizon
@@ -33,19 +34,28 @@ from ..model.system import System
 from ..observers import Observer
 from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
+from .enclosures import evaluated
 from .evidence import Evidence, MismatchError, at_most, json_ready
 from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region
+from .model_values import SAME_MODEL
 from .properties import ObserverStability
 from .regions import Region, bounded_region
-from .sizes import OUTWARD, UNIT, Size, Sizes, intervals, lengths_of, weighted_lengths
+from .sizes import (
+    OUTWARD,
+    UNIT,
+    Size,
+    Sizes,
+    extent_of,
+    intervals,
+    lengths_of,
+    weighted_lengths,
+)
 
 # How close to its limit the bound is when it is called settled, and in how many samples at most.
 _SETTLED, _MOST_SAMPLES = 0.1, 10**6
 # How much of the time is for the contraction, and of the rest for the region itself.
 _CONTRACTION, _INVARIANCE = 0.8, 0.6
-# Values of two models that differ by this share of the largest along a run are rounding.
-_SAME_MODEL = 1e-9
 _SLACKS = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 
 #: Of an estimator whose observer does not run on.
@@ -204,19 +214,22 @@ class ObserverBound:
 
     def entering(self, disturbances: Size | None = None, noises: Size | None = None) -> Array:
         """What w and v add to the bound, always (2,) or at each sample (T, 2): see `advanced`."""
-        P, V, Q, R = self.metric, self.stability.V, self.stability.Q, self.stability.R
+        W, V, Q, R = self.stability.entry, self.stability.V, self.stability.Q, self.stability.R
+        assert W is not None
         assert V is not None
         w = self.sizes.disturbance if disturbances is None else disturbances
         v = self.sizes.noise if noises is None else noises
-        first, second = lengths_of("disturbances", w, P), lengths_of("noises", v, V)
+        first, second = lengths_of("disturbances", w, W), lengths_of("noises", v, V)
         if first.ndim and second.ndim and len(first) != len(second):
             raise ShapeError(
                 f"disturbances has {len(first)} samples, and noises {len(second)}; expected the "
                 "same."
             )
+        if self.stability.room is not None:
+            _check_wrapping(extent_of("noises", v, len(V)), self.stability.room)
         length = np.asarray(first + second)
         root = np.full(length.shape, np.inf)
-        if Q is not None and R is not None and len(Q) == len(P):
+        if Q is not None and R is not None:
             root = np.hypot(lengths_of("disturbances", w, Q), lengths_of("noises", v, R))
         return np.stack((length, root), axis=-1) * OUTWARD
 
@@ -237,7 +250,7 @@ class ObserverBound:
         return found
 
     def advanced(self, radius: float, entering: ArrayLike) -> float:
-        """b(t+1) from b(t), rounded up: rho b + |w|_P + |v|_V or the root of squares, if less."""
+        """b(t+1) from b(t), rounded up: rho b + |w|_W + |v|_V or the root of squares, if less."""
         length, root = map(float, np.asarray(entering))
         reached = self.rate * radius
         return min(reached + length, math.hypot(reached, root)) * OUTWARD
@@ -301,7 +314,7 @@ class ObserverBound:
         run : Run
             Of an estimator with this observer, with the usual steps and inputs in the region.
         disturbances, noises : optional
-            w(t) and v(t) as (T, n) and (T, p), or bounds for all times: a number for the length or
+            w(t) and v(t) as (T, r) and (T, p), or bounds for all times: a number for the length or
             a set, such as ``qpmhe.Box``. Left out, `sizes`.
         initial_error : float, (n,) array_like or set
             x - z at the run's first sample, a bound on its length, or a set that holds it.
@@ -311,8 +324,9 @@ class ObserverBound:
         ShapeError, OptionError, SetError, InvalidInputError
             If an argument does not fit.
         MismatchError
-            If the run's estimator is known, and had another gain, or a model with other values of f
-            or h at the run's states.
+            If the run's estimator is known, and has another gain, or a model with other values of f
+            or h: at points of the region, from those that were certified, or at the run's states,
+            from those of the certified system.
         """
         if not isinstance(run, Run):
             raise InvalidInputError(
@@ -324,8 +338,7 @@ class ObserverBound:
         if source is not None:
             own = self.of_observer(source.observer, source.system)
             inputs, steps, usual = source.inputs, source.steps, source.system.dt
-            if self.stability.system is not None:
-                _check_model(self.stability.system, source.system, z[:-1], inputs)
+            _check_model(self.stability, self.region, source.system, z[:-1], inputs)
         radius = self.radii(len(run), initial_error, disturbances, noises)
         lost, reason = own.first_event(run.flags, z[:-1], inputs, steps, usual)
         empty = self.is_empty(radius[1:], z[1:])
@@ -436,7 +449,7 @@ def bound_observer(
     place, given = bounded_region(system, region, inputs), Sizes.of(sizes, system, cost)
     deadline = Deadline.of(seconds)
     stability = certify_observer(
-        system, observer, place, sizes=given.typical(system), seconds=deadline.part(_CONTRACTION)
+        system, observer, place, sizes=given.typical, seconds=deadline.part(_CONTRACTION)
     )
     return with_invariance(
         ObserverBound(stability, place, given, observer.metric), system, deadline
@@ -447,8 +460,6 @@ def with_invariance(
     bound: ObserverBound, system: System, seconds: float | Deadline
 ) -> ObserverBound:
     """The bound, with the findings on whether state and observer stay in the region."""
-    if system.disturbance_matrix is not None:
-        return bound
     deadline, size, inner = Deadline.of(seconds), bound.sizes.extent[0], None
     found = certify_invariance(
         system, bound.region, disturbance=size, seconds=deadline.part(_INVARIANCE)
@@ -486,29 +497,50 @@ def largest_ratio(metric: Array, other: Array) -> float:
     return math.inf
 
 
-def _check_model(certified: System, used: System, states: Array, inputs: Array | None) -> None:
-    """Refuse a run of another model than the certified one, judged at the run's own states."""
-    if used is certified:
-        return
-    sizes = [(one.n, one.p, one.m) for one in (certified, used)]
-    if sizes[0] != sizes[1]:
-        raise MismatchError(
-            f"the run's system has (n, p, m) = {sizes[1]}, the certified one {sizes[0]}; certify "
-            "the system of the run."
+def _check_wrapping(largest: Array, room: Array) -> None:
+    """Refuse noises of angles with which an innovation may wrap."""
+    if not (largest < room).all():
+        j = int(np.argmax(largest - room))
+        raise OptionError(
+            f"the noise of the angle y[{j}] is up to {largest[j]:.6g}; expected less than "
+            f"{room[j]:.6g}, so that no innovation wraps in the region. Certify a smaller region "
+            "for a larger noise."
         )
-    u = np.empty((len(states), used.m)) if inputs is None else inputs
+
+
+def _check_model(
+    stability: ObserverStability, region: Region, used: System, states: Array, inputs: Array | None
+) -> None:
+    """Refuse a run of another model: by certified values, and at the run's states by the system."""
+    certified = stability.system
+    for who, system in (("the system", certified), ("the run's system", used)):
+        changed = ""
+        if stability.model is not None and system is not None:
+            changed = stability.model.difference(system)
+        if changed:
+            raise MismatchError(
+                f"{who} is another than was certified: {changed}; certify the system of the run."
+            )
+    points = np.hstack((states, np.zeros((len(states), 0)) if inputs is None else inputs))
+    low, high, n = region.lower[region.n :], region.upper[region.n :], region.n
+    # Elsewhere the bound ends, and the model need not be defined.
+    usual = ((low <= points[:, n:]) & (points[:, n:] <= high)).all(axis=1)
+    times = np.flatnonzero(region.contains(states) & usual)
+    if certified is None or not times.size:
+        return
+    points = points[times]
     for name in ("f", "h"):
-        with np.errstate(all="ignore"):
-            mine, other = (getattr(one, name).batch(states, u) for one in (certified, used))
+        mine, other = (
+            evaluated(name, getattr(one, name), points, n) for one in (certified, used)
+        )
         # Of each component's own unit.
         size = np.abs(mine).max(axis=0)
         if name == "f":
-            size = np.maximum(size, np.abs(states).max(axis=0))
-        # Written so that a value that is not finite counts as another model.
-        same = (np.abs(mine - other) <= _SAME_MODEL * size).all(axis=1)
+            size = np.maximum(size, np.abs(points[:, :n]).max(axis=0))
+        same = (np.abs(mine - other) <= SAME_MODEL * size).all(axis=1)
         if not same.all():
-            t = int(same.argmin())
+            k = int(same.argmin())
             raise MismatchError(
-                f"{name} of the run's system is {other[t].tolist()} at sample {t}, and that of the "
-                f"certified one {mine[t].tolist()}; certify the system of the run."
+                f"{name} of the run's system is {other[k].tolist()} at sample {times[k]}, and that "
+                f"of the certified one {mine[k].tolist()}; certify the system of the run."
             )

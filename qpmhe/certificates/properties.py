@@ -11,6 +11,7 @@ from .._checks import Array, positive
 from ..model.sets import ConvexSet
 from ..model.system import System
 from .evidence import Evidence, MismatchError, json_ready
+from .model_values import ModelValues
 from .regions import Region, beyond, stated_region
 from .theorem import DecayingSums, checked_rate
 
@@ -22,18 +23,25 @@ class _Certified:
     region: Region | None = None
     notes: tuple[str, ...] = ()
     P: Array | None = None
+    W: Array | None = None
     V: Array | None = None
     cells: int = 0
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
     system: System | None = field(default=None, init=False, repr=False)
+    model: ModelValues | None = field(default=None, init=False, repr=False)
+
+    @property
+    def entry(self) -> Array | None:
+        """The norm of disturbances: W, or P where they are of the states."""
+        return self.P if self.W is None else self.W
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the system, whose functions often cannot be pickled."""
         return vars(self) | {"system": None}
 
     def to_dict(self) -> dict[str, Any]:
-        """All but the region, in types that JSON knows; infinite numbers become None."""
-        left_out = ("region", "system")
+        """All but region and model, in types that JSON knows; infinite numbers become None."""
+        left_out = ("region", "system", "model")
         content: dict[str, Any] = json_ready(
             {name: value for name, value in vars(self).items() if name not in left_out}
         )
@@ -52,7 +60,7 @@ class Detectability(_Certified):
         + c_v \sum_{\tau=1}^t \eta^\tau |\delta h(t-\tau)|
 
     with :math:`\delta w = w_1 - w_2` and :math:`\delta h = h(x_1) - h(x_2)`. Where P is
-    given, this follows from :math:`|x_1^+ - x_2^+|_P \le \eta |x_1 - x_2|_P + |\delta w|_P +
+    given, this follows from :math:`|x_1^+ - x_2^+|_P \le \eta |x_1 - x_2|_P + |\delta w|_W +
     |\delta h|_V`, in norms :math:`|s|_M = \sqrt{s^\top M s}`.
 
     Parameters
@@ -67,14 +75,17 @@ class Detectability(_Certified):
         The set in which both trajectories must stay; None for constants assumed everywhere.
     notes : tuple of str
         Further remarks.
-    P, V : (n, n) and (p, p) array or None
-        Norms of the differences of states and of disturbances, and of outputs.
+    P, W, V : (n, n), (r, r) and (p, p) array or None
+        Norms of the differences of states, of disturbances, and of outputs. W is None where it is
+        P, and :math:`G^\top P G` with the system's ``disturbance_matrix`` G.
     form : str
         Which inequality was shown: ``output weight``, ``output injection``, or ``assumed``.
     cells : int
         Number of pieces of the region on which the inequality was verified; 0 if none.
     system : System or None
         The certified system; None for constants made or changed by hand, or copied.
+    model : ModelValues or None
+        Values of f and h when it was certified; None for constants made or changed by hand.
     """
 
     eta: float
@@ -108,7 +119,7 @@ class ObserverStability(_Certified):
         |x(t) - z(t)| \le C_p |x_0 - z_0| \rho^t
         + C_w \sum_{\tau=1}^t \rho^\tau |w(t-\tau)| + C_v \sum_{\tau=1}^t \rho^\tau |v(t-\tau)|
 
-    Where P is given, this follows from :math:`|x^+ - z^+|_P \le \rho |x - z|_P + |w|_P + |v|_V`,
+    Where P is given, this follows from :math:`|x^+ - z^+|_P \le \rho |x - z|_P + |w|_W + |v|_V`,
     and where Q and R are given, :math:`|x^+ - z^+|_P^2 \le \rho^2 |x - z|_P^2 + |w|_Q^2 +
     |v|_R^2` holds as well, whose limit is in general smaller.
 
@@ -122,11 +133,14 @@ class ObserverStability(_Certified):
         The constant of (eq:kappa), in units of the state per unit of the output.
     gain : (n, p) array or None
         L, the observer's constant gain.
-    P, V : (n, n) and (p, p) array or None
-        Norms of error and disturbance, and of noise: V is L^T P L.
+    P, W, V : (n, n), (r, r) and (p, p) array or None
+        Norms of error, disturbance and noise: V is L^T P L; W is as for `Detectability`.
     Q, R : (r, r) and (p, p) array or None
         Weights of disturbance and noise in the sum of squares.
-    evidence, region, notes, cells, system
+    room : (p,) array or None
+        Below what each noise must be for angles among the outputs, so that no innovation wraps;
+        infinite for other outputs, None without angles.
+    evidence, region, notes, cells, system, model
         As for `Detectability`.
     """
 
@@ -138,6 +152,7 @@ class ObserverStability(_Certified):
     gain: Array | None = field(default=None, kw_only=True)
     Q: Array | None = field(default=None, kw_only=True)
     R: Array | None = field(default=None, kw_only=True)
+    room: Array | None = field(default=None, kw_only=True)
 
     @classmethod
     def assumed(
@@ -164,12 +179,13 @@ Result = TypeVar("Result", "Detectability", "ObserverStability")
 
 
 def sealed(result: Result, system: System, evidence: Evidence) -> Result:
-    """The result itself, with its system and its evidence; its arrays are fixed."""
+    """The result itself, with its system, its values and evidence; its arrays are fixed."""
     for name, value in vars(result).items():
         if isinstance(value, np.ndarray):
             vars(result)[name] = value = value.copy()
             value.setflags(write=False)
-    vars(result).update(system=system, evidence=evidence)
+    model = None if result.region is None else ModelValues.of(system, result.region)
+    vars(result).update(system=system, model=model, evidence=evidence)
     return result
 
 
@@ -193,5 +209,11 @@ def fitting(part: Result, system: System, region: Region, gain: Array | None) ->
         raise MismatchError(
             f"the {what} that was passed is for another System object. Certify this system, or "
             f"state the constants: {type(part).__name__}.assumed(...)."
+        )
+    changed = "" if part.model is None else part.model.difference(system)
+    if changed:
+        raise MismatchError(
+            f"the system has changed since the {what} that was passed was certified: {changed}. "
+            "Certify the system as it is now."
         )
     return part

@@ -85,7 +85,7 @@ def _proved_observer(
 
     try:
         own = certify_observer(
-            system, observer, region, sizes=sizes.typical(system), seconds=deadline.part(0.5)
+            system, observer, region, sizes=sizes.typical, seconds=deadline.part(0.5)
         )
         limit, says = limits(own)
         if says:
@@ -94,7 +94,7 @@ def _proved_observer(
     except (NotCertifiedError, CertificateError) as error:
         why = str(error.args[0]).split(". ")[0].split(" What may help")[0]
     try:
-        made = synthesise_gain(system, region, sizes=sizes.typical(system), seconds=deadline)
+        made = synthesise_gain(system, region, sizes=sizes.typical, seconds=deadline)
     except (NotCertifiedError, CertificateError) as error:
         return observer, own, "", str(error)
     if own is not None and not limits(made.stability)[1]:

@@ -109,13 +109,14 @@ class Search:
         )
         self._program: Program | None = None
         self._answers: list[Answer] = []
-        self.notes = self._angles()
+        self.notes: tuple[str, ...] = ()
+        self.room = self._angles()
 
-    def _angles(self) -> tuple[str, ...]:
-        """How large noises of angles may be, so that innovations in the region do not wrap."""
+    def _angles(self) -> Array | None:
+        """Below what noises must be so that no innovation in the region wraps; None: any may be."""
         angles = self.system.output_residual
         if not isinstance(angles, Angles):
-            return ()
+            return None
         if self.model.reason:
             raise CertificateError(
                 "the outputs' angles have no enclosure, so that it is not known where they wrap"
@@ -132,10 +133,13 @@ class Search:
                 f"in the region, and by the noise, {largest[k]:.3g}, and half a period is "
                 f"{half[k]:.3g}", ("a smaller region",),
             )
-        return tuple(
+        self.notes = tuple(
             f"the noise of the angle y[{j}] is less than {each:.4g}: then no innovation wraps"
             for j, each in zip(angles.components, np.floor(room * 1e4) / 1e4, strict=True)
         )
+        found = np.full(self.p, np.inf)
+        found[angles.components] = room
+        return found
 
     def _leave_out(self) -> None:
         """Leave the states out that the region fixes; an error if f or the gain moves them."""

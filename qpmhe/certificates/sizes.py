@@ -28,8 +28,6 @@ UNIT = float(np.finfo(np.float64).eps)
 #: More than the rounding of a sum, a product and a root, each.
 OUTWARD = 1.0 + 16.0 * UNIT
 _SIGMAS = 3.0
-# Of the larger size, what the other one counts at least where a matrix is sought.
-_LEAST = 1e-3
 # Boxes with more corners are bounded by sums over their sides.
 _MOST_CORNERS = 4096
 
@@ -42,7 +40,8 @@ class Sizes:
     ----------
     disturbance, noise : float or ConvexSet
         The largest |w| and |v|, or sets that hold w and v, such as ``qpmhe.Box``; of another set,
-        the box around it is used. An error names one that is negative or not bounded.
+        the box around it is used. An error names one that is negative or not bounded. With a
+        ``disturbance_matrix`` G, w (r,) is what G multiplies.
     source : str
         The origin of these sizes, for reports.
     """
@@ -66,19 +65,17 @@ class Sizes:
         """The system's W and V, and three standard deviations where these are not bounded."""
         found: list[ConvexSet] = []
         sources: list[str] = []
-        spread = system.state_covariance(w_covariance)
         for letter, stated, covariance in (
-            ("W", system.disturbances, spread), ("V", system.noises, v_covariance),
+            ("W", system.disturbances, w_covariance), ("V", system.noises, v_covariance),
         ):
-            of_states = letter == "V" or system.disturbance_matrix is None
-            if stated is not None and of_states and np.isfinite(bounds(stated)).all():
+            if stated is not None and np.isfinite(bounds(stated)).all():
                 found.append(stated)
                 sources.append(f"the system's {letter}")
             else:
                 half = _SIGMAS * np.sqrt(np.diag(covariance))
                 found.append(Box(-half, half))
                 sources.append(f"three standard deviations of {origin}")
-        return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))
+        return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))._checked(system)
 
     @classmethod
     def of(cls, sizes: Any, system: System, cost: Cost | None = None) -> Sizes:
@@ -89,7 +86,7 @@ class Sizes:
                     f"sizes is {shown(sizes)}; expected Sizes(disturbance=..., noise=...), the "
                     "largest lengths or boxes."
                 )
-            return sizes
+            return sizes._checked(system)
         if cost is None:
             if system.disturbances is None or system.noises is None:
                 raise SetError(
@@ -102,6 +99,18 @@ class Sizes:
         if factor is not None:
             covariance = factor @ covariance @ factor.T
         return cls.usual(system, covariance, inverse(cost.noise), "the cost's inverse weights")
+
+    def _checked(self, system: System) -> Sizes:
+        """The same, if the sets have the dimensions of a system's w and v."""
+        w = "w" if system.disturbance_matrix is None else "w, which its disturbance_matrix takes,"
+        for name, letter, size in (("disturbance", w, system.r), ("noise", "v", system.p)):
+            given = getattr(self, name)
+            if isinstance(given, ConvexSet) and given.dimension != size:
+                raise ShapeError(
+                    f"{name} ({self.source}) is a set of dimension {given.dimension}; expected "
+                    f"{size}, as the system's {letter} has."
+                )
+        return self
 
     @property
     def extent(self) -> tuple[float | Array, float | Array]:
@@ -119,19 +128,14 @@ class Sizes:
         w, v = (float(np.linalg.norm(each)) * OUTWARD for each in self.extent)
         return w, v
 
-    def typical(self, system: System) -> tuple[float | Array, float | Array]:
-        """Sizes of w and v to choose a certificate for: of each component, or lengths.
+    @property
+    def typical(self) -> tuple[float | Array, float | Array]:
+        """Sizes of w and v to choose a certificate for: `extent`, or 1 of each if all are zero.
 
-        Where there is nothing of one kind, a thousandth of the other keeps the choice bounded.
+        Beside others, a search takes no size as smaller than it can tell, in the units of states
+        and outputs.
         """
-        lengths = self.largest if max(self.largest) > 0.0 else (1.0, 1.0)
-        least = _LEAST * max(lengths)
-        w, v = (
-            np.maximum(each, least) if np.ndim(each) and np.size(each) == size
-            else max(length, least)
-            for each, length, size in zip(self.extent, lengths, (system.r, system.p), strict=True)
-        )
-        return w, v
+        return self.extent if max(self.largest) > 0.0 else (1.0, 1.0)
 
     def __str__(self) -> str:
         return f"{_words('w', self.disturbance)}, {_words('v', self.noise)} ({self.source})"
@@ -173,6 +177,17 @@ def lengths_of(name: str, given: Size, weight: Array) -> Array:
             f"vector ({n},) or vectors (T, {n})."
         )
     return weighted_lengths(values, weight)
+
+
+def extent_of(name: str, given: Size, n: int) -> Array:
+    """The largest size of each component, (n,), of what `lengths_of` takes."""
+    if isinstance(given, ConvexSet):
+        return np.asarray(np.abs(sides_of(name, given)).max(axis=0))
+    values = np.abs(numbers(name, given))
+    if values.ndim == 0:
+        return np.full(n, values)
+    found: Array = values.reshape(-1, n).max(axis=0, initial=0.0)
+    return found
 
 
 def weighted_lengths(vectors: Array, weight: Array) -> Array:

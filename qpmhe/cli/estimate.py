@@ -76,7 +76,7 @@ def estimate(
     ] = None,
     max_disturbance: Annotated[
         str | None,
-        typer.Option(help="For --bound: largest |w|, one length or a number for each state; "
+        typer.Option(help="For --bound: largest |w|, one length or a number for each component; "
                           "default is W, else three standard deviations."),
     ] = None,
     max_noise: Annotated[

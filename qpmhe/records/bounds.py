@@ -69,7 +69,7 @@ class RowBounds:
         )
         usual = sizes_of(system, mhe.cost, scenario)
         sizes = Sizes(
-            _size("--max-disturbance", options.max_disturbance, n, usual.disturbance),
+            _size("--max-disturbance", options.max_disturbance, system.r, usual.disturbance),
             _size("--max-noise", options.max_noise, p, usual.noise),
             usual.source if options.max_disturbance is None and options.max_noise is None
             else "as stated",

@@ -222,5 +222,20 @@ def test_a_run_of_another_model_with_the_same_gain_is_refused():
     # Another object with the same functions is the same model.
     assert bound.along(run_of(made(0.8, 1.0)), initial_error=0.1).lost is None
     for name, other in (("f", made(1.0, 1.0)), ("h", made(0.8, 1.1))):
-        with pytest.raises(MismatchError, match=f"^{name} of the run's system"):
+        with pytest.raises(MismatchError, match=f"another than was certified: {name} is"):
             bound.along(run_of(other), initial_error=0.1)
+
+
+def test_where_the_bound_ends_the_model_need_not_be_defined():
+    """The observer leaves the domain of the root, in a run of the certified model."""
+    system = qpmhe.System(lambda x: 0.5 * np.sqrt(x) + 0.3, lambda x: 1.0 * x, n=1, p=1)
+    bound = bound_of(system, [[0.1]], box(0.1, 2.0), 0.01, 0.01)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([[0.1]]), unit_cost(), horizon=3, initial_state=[0.5]
+    )
+    run = mhe.run(np.where(np.arange(9) == 4, -90.0, 1.0)[:, None])
+    assert run.observer_states.min() < 0.0
+    band = bound.along(run, initial_error=1.4)
+    assert band.lost == 4
+    mhe.reset()
+    assert bound.along(mhe.run(np.zeros((0, 1))), initial_error=0.5).lost is None

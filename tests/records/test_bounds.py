@@ -126,3 +126,30 @@ def test_what_cannot_be_bounded_is_said_before_any_row(made):
         assert isinstance(done.exception, OptionError)
         assert f"{option} is {value!r}" in str(done.exception)
     assert not Path("out.csv").exists()
+
+
+def test_sizes_are_of_w_where_a_matrix_takes_it(made):
+    text = made[1]
+    Path("two.py").write_text(
+        MODEL.replace("states=X)", "states=X, disturbance_matrix=[[3.0], [-2.0]])")
+        .replace("100.0 * np.eye(2)", "[[100.0]]").replace("1e-3 * np.eye(2)", "1e-4 * np.eye(1)")
+    )
+    A, G = np.array([[0.9, 0.2], [-0.1, 0.7]]), np.array([3.0, -2.0])
+    rng, x, rows = np.random.default_rng(1), [np.array([1.0, -1.0])], [text[0]]
+    for t in range(60):
+        rows.append(f"{t},{x[-1][0] + rng.uniform(-0.18, 0.18)}")
+        x.append(A @ x[-1] + 0.02 * G * rng.choice([-1.0, 1.0]))
+    put("record.csv", rows)
+    # Three standard deviations of the scenario's w, 0.03, or what is stated.
+    bounded()
+    usual = width("out.csv", np.array(x))[-1]
+    for given in (0.02, [0.02]):
+        bounded(
+            resume=False, overwrite=True,
+            bound=BoundOptions(initial_error=[1.0, 1.0], max_disturbance=given),
+        )
+        assert (width("out.csv", np.array(x))[-1] < usual).all()
+    with pytest.raises(OptionError, match=r"--max-disturbance is .*, or 1, one for each component"):
+        bounded(
+            overwrite=True, bound=BoundOptions(initial_error=1.0, max_disturbance=[0.06, 0.04])
+        )
