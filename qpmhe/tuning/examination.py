@@ -44,7 +44,7 @@ _SUITS = 0.3, 1.5
 # Correlations of innovations that matter, and how sure they must be.
 _CORRELATED, _SURE = 0.2, 1e-6
 # Those that raise doubts about what was found if they remain with it; also over so few samples.
-_COLOURED, _DOUBTFUL, _SOON = 0.1, 2e-4, 5
+_COLOURED, _DOUBTFUL, _SOON = 0.1, 1e-5, 5
 _CAUSES = (
     "Possible causes: noise that is correlated in time, a sensor's lag, gain or bias, and a "
     "parameter or a state that the model lacks."
