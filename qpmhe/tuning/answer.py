@@ -39,6 +39,8 @@ _TOGETHER = 0.8
 _MANY_LABELS = 50.0
 # Standard errors by which a gain of the second search is beyond chance.
 _CHANCE = 2.0
+# The step of a correlation's derivatives.
+_DIFFERENCE = 1e-4
 # Eigenvalues of the Hessian below this count as it; an interval is infinite then.
 _FLAT = 1e-6
 
@@ -74,8 +76,8 @@ class Tuning:
         All that was tuned.
     start, values : dict
         The value of each name: standard deviations of disturbance, noise and prior in the units of
-        state and output (a group has the unit of its first component); parameters. At the start,
-        and as tuned.
+        state and output (a group has the unit of its first component); correlations, where whole
+        matrices are tuned; parameters. At the start, and as tuned.
     intervals : dict
         The 95 % interval (low, high) of each, by the likelihood's curvature. It is reliable if the
         model is right; model errors make it too narrow.
@@ -232,6 +234,8 @@ class Tuning:
                     end = limit(self._likelihood, theta, hessian, k, way)
                     ends[side] = way * np.inf if end is None else end
             widest = _WIDEST_LOG if structure.is_log(k) else _WIDEST
+            if k in structure.correlations:
+                at, ends = self._of_correlation(theta, k, ends, inverse)
             if max(at - ends[0], ends[1] - at) > widest:
                 unknown.append(k)
             stands_for = [self._stands_for(theta, k, end) for end in ends]
@@ -244,8 +248,29 @@ class Tuning:
             texts.append(self._words(members, correlations))
         self.unidentified = tuple(texts)
 
+    def _of_correlation(
+        self, theta: Array, k: int, ends: list[float], inverse: Array
+    ) -> tuple[float, list[float]]:
+        """The arctanh of a correlation and of the ends of its interval.
+
+        Where it depends on more than component k, its uncertainty follows from that of all.
+        """
+        name, values = self._structure.names[k], self._structure.values
+        moves = _DIFFERENCE * np.eye(len(theta))[: len(inverse)]
+        sides = np.arctanh([
+            [values(theta + sign * move)[name] for move in moves] for sign in (-1.0, 1.0)
+        ])
+        slope = (sides[1] - sides[0]) / (2.0 * _DIFFERENCE)
+        if not np.delete(slope, k).any():
+            return float(theta[k]), ends
+        middle = float(np.arctanh(values(theta)[name]))
+        width = NORMAL * float(np.sqrt(slope @ inverse @ slope))
+        return middle, [middle - width, middle + width]
+
     def _stands_for(self, theta: Array, k: int, end: float) -> float:
         """An end of an interval in the unit of what the component stands for."""
+        if k in self._structure.correlations:
+            return float(np.tanh(end))
         if np.isinf(end):
             return 0.0 if end < 0.0 and self._structure.is_log(k) else end
         at = theta.copy()
@@ -264,12 +289,14 @@ class Tuning:
             )
         (name,) = names
         low, high = self.intervals[name]
-        no_low = low == 0.0 or np.isinf(low)
-        if no_low and np.isinf(high):
+        of_two = members[0] in self._structure.correlations
+        no_low = low == (-1.0 if of_two else 0.0) or np.isinf(low)
+        no_high = np.isinf(high) or (of_two and high == 1.0)
+        if no_low and no_high:
             return f"{name}: the records say nothing about it, any value fits."
         if no_low:
             return f"{name}: any value below {high:.3g} fits the records."
-        if np.isinf(high):
+        if no_high:
             return f"{name}: any value above {low:.3g} fits the records."
         return f"{name}: the records fit anything from {low:.3g} to {high:.3g}."
 
@@ -350,12 +377,14 @@ class Tuning:
             for name, value in self.values.items()
         ]
         scores = [(name, f"{a:.4g}", f"{b:.4g}") for name, (a, b) in self.scores.items()]
+        title = "Weights, as standard deviations"
+        title += " and correlations" * bool(self._structure.correlations)
         console = Console(file=io.StringIO(), width=110, no_color=True)
-        for title, last, rows in (
-            ("Weights, as standard deviations", ["95 % interval"], weights),
+        for heading, last, rows in (
+            (title, ["95 % interval"], weights),
             (f"Scores on {self._judges}, less is better", [], scores),
         ):
-            console.print(_table(title, ["", "before", "after", *last], rows))
+            console.print(_table(heading, ["", "before", "after", *last], rows))
             console.print()
         for text in (
             f"Chosen {self.judgement}", *(f"Not identified: {one}" for one in self.unidentified),
@@ -398,7 +427,11 @@ class Tuning:
         from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
         start = self.start
-        shown = [name for name in self.intervals if start[name] > 0.0]
+        names, others = self._structure.names, self._structure.correlations
+        shown = [
+            name for k, name in enumerate(names)
+            if name in self.intervals and start[name] > 0.0 and k not in others
+        ]
         found, blue = STYLES[0]["color"], STYLES[1]["color"]
         for row, name in enumerate(reversed(shown)):
             low, high = (

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.system import Function, System
+from ..model.system import System
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Batch = Callable[[Array, Array], Array]
 Loss = Callable[[Array], tuple[Array, Array]]
 
 # Outliers have a Cauchy distribution, as they may be anything: their share, and its width.
@@ -81,14 +82,16 @@ class FilterBank:
     def __init__(
         self, system: System, steps: Array | None, before: int = 0, *, loss: Loss | None = None
     ) -> None:
-        self.system, self.before, self._steps, self._loss = system, before, steps, loss
+        self.system, self.before, self.steps, self._loss = system, before, steps, loss
+        #: Length of the state that is filtered.
+        self.n = system.n
         #: The first thing that the model has raised.
         self.error: Exception | None = None
         #: Takes the length of the step as its last input where it can.
         self.model = system if system.make_timed is None else system.timed
         self._is_timed = self.model is not system
         if self._is_timed and steps is None:
-            self._steps = np.array([float(system.dt or 1.0)])
+            self.steps = np.array([float(system.dt or 1.0)])
         self._tried = False
 
     def _try_batched(self, start: Array, prior: Array, inputs: Array) -> None:
@@ -110,11 +113,16 @@ class FilterBank:
         turned = x if self.system.turns is None else self.system.turns(x)
         return np.clip(turned, states.lower, states.upper)
 
+    def functions(self) -> tuple[Batch, Batch, Batch, Batch]:
+        """Functions f, h and their Jacobians, of many states at once."""
+        model = self.model
+        return model.f.batch, model.h.batch, model.f_jacobian.batch, model.h_jacobian.batch
+
     def full_inputs(self, inputs: Array, step: float = 1.0) -> Array:
         """The inputs of `model`, followed by the length of the step if it takes one."""
-        if not self._is_timed or self._steps is None:
+        if not self._is_timed or self.steps is None:
             return inputs
-        lengths = np.broadcast_to(step * self._steps[: len(inputs)], (len(inputs),))
+        lengths = np.broadcast_to(step * self.steps[: len(inputs)], (len(inputs),))
         return np.column_stack((inputs, lengths))
 
     def errors(self, measured: Array, expected: Array) -> Array:
@@ -148,7 +156,7 @@ class FilterBank:
         later = self.expected(self.following(states, inputs), inputs)
         return expected, self.errors(later, expected)
 
-    def _values(self, function: Function, x: Array, u: Array, shape: tuple[int, ...]) -> Array:
+    def _values(self, function: Batch, x: Array, u: Array, shape: tuple[int, ...]) -> Array:
         """A model function's values at all states; NaN where it raises."""
         try:
             return np.asarray(function(x, u))
@@ -167,9 +175,10 @@ class FilterBank:
         u = np.array([self.full_inputs(one.inputs, one.step) for one in hypotheses])
         start = np.array([one.start for one in hypotheses])
         prior = np.array([one.prior for one in hypotheses])
-        if not self._tried:
+        if not self._tried and self.n == self.system.n:
             self._try_batched(start[0], prior[0], u[0])
-        model, (count, total, p), n = self.model, y.shape, self.system.n
+        (count, total, p), n = y.shape, self.n
+        f, h, f_jacobian, h_jacobian = self.functions()
         there = np.isfinite(y)
         y = np.where(there, y, 0.0)
         disturbance = np.array([one.disturbance for one in hypotheses])
@@ -188,8 +197,8 @@ class FilterBank:
         left_out = np.zeros((count, p))
         for t in range(total):
             now, seen = u[:, t], there[:, t]
-            c = self._values(model.h_jacobian.batch, x, now, (p, n)) / unit[:, None]
-            e = self.errors(y[:, t], self._values(model.h.batch, x, now, (p,))) / unit
+            c = self._values(h_jacobian, x, now, (p, n)) / unit[:, None]
+            e = self.errors(y[:, t], self._values(h, x, now, (p,))) / unit
             transposed = covariance @ c.transpose(0, 2, 1)
             spread = c @ transposed
             if any_outliers:
@@ -229,8 +238,8 @@ class FilterBank:
             covariance = closed @ covariance @ closed.transpose(0, 2, 1)
             covariance += gain @ noise @ gain.transpose(0, 2, 1)
             first.corrected[t], first.covariances[t] = x[0], covariance[0]
-            a = self._values(model.f_jacobian.batch, x, now, (n, n))
-            following = self._values(model.f.batch, x, now, (n,))
+            a = self._values(f_jacobian, x, now, (n, n))
+            following = self._values(f, x, now, (n,))
             if self._loss is not None:
                 following = self._bounded(following + np.einsum("hij,hj->hi", a, move))
             if (scale != 1.0).any():

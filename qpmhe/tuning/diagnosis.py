@@ -118,8 +118,9 @@ def diagnose(
     innovations are white and have the predicted covariance. Where they do not, each fault below
     has a filter that corrects the record for this fault. The fault that makes the record most
     likely is the first finding; the search for others continues with it corrected. In the end
-    factors of R and Q are searched together. The ten measurements after a gap of ten samples or
-    more are no evidence.
+    factors of R and Q are searched together; they are named only if the innovations are white with
+    them, and if no coloured noise or lag of a sensor explains the record as well. The ten
+    measurements after a gap of ten samples or more are no evidence.
 
     * R or Q, of all or of one component, too small or too large by a factor;
     * a biased sensor, throughout or for a time, one in another unit; two that are swapped;

@@ -15,8 +15,9 @@ from ..estimation.observability import observability, prior_shares, prior_units
 from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
-from .faults import search
+from .faults import LEAST_GAIN, SCALED, Fault, search
 from .findings import Finding, Names, listed, number, percent
+from .memory import MemoryBank
 from .stuck import stuck
 
 # The search takes at most so many samples: of a longer record, those least like the model.
@@ -42,6 +43,13 @@ _FAILING, _KEPT, _WEAK_PRIOR, _REJECTED = 0.02, 0.5, 0.1, 0.02
 _SUITS = 0.3, 1.5
 # Correlations of innovations that matter, and how sure they must be.
 _CORRELATED, _SURE = 0.2, 1e-6
+# Those that raise doubts about what was found if they remain with it; also over so few samples.
+_COLOURED, _DOUBTFUL, _SOON = 0.1, 1e-5, 5
+_CAUSES = (
+    "Possible causes: noise that is correlated in time, a sensor's lag, gain or bias, and a "
+    "parameter or a state that the model lacks."
+)
+_DOUBT = "This is not certain: the innovations stay coloured with it."
 # Samples at the start, at least, that are no evidence: a filter needs some to forget it.
 _START = 10
 
@@ -138,9 +146,9 @@ class Examination:
         self.null = null = self.bank.run([base])
         self.normalised = null.normalised
         bank, base, null, begin = self._searched()
-        self.faults, self.best = search(bank, base, null, self._starts())
+        self.faults, self.best, self.unexplained = self._verified(bank, base, null)
         if not self.is_judged and not all(one.is_wrong_unit for one in self.faults):
-            self.faults, self.best = [], null
+            self.faults, self.best, self.unexplained = [], null, []
         whole = 0, len(base.measurements) - 1
         self.searched = begin + self.first if begin else 0, begin + self.first + whole[1]
         if begin:
@@ -152,6 +160,36 @@ class Examination:
             if one.span is not None:  # before the filter began there is no evidence, nor an end
                 low, high = one.span[0] + begin, one.span[1] + begin + self.first
                 self.faults[k] = replace(one, span=(low + self.first if low else 0, high))
+
+    def _verified(
+        self, bank: FilterBank, base: Hypothesis, null: Filtered
+    ) -> tuple[list[Fault], Filtered, list[tuple[int, int, float, str]]]:
+        """Faults; factors of R and Q only if they explain the record, and nothing else does.
+
+        Also the filter with them, and what correlation it leaves: sensor, lag, size, and what that
+        tells.
+        """
+        faults, corrected = search(bank, base, null, self._starts())
+        best, why = bank.run([corrected]), ""
+        coloured = self._colour(best.normalised, _COLOURED, _DOUBTFUL) if faults else []
+        scaled = [k for k, one in enumerate(faults) if one.kind in SCALED]
+        if scaled:
+            before = faults[: scaled[0]]
+            rest = replace(
+                before[-1].hypothesis if before else base,
+                noise=base.noise, disturbance=base.disturbance,
+            )
+            gain = float(np.subtract(*bank.run([rest, corrected]).likelihoods[::-1]))
+            if coloured:
+                why = "Factors of Q and R do not make them white. "
+            elif np.isfinite(gain) and MemoryBank(bank).gain(rest) > gain - LEAST_GAIN:
+                why = "A sensor with a memory explains that as well as factors of Q and R do. "
+            if why:
+                faults, best = before, bank.run([rest])
+                coloured = coloured or self._colour(best.normalised, 0.0, np.inf)
+        return faults, best, [
+            (*one, why) for one in sorted(coloured, key=lambda one: -abs(one[2]))
+        ]
 
     def _searched(self) -> tuple[FilterBank, Hypothesis, Filtered, int]:
         """What is searched for faults, from which sample on: all that has to be, or can be."""
@@ -223,6 +261,8 @@ class Examination:
         deviations, told = np.sqrt(self.noise.diagonal()), []
         for one in self.faults:
             finding = one.in_words(self.names, deviations, self.outliers)
+            if self.unexplained and not one.is_wrong_unit:
+                finding = replace(finding, remedy=f"{finding.remedy} {_DOUBT}")
             if one.kind != "outliers" or not isinstance(self.source.cost, RobustCost):
                 told.append(finding)
         yield from self.stuck
@@ -237,6 +277,8 @@ class Examination:
             if share > _FAILING:
                 yield Finding("failing", f"{what} at {share:.0%} of the samples.", remedy)
         yield from told[len(wrong_units) :]
+        for sensor, lag, size, why in self.unexplained[:1]:
+            yield self._not_white(sensor, lag, size, why + _CAUSES)
         if np.isfinite(self.along.logs).all():
             yield from self._unseen()
 
@@ -256,26 +298,36 @@ class Examination:
         seen = int(np.isfinite(normalised).any(axis=1).sum())
         return Correlations(own, inputs, 1.96 / np.sqrt(max(seen, 1)))
 
+    def _colour(self, normalised: Array, least: float, sure: float) -> list[tuple[int, int, float]]:
+        """Sensors whose innovations are not white, with the lag and size of their correlation."""
+        own, there = self._correlations(normalised).own[1:], np.isfinite(normalised)
+        total, p = there.shape
+        lags = np.arange(1, len(own) + 1)
+        # Only pairs of which both were measured are evidence.
+        pairs = np.array([(there[lag:] & there[:-lag]).sum(axis=0) for lag in lags])
+        weights = total * (total + 2) / (total - lags) ** 2
+        sums = np.cumsum(weights[:, None] * pairs * own**2, axis=0)
+        found = []
+        for j in range(p):
+            k = int(np.argmax(np.abs(own[:, j])))
+            ends = {min(_SOON, len(own)), len(own)}
+            chance = min(chi2.sf(sums[some - 1, j], some) for some in ends)
+            if chance < sure and abs(own[k, j]) > least:
+                found.append((j, k + 1, float(own[k, j])))
+        return found
+
     def _correlated(self) -> Iterator[Finding]:
-        innovations = self.best.normalised
-        found, there = self._correlations(innovations), np.isfinite(innovations)
-        total, lags = len(innovations), len(found.own) - 1
-        weights = total * (total + 2) / (total - np.arange(1, lags + 1)) ** 2
-        for j, name in enumerate(self.names.outputs):
-            own = found.own[1:, j]
-            # Only pairs of which both were measured are evidence.
-            pairs = [(there[lag:, j] & there[:-lag, j]).sum() for lag in range(1, lags + 1)]
-            k = int(np.argmax(np.abs(own)))
-            if chi2.sf(np.sum(weights * pairs * own**2), lags) < _SURE and (
-                abs(own[k]) > _CORRELATED
-            ):
-                yield Finding(
-                    "correlated",
-                    f"The innovations of sensor {name} are not white: their correlation is "
-                    f"{number(own[k])} over {self.names.samples(k + 1)}, where "
-                    f"{number(found.limit)} is the limit.",
-                    "The model lacks something slow: a bias, a parameter or a state.", "warning",
-                )
+        for j, lag, size in self._colour(self.best.normalised, _CORRELATED, _SURE):
+            yield self._not_white(
+                j, lag, size, "The model lacks something slow: a bias, a parameter or a state.")
+
+    def _not_white(self, sensor: int, lag: int, size: float, remedy: str) -> Finding:
+        return Finding(
+            "correlated",
+            f"The innovations of sensor {self.names.outputs[sensor]} are not white: their "
+            f"correlation is {number(size)} over {self.names.samples(lag)}, where "
+            f"{number(self.correlations.limit)} is the limit.", remedy, "warning",
+        )
 
     def _unseen(self) -> Iterator[Finding]:
         """Directions that the data do not see, that no filter has learnt, and that stay."""

@@ -25,11 +25,13 @@ _SUSPICIOUS, _FEW, _BEST = (0.5, 2.0), 100, 3
 _UNIT, _UNIT_OFFSET = 3.0, 30.0
 # Offsets are first what so many samples say, and then found again so many times.
 _SOON, _AGAIN = 5, 4
+# Shares of the size that innovations show of a gain.
+_AROUND = (0.5, 1.0, 1.5, 2.5)
 # More components than this have no factors or pairs of their own.
 _MOST = 8
 # What a fault must gain in log likelihood: in all, up to twice that where measurements are missing;
 # unless it is local, also for each measurement, and when no sample counts for more than the last.
-_GAIN, _GAIN_EACH, _MOST_EACH = 12.0, 0.035, 3.0
+LEAST_GAIN, _GAIN_EACH, _MOST_EACH = 12.0, 0.035, 3.0
 # A further fault must gain this share of what the first did: what that has left may be its shadow.
 _BESIDE = 0.05
 # Factors of covariances are searched together until the logarithms' steps are this small, in so
@@ -47,7 +49,8 @@ class _Kind(NamedTuple):
     local: bool = False
 
 
-_SCALED = ("noise", "disturbance")
+#: Kinds that multiply R or Q.
+SCALED = ("noise", "disturbance")
 # Effects: logarithms of factors, shares of a step or an input, deviations of a bias, samples.
 _KINDS = {
     "noise": _Kind(
@@ -64,9 +67,10 @@ _KINDS = {
         "choose the weights; look for what the model lacks.",
     ),
     "gain": _Kind(
-        np.log(1.5),
+        np.log(1.05),
         "{sensors} read{s} about {value} times what the model expects.",
         "Check the units of the record and of the model's outputs, or correct the gain.",
+        local=True,
     ),
     "bias": _Kind(
         0.5, "{sensors} {is} off by {sigmas} sigma ({value}){stretch}.",
@@ -132,7 +136,8 @@ class Fault:
         worst = [j for j in np.argsort(-outliers)[:3] if outliers[j] > 0.0]
         grows = value > 1.0
         words = {
-            "of": of, "sensors": sensors, "s": "s" * bool(subject), "value": number(value),
+            "of": of, "sensors": sensors, "s": "s" * bool(subject),
+            "value": number(value) if self.is_wrong_unit or self.kind != "gain" else f"{value:.3g}",
             "factor": number(float(f"{max(value, 1.0 / value):.2g}")) if value > 0.0 else "",
             "about": "about" if self.upper else "a factor of more than",
             "or_more": "" if self.upper else " or more",
@@ -166,7 +171,7 @@ class Fault:
     def matters(self) -> bool:
         """Whether its effect is large enough to report."""
         size, noise = self.value, self.hypothesis.noise
-        if self.kind in (*_SCALED, "gain"):
+        if self.kind in (*SCALED, "gain"):
             size = np.log(size)
         elif self.kind in ("step", "input"):
             size -= 1.0
@@ -177,10 +182,10 @@ class Fault:
 
 def search(
     bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array] = (), most: int = 3
-) -> tuple[list[Fault], Filtered]:
+) -> tuple[list[Fault], Hypothesis]:
     """Faults, the one that explains most first, each given those before it.
 
-    Also the filter that corrects for them. `starts` are further states where a filter may start if
+    Also the record without them. `starts` are further states where a filter may start if
     those of the estimator are useless, as with wrong units.
     """
     found: list[Fault] = []
@@ -192,7 +197,7 @@ def search(
         null = bank.run([base])
         same = [
             k for k, one in enumerate(found)
-            if one.kind in ("noise", "disturbance", "gain", "step", "input")
+            if one.kind in (*SCALED, "gain", "step", "input")
             and (one.kind, one.subject) == (best.kind, best.subject)
         ]
         for k in same:
@@ -204,14 +209,14 @@ def search(
 
 def _together(
     bank: FilterBank, base: Hypothesis, null: Filtered, found: list[Fault]
-) -> tuple[list[Fault], Filtered]:
+) -> tuple[list[Fault], Hypothesis]:
     """Factors of covariances as the record is likeliest with all of them.
 
     Each was found given those before it alone: it may have made up for one that came later.
     """
-    some = [k for k, one in enumerate(found) if one.kind in _SCALED]
+    some = [k for k, one in enumerate(found) if one.kind in SCALED]
     if not some or not np.isfinite(null.logs).all():
-        return found, null
+        return found, base
     logs = np.log([found[k].value for k in some])
 
     def changed(moves: Sequence[float] | Array) -> Hypothesis:
@@ -255,15 +260,15 @@ def _together(
             total *= 1.0 - float(shares[np.flatnonzero(rows)[-1]])
         faults[k] = replace(found[k], value=float(np.exp(total)), upper=upper)
     base = changed(at)
-    faults = [one for one in _disjoint(faults, base) if one.kind not in _SCALED or one.matters]
-    return faults, bank.run([base])
+    faults = [one for one in _disjoint(faults, base) if one.kind not in SCALED or one.matters]
+    return faults, base
 
 
 def _disjoint(found: list[Fault], base: Hypothesis) -> list[Fault]:
     """A factor of all components and one of some of them as factors of these and of the others."""
     faults = list(found)
     for k, whole in enumerate(found):
-        if whole.kind not in _SCALED or whole.subject:
+        if whole.kind not in SCALED or whole.subject:
             continue
         parts = [j for j, one in enumerate(found) if one.kind == whole.kind and one.subject]
         for j in parts:
@@ -296,7 +301,7 @@ def _best(
     gains = values[1:] - (lowest if fails else values[0])
     # Few samples that a filter mistakes, as after gaps, suit many faults: they are outvoted.
     votes = np.clip(logs[:, 1:] - logs[:, :1], -_MOST_EACH, _MOST_EACH).sum(axis=0)
-    least = _GAIN * (2.0 - there.mean())
+    least = LEAST_GAIN * (2.0 - there.mean())
     enough = (gains > least + _GAIN_EACH * there.sum()) & (fails | (votes > least))
     best: Fault | None = None
     # By their values: where the record is impossible without any, differences have no digits left.
@@ -357,7 +362,7 @@ def _refined(base: Hypothesis, tried: list[Fault], values: Array) -> Iterator[Fa
     """For each family of factors, the top of a parabola through the best ones."""
     families: dict[tuple[str, tuple[int, ...]], list[tuple[float, float]]] = {}
     for one, value in zip(tried, values[1:].tolist(), strict=True):
-        if one.kind in ("noise", "disturbance", "step"):
+        if one.kind in (*SCALED, "gain", "step"):
             families.setdefault((one.kind, one.subject), [(0.0, float(values[0]))]).append(
                 (float(np.log(one.value)), value)
             )
@@ -525,6 +530,8 @@ def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[
     if 1 < p <= _MOST:
         for j in range(p):
             yield _Signature("shift", (j,), -moves * (np.arange(p) == j), none_x)
+    for j in range(p) if p <= _MOST else ():
+        yield _Signature("gain", (j,), expected * (np.arange(p) == j), none_x)
     reached = bank.following(null.corrected, inputs)
     for j in range(base.inputs.shape[1]):
         without = inputs.copy()
@@ -571,10 +578,12 @@ def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Faul
     best: dict[tuple[str, tuple[int, ...]], tuple[float, float, _Signature]] = {}
     for one, size, gain in _candidates(bank, signatures, against, own):
         key = one.kind, one.subject
-        if gain > 0.5 * _GAIN and gain > best.get(key, (0.0,))[0]:
+        if gain > 0.5 * LEAST_GAIN and gain > best.get(key, (0.0,))[0]:
             best[key] = gain, size, one
     for _, size, one in best.values():
-        yield _removed(base, one, size)
+        # A filter that follows the fault shows less of a gain, or more.
+        for share in _AROUND if one.kind == "gain" else (1.0,):
+            yield _removed(base, one, share * size)
 
 
 def _candidates(
@@ -651,5 +660,7 @@ def _removed(base: Hypothesis, one: _Signature, size: float) -> Fault:
     if one.kind == "input":
         kind = "sign" if size < -1.0 else "input"
         return _with_factor(base, kind, one.subject, 1.0 + size)
+    if one.kind == "gain":
+        return _with_factor(base, "gain", one.subject, float(np.exp(size)))
     y = base.measurements - size * one.outputs
     return Fault(one.kind, size, replace(base, measurements=y), one.subject, one.span)

@@ -20,6 +20,8 @@ _STRUCTURES = ("diagonal", "full", "scalar")
 # A standard deviation may change by this factor either way, and a model's parameter from a
 # twentieth of its start to twenty times as much.
 _RANGE, _SHARE = float(np.log(1e4)), 20.0
+# Of a partial correlation: 1 - r is 1.2e-5.
+_PARTIAL = 6.0
 
 
 class Factors:
@@ -37,7 +39,7 @@ class Factors:
         self._deviations = np.sqrt(start.diagonal())[first]
         self.names = [f"{kind} {name}" for name in groups]
         self.start: Array = np.zeros(len(groups))
-        self.limits = [(-_RANGE, _RANGE)] * len(groups)
+        self.limits, self.correlations = [(-_RANGE, _RANGE)] * len(groups), 0
 
     def covariance(self, theta: Array) -> Array:
         """The covariance (d, d)."""
@@ -54,41 +56,67 @@ class Factors:
         return np.asarray(self._deviations * np.exp(theta))
 
 
-class CholeskyFactor:
-    """The factor L of a covariance L L': D M with D positive, M unit lower triangular."""
+class Correlated:
+    r"""Standard deviations and correlations of a covariance D C D, positive definite.
+
+    theta holds the logarithms of D by its start, and arctanh of the partial correlations r_ij of
+    components i > j given those before j. C = N N^T with N lower triangular:
+    :math:`N_{ij} = r_{ij} \prod_{k<j} (1 - r_{ik}^2)^{1/2}` with :math:`r_{ii} = 1`. So C is a
+    correlation matrix at any theta.
+
+    References
+    ----------
+    Lewandowski, Kurowicka and Joe, Generating random correlation matrices based on vines and
+    extended onion method, Journal of Multivariate Analysis 100 (2009).
+    """
 
     def __init__(self, kind: str, start: Array, labels: Sequence[str]) -> None:
-        factor, d = cholesky(start), len(start)
-        self._pivots, self._below = factor.diagonal().copy(), np.tril_indices(d, -1)
-        below = (factor / self._pivots[:, None])[self._below]
+        self._deviations, d = np.sqrt(start.diagonal()), len(start)
+        self._below = np.tril_indices(d, -1)
+        root = cholesky(start / np.outer(self._deviations, self._deviations))
+        # What is left of each row of N behind an entry.
+        left = np.sqrt(np.cumsum(root[:, ::-1] ** 2, axis=1)[:, ::-1])
+        rows, columns = self._below
+        partial = np.arcsinh(root[self._below] / left[rows, columns + 1])
         self.names = [f"{kind} {one}" for one in labels] + [
-            f"{kind} {labels[i]} with {labels[j]}" for i in range(d) for j in range(i)
+            f"correlation of {kind} {labels[j]} and {labels[i]}"
+            for i in range(d) for j in range(i)
         ]
-        self.start = np.concatenate((np.zeros(d), below))
-        self.limits = [(-_RANGE, _RANGE)] * d + [(-_SHARE, _SHARE)] * below.size
+        self.start = np.concatenate((np.zeros(d), partial))
+        ends = np.maximum(_PARTIAL, np.abs(partial)).tolist()
+        self.limits = [(-_RANGE, _RANGE)] * d + [(-end, end) for end in ends]
+        self.correlations = partial.size
 
-    def _parts(self, theta: Array) -> tuple[Array, Array]:
-        d = len(self._pivots)
-        unit = np.eye(d)
-        unit[self._below] = theta[d:]
-        return self._pivots * np.exp(theta[:d]), unit
+    def _parts(self, theta: Array) -> tuple[Array, Array, Array, Array]:
+        """The standard deviations, r, the products, and N."""
+        d = len(self._deviations)
+        partial, roots, products = np.eye(d), np.ones((d, d)), np.ones((d, d))
+        partial[self._below] = np.tanh(theta[d:])
+        roots[self._below] = 1.0 / np.cosh(theta[d:])
+        products[:, 1:] = np.cumprod(roots[:, :-1], axis=1)
+        return self._deviations * np.exp(theta[:d]), partial, products, partial * products
 
     def covariance(self, theta: Array) -> Array:
         """The covariance (d, d)."""
-        pivots, unit = self._parts(theta)
-        factor = pivots[:, None] * unit
-        return np.asarray(factor @ factor.T)
+        deviations, _, _, root = self._parts(theta)
+        scaled = deviations[:, None] * root
+        return np.asarray(scaled @ scaled.T)
 
     def adjoint(self, theta: Array, slope: Array) -> Array:
         """The derivative by theta, from the derivative by the covariance's entries."""
-        pivots, unit = self._parts(theta)
-        by_unit = pivots[:, None] * ((slope + slope.T) @ (pivots[:, None] * unit))
-        return np.concatenate(((by_unit * unit).sum(axis=1), by_unit[self._below]))
+        deviations, partial, products, root = self._parts(theta)
+        both = deviations[:, None] * (slope + slope.T) * deviations
+        moved = (both * (root @ root.T)).sum(axis=1)
+        by_root = both @ root
+        # An entry of N before which r_ij stands has the factor (1 - r_ij^2)^1/2.
+        behind = np.cumsum((by_root * root)[:, ::-1], axis=1)[:, ::-1] - by_root * root
+        by_partial = (1.0 - partial**2) * by_root * products - partial * behind
+        return np.concatenate((moved, by_partial[self._below]))
 
     def values(self, theta: Array) -> Array:
-        """The diagonal of L, and the entries of M below the diagonal."""
-        pivots, unit = self._parts(theta)
-        return np.concatenate((pivots, unit[self._below]))
+        """The standard deviations, and the correlations below the diagonal."""
+        deviations, _, _, root = self._parts(theta)
+        return np.concatenate((deviations, (root @ root.T)[self._below]))
 
 
 class Structure:
@@ -102,7 +130,7 @@ class Structure:
         self, first: Weights, structure: Any, labels: Mapping[str, Sequence[str]]
     ) -> None:
         self.first, chosen = first, _chosen(structure)
-        parts: dict[str, Factors | CholeskyFactor] = {
+        parts: dict[str, Factors | Correlated] = {
             kind: _part(kind, getattr(first, kind), chosen[kind], labels[kind])
             for kind in KINDS if kind in chosen
         }
@@ -124,6 +152,11 @@ class Structure:
             (kind, part, slice(end - len(part.names), end))
             for (kind, part), end in zip(parts.items(), ends, strict=True)
         ]
+        #: Components that stand for a correlation, which depends on others of theta too.
+        self.correlations = {
+            k for _, part, place in self._parts
+            for k in range(place.stop - part.correlations, place.stop)
+        }
         # exp(theta) times the share that is forgotten at each step, 1 - discount.
         self._forgotten = max(1.0 - first.discount, 1e-3)
         limits = {"discount": (-np.log(100.0), np.log(0.5 / self._forgotten)),
@@ -173,7 +206,7 @@ class Structure:
 
     def is_log(self, k: int) -> bool:
         """Whether component k is a logarithm of what it stands for."""
-        return k < self.covariances and self.limits[k][1] >= _RANGE
+        return k < self.covariances and k not in self.correlations
 
     def bounded(self, theta: Array) -> Array:
         """Theta within the limits."""
@@ -195,7 +228,7 @@ def _chosen(structure: Any) -> dict[str, Any]:
 
 def _part(
     kind: str, start: Array, structure: Any, labels: Sequence[str]
-) -> Factors | CholeskyFactor:
+) -> Factors | Correlated:
     """The parameters of one covariance."""
     varied = np.flatnonzero(start.diagonal() > 0.0).tolist()
     if structure == "diagonal":
@@ -204,7 +237,7 @@ def _part(
         return Factors(kind, start, {"level": varied})
     if structure == "full":
         positive_definite(f"{kind} covariance to start from", start)
-        return CholeskyFactor(kind, start, labels)
+        return Correlated(kind, start, labels)
     if not isinstance(structure, Mapping) or not structure:
         raise OptionError(
             f"structure of the {kind} is {shown(structure)}; expected one of "

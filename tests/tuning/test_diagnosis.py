@@ -14,6 +14,7 @@ from qpmhe.estimation.observability import prior_shares
 from qpmhe.tuning import observability
 from qpmhe.tuning.bank import FilterBank, Hypothesis
 from qpmhe.tuning.faults import Fault, _disjoint
+from qpmhe.tuning.memory import MemoryBank
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "studies"))
 
@@ -174,6 +175,143 @@ def test_a_factor_without_an_upper_end():
     least = one.text.removeprefix("Q of x2 is too large by a factor of more than ").split(":")[0]
     assert 5.0 < float(least) < 4000.0
     assert f"Divide the covariance of the disturbance of x2 by {least} or more," in one.remedy
+
+
+TANKS = np.array([[0.95, 0.0], [0.05, 0.93]])
+SPRING = np.array([[0.98, 0.19], [-0.19, 0.95]])
+
+
+def pair(a, seed, *, spoil=lambda x, v: x + v, disturbance=1.0, noise=1.0):
+    """A run of two measured states, its record spoilt, or with factors of the true Q and R."""
+    generator, total = np.random.default_rng(seed), 300
+    u = np.where(np.arange(total) // 40 % 2, 1.0, 0.4)[:, None] * np.array([[1.0, 0.0]])
+    w, v = generator.standard_normal((2, total, 2)) * np.array([[[0.02]], [[0.1]]])
+    x = np.zeros((total + 1, 2))
+    for t in range(total):
+        x[t + 1] = a @ x[t] + u[t] + np.sqrt(disturbance) * w[t]
+    given = {"prior": np.eye(2), "disturbance": 0.02**2 * np.eye(2), "noise": 0.1**2 * np.eye(2)}
+    return qpmhe.MovingHorizonEstimator(
+        qpmhe.System(lambda x, u: x @ a.T + u, lambda x: x, n=2, p=2, m=2),
+        qpmhe.ExtendedKalman(**given), qpmhe.QuadraticCost.from_covariances(**given), horizon=10,
+        initial_state=np.zeros(2), engine="python", max_qps=0,
+    ).run(spoil(x[:-1], np.sqrt(noise) * v), u)
+
+
+def smoothed(values, kept):
+    found = values.copy()
+    for t in range(1, len(values)):
+        found[t] = kept * found[t - 1] + (1.0 - kept) * values[t]
+    return found
+
+
+def coloured(kept):
+    """Noise of the same variance that is correlated in time."""
+    scale = np.sqrt((1.0 + kept) / (1.0 - kept))
+    return lambda x, v: x + scale * smoothed(v, kept)
+
+
+def lagging(x, v):
+    return np.column_stack((smoothed(x[:, 0], 0.85), x[:, 1])) + v
+
+
+SPOILT = {"coloured, 0.8": coloured(0.8), "coloured, 0.95": coloured(0.95), "lag": lagging}
+
+
+@pytest.mark.parametrize("spoilt", SPOILT)
+@pytest.mark.parametrize("a", [TANKS, SPRING], ids=["tanks", "spring"])
+def test_what_factors_of_covariances_do_not_explain_is_not_blamed_on_them(a, spoilt):
+    """Neither Q nor R is wrong: a sensor is."""
+    for seed in (0, 1, 2):
+        found = qpmhe.diagnose(pair(a, seed, spoil=SPOILT[spoilt]))
+        assert not {"noise", "disturbance"} & set(kinds(found)), str(found)
+        told = " ".join(str(one) for one in found.findings)
+        assert "Multiply" not in told
+        assert "Divide" not in told
+        assert "correlated" in kinds(found), str(found)
+        (one,) = (one for one in found.findings if one.kind == "correlated")
+        assert "are not white" in one.text
+        for cause in ("noise that is correlated in time", "lag, gain or bias", "model lacks"):
+            assert cause in one.remedy
+
+
+@pytest.mark.parametrize("a", [TANKS, SPRING], ids=["tanks", "spring"])
+def test_factors_of_covariances_that_explain_the_record_are_named(a):
+    for seed in (0, 1):
+        for kind, factor in (("disturbance", 20.0), ("noise", 6.0), ("noise", 0.1)):
+            found = qpmhe.diagnose(pair(a, seed, **{kind: factor}))
+            assert kinds(found) == [kind], str(found)
+            told = float(found.findings[0].text.split(" by about ")[1].split(":")[0])
+            assert told == pytest.approx(max(factor, 1.0 / factor), rel=0.5)
+
+
+@pytest.mark.parametrize("gain", [0.8, 0.94, 1.06, 1.2])
+def test_a_gain_of_a_sensor_is_found_from_five_per_cent_on(gain):
+    for seed in (0, 1, 2):
+        scaled = pair(TANKS, seed, spoil=lambda x, v: x * np.array([gain, 1.0]) + v)
+        (one,) = qpmhe.diagnose(scaled).findings
+        assert one.kind == "gain"
+        told = float(one.text.removeprefix("Sensor y1 reads about ").split(" times")[0])
+        assert told == pytest.approx(gain, abs=0.02)
+    little = pair(TANKS, 0, spoil=lambda x, v: x * np.array([1.02, 1.0]) + v)
+    assert "gain" not in kinds(qpmhe.diagnose(little))
+
+
+def test_healthy_pairs_have_no_finding():
+    for a in (TANKS, SPRING):
+        for seed in range(10):
+            found = qpmhe.diagnose(pair(a, seed))
+            assert found.is_healthy, str(found)
+
+
+def test_filters_of_sensors_with_memory_are_filters_of_the_augmented_system():
+    """Dense: the record is a Gaussian vector whose covariance is known."""
+    generator, total, phi = np.random.default_rng(4), 12, 0.8
+    u, y = generator.standard_normal((total, 1)), generator.standard_normal((total, 2))
+    c = np.array([[1.0, 0.5], [0.0, 1.0]])
+    system = qpmhe.System(lambda x, u: x @ SPRING.T + u, lambda x: x @ c.T, n=2, p=2, m=1)
+    Q, R, P = np.diag([0.1, 0.2]), np.diag([0.3, 0.5]), np.diag([1.0, 2.0])
+    base = Hypothesis(y, u, R, Q, np.array([0.5, -0.2]), P)
+    rivals = MemoryBank(FilterBank(system, None))
+
+    def dense(begin, steps, maps, start, prior, disturbance, white):
+        """The log density of y, from moments of the whole record."""
+        size = len(start)
+        states, spread = [np.array(start)], np.zeros((total * size, total * size))
+        for t in range(1, total):
+            states.append(steps @ states[-1] + begin[t - 1])
+        powers = [np.linalg.matrix_power(steps, k) for k in range(total)]
+        own = [prior]
+        for _ in range(1, total):
+            own.append(steps @ own[-1] @ steps.T + disturbance)
+        for i in range(total):
+            for j in range(i + 1):
+                block = powers[i - j] @ own[j]
+                spread[i * size:(i + 1) * size, j * size:(j + 1) * size] = block
+                spread[j * size:(j + 1) * size, i * size:(i + 1) * size] = block.T
+        H = np.kron(np.eye(total), maps)
+        S, e = H @ spread @ H.T + np.kron(np.eye(total), white), (y - states @ maps.T).ravel()
+        return -0.5 * (e @ np.linalg.solve(S, e) + np.linalg.slogdet(S)[1])
+
+    Z = np.zeros((2, 2))
+    drive = np.hstack((np.repeat(u, 2, axis=1), np.zeros((total, 2))))
+    plain = dense(drive[:, :2], SPRING, c, base.start, P, Q, R)
+    noisy = dense(
+        drive, np.block([[SPRING, Z], [Z, phi * np.eye(2)]]), np.hstack((c, np.eye(2))),
+        np.append(base.start, [0.0, 0.0]), np.block([[P, Z], [Z, R]]),
+        np.block([[Q, Z], [Z, (1.0 - phi**2) * R]]), R)
+    maps = np.vstack((np.eye(2), c))
+    late = dense(
+        drive, np.block([[SPRING, Z], [(1.0 - phi) * c, phi * np.eye(2)]]),
+        np.hstack(((1.0 - phi) * c, phi * np.eye(2))), maps @ base.start, maps @ P @ maps.T,
+        np.block([[Q, Z], [Z, Z]]), R)
+    tried = [
+        rivals.hypothesis(base, part, memory, 1.0, share) for part, memory, share in (
+            ([], (0.0, 0.0, 0.0, 1.0), 0.0), ([0, 1], (phi, 0.0, 1.0, 1.0), 1.0),
+            ([0, 1], (phi, 1.0 - phi, phi, 1.0 - phi), 0.0))
+    ]
+    units = total * 0.5 * np.log(np.diag(R)).sum()  # outputs count in deviations of the noise
+    expected = np.array([plain, noisy, late]) + units
+    assert rivals.run(tried).likelihoods == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_noted():

@@ -12,6 +12,7 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError
 from qpmhe.tuning import TuningCheckpointError, TuningRecord, search
+from qpmhe.tuning.structures import Correlated
 
 tuning_module = sys.modules["qpmhe.tuning.tune"]
 
@@ -140,11 +141,87 @@ def test_structures():
     full = tuned(structure="full")
     assert np.linalg.eigvalsh(full.disturbance)[0] > 0.0
     assert full.cost_per_sample <= tuned().cost_per_sample + 1e-9
+    drawn = [label.get_text() for label in full.plot()[0].get_yticklabels()]
+    assert drawn == ["noise y1", "disturbance x2", "disturbance x1"]  # no correlation
     # A disturbance without variance stays without.
     second = tuned(disturbance=np.diag([0.0, 1.0]))
     assert list(second.values) == ["disturbance x2", "noise y1"]
     np.testing.assert_array_equal(second.disturbance[0], 0.0)
     second.cost()
+
+
+def test_whole_matrices_are_told_as_standard_deviations_and_correlations():
+    """All states are measured: each of the true values is within its interval."""
+    true = np.array([[0.16, 0.8 * 0.4 * 0.3, -0.04], [0.0, 0.09, 0.0], [0.0, 0.0, 0.25]])
+    true = np.triu(true) + np.triu(true, 1).T
+    generator, total = np.random.default_rng(11), 1500
+    w = generator.standard_normal((total, 3)) @ np.linalg.cholesky(true).T
+    x = np.zeros((total + 1, 3))
+    for t in range(total):
+        x[t + 1] = 0.9 * x[t] + w[t]
+    y = x[:-1] + 0.1 * generator.standard_normal((total, 3))
+    tuning = tuned(
+        [y], qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=3, p=3), prior=np.eye(3),
+        disturbance=np.eye(3), noise=0.1**2 * np.eye(3), initial_state=np.zeros(3),
+        structure={"disturbance": "full"})
+    assert list(tuning.values) == [
+        "disturbance x1", "disturbance x2", "disturbance x3",
+        "correlation of disturbance x1 and x2", "correlation of disturbance x1 and x3",
+        "correlation of disturbance x2 and x3"]
+    below = [1, 2, 2], [0, 0, 1]
+    for covariance, told in (
+        (tuning.disturbance, tuning.values.values()), (np.eye(3), tuning.start.values()),
+    ):
+        deviations = np.sqrt(covariance.diagonal())
+        expected = [*deviations, *(covariance / np.outer(deviations, deviations))[below]]
+        np.testing.assert_allclose(list(told), expected, rtol=1e-9, atol=1e-12)
+    deviations = np.sqrt(true.diagonal())
+    for one, (low, high) in zip(
+        [*deviations, *(true / np.outer(deviations, deviations))[below]],
+        tuning.intervals.values(), strict=True,
+    ):
+        assert low < one < high < low + 0.25
+    for name, value in tuning.values.items():
+        low, high = tuning.intervals[name]
+        assert low < value < high
+    assert tuning.unidentified == ()
+    assert "Weights, as standard deviations and correlations" in str(tuning)
+
+
+def test_interval_of_a_correlation_that_depends_on_several_numbers():
+    """In another order of the states the same correlation is a number of its own: its profile."""
+    y = np.random.default_rng(5).standard_normal((500, 3)) @ np.array(
+        [[1.0, 0.6, 0.3], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    ends = []
+    for order in ([0, 1, 2], [1, 2, 0]):
+        tuning = tuned(
+            [y[:, order]], qpmhe.System(lambda x: 0.0 * x, lambda x: x, n=3, p=3),
+            prior=np.eye(3), disturbance=np.eye(3), noise=1e-4 * np.eye(3), held_out=0.0,
+            initial_state=np.zeros(3), structure={"disturbance": "full"})
+        names = [f"x{order.index(i) + 1}" for i in (1, 2)]
+        ends.append(tuning.intervals["correlation of disturbance " + " and ".join(names)])
+    np.testing.assert_allclose(ends[0], ends[1], atol=0.01)
+
+
+def test_derivatives_of_correlations():
+    generator = np.random.default_rng(0)
+    root, slope = generator.standard_normal((2, 4, 4))
+    start = root @ root.T
+    part = Correlated("noise", start, "abcd")
+    np.testing.assert_allclose(part.covariance(part.start), start, rtol=1e-12, atol=1e-12)
+    theta = part.start + 0.3 * generator.standard_normal(10)
+    moves = 1e-5 * np.eye(10)
+    expected = [
+        np.sum(slope * (part.covariance(theta + move) - part.covariance(theta - move))) / 2e-5
+        for move in moves
+    ]
+    np.testing.assert_allclose(part.adjoint(theta, slope), expected, rtol=1e-6, atol=1e-7)
+    wild = part.covariance(np.array([limit for _, limit in part.limits]))
+    assert np.isfinite(wild).all()
+    # A start that is almost singular keeps its correlations.
+    start = np.array([[1.0, 1.0 - 1e-12], [1.0 - 1e-12, 1.0]])
+    part = Correlated("noise", start, "ab")
+    np.testing.assert_allclose(part.covariance(part.start), start, rtol=1e-14)
 
 
 @pytest.mark.parametrize("rule", ["threshold", qpmhe.Gate(), qpmhe.HuberInnovation()])
