@@ -37,6 +37,8 @@ _INWARD, _MOST_INWARD = 2.0**-10, 0.25
 # How far beside a point where it is still not finite: shares of the magnitudes, of changing sign
 # and size, since functions without a derivative at 0 have none along axes and diagonals, either.
 _ASIDE, _GOLDEN = 2.0**-24, 0.6180339887498949
+# One call, where the method takes three.
+_all = np.logical_and.reduce
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
@@ -142,7 +144,7 @@ class Jacobian:
         """A given Jacobian, with rows from inside the bounds or from beside x where it has none."""
         try:
             found: Array = np.asarray(given(x, u), np.float64)
-            if np.isfinite(found).all():
+            if _all(np.isfinite(found), None):
                 return found
         except Exception:
             found = np.full((*x.shape[:-1], *self.function.shape, x.shape[-1]), np.nan)

@@ -18,6 +18,7 @@ def estimator(system, **options):
     )
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.ModelWarning")
 def test_a_casadi_model_runs_in_the_compiled_step():
     ca = pytest.importorskip("casadi")
 
