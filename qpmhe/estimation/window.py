@@ -458,7 +458,7 @@ class Window(Stages):
             view.z_next[...], output, jacobian = kernel.stage(view.z, u)
             np.subtract(view.y, output, terms.noise)
             np.negative(jacobian, terms.linear[:, 1:])
-            if not np.isfinite(jacobian).all():
+            if not np.logical_and.reduce(np.isfinite(jacobian), None):  # in one call
                 self._differentiate(terms, (model.f_jacobian, model.h_jacobian), (view.z, u))
         if self._output_residual is not None:
             self._evaluating = "output_residual"

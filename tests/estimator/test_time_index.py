@@ -22,8 +22,8 @@ def discrete():
 
 def of_ode(dt):
     return qpmhe.System.from_ode(
-        lambda x, u: np.stack([0.1 * x[..., 1], 0.1 * (u[..., 0] - x[..., 0])], -1), lambda x: x[..., :1], dt=dt,
-        n=2, p=1, m=1,
+        lambda x, u: np.stack([0.1 * x[..., 1], 0.1 * (u[..., 0] - x[..., 0])], -1),
+        lambda x: x[..., :1], dt=dt, n=2, p=1, m=1,
     )
 
 
