@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import threading
 import warnings
 from collections.abc import Mapping
 from dataclasses import fields
@@ -217,6 +218,7 @@ class MovingHorizonEstimator:
             )
             warn_of_step(error, system, 3)
         self._second: SecondDerivatives | None = None
+        self._stepping = threading.Lock()  # during an update: its model must not call another one
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -227,8 +229,6 @@ class MovingHorizonEstimator:
                 f"{system.n} states do not fit into memory ({error}); take a shorter horizon."
             ) from error
 
-    # Whether an update runs: its model must not call another one.
-    _stepping = False
 
     def _checked_start(self, initial_state: ArrayLike, system: System) -> Array:
         state = vector("initial_state", initial_state, system.n)
@@ -375,18 +375,15 @@ class MovingHorizonEstimator:
         `set` changes them for all samples.
         """
         began = perf_counter()
-        if self._stepping:
+        if self._stepping.locked():
             raise InvalidInputError(
                 "update was called within an update of the same estimator: by its own model, "
                 "observer, cost or solver, or by another thread. Take another estimator there."
             )
-        self._stepping = True
-        try:
+        with self._stepping:  # no interrupt leaves it locked
             return self._updated(
                 y, u, dt, noise_weight, disturbance_weight, bounds, parameters, sensors, began
             )
-        finally:
-            self._stepping = False
 
     def _updated(
         self, y: ArrayLike | None, u: ArrayLike | None, dt: float | None,

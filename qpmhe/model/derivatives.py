@@ -90,7 +90,7 @@ class Jacobian:
         if given is not None:
             name = f"{function.name}_jacobian"
             self._given = BatchedFunction(name, given, (*function.shape, n), inputs, probes)
-            self.method, self.batch = "given", self._given_batch()
+            self.method, self.batch = "given", self._given_batch
         else:
             self._choose(probes)
 
@@ -99,7 +99,14 @@ class Jacobian:
         if u is NO_INPUT and self._inputs:
             raise missing_input(f"{self.function.name}_jacobian", self._inputs)
         if self._given is not None:
-            return self._taken(self._given, x, u)
+            try:
+                found: Array = self._given(x, u)
+                # Of a trace, it is no number.
+                if found.dtype != np.float64 or _all(np.isfinite(found), None):
+                    return found
+            except Exception:
+                found = np.full((*self.function.shape, x.size), np.nan)
+            return self._beside(self._given, found, x, u)
         value: Array = self.batch(x[None], u[None])[0]
         return value
 
@@ -135,19 +142,21 @@ class Jacobian:
             step = np.minimum(_INWARD * self._sizes, _MOST_INWARD * (upper - lower))
             self.inner = np.array((lower + step, upper - step))
 
-    def _given_batch(self) -> Callable[[Array, Array], Array]:
-        given = self._given
-        assert given is not None
-        return partial(self._taken, given.batch)
-
-    def _taken(self, given: Callable[[Array, Array], Any], x: Array, u: Array) -> Array:
-        """A given Jacobian, with rows from inside the bounds or from beside x where it has none."""
+    def _given_batch(self, x: Array, u: Array) -> Array:
+        """A given Jacobian over a batch; see `_beside`."""
+        assert self._given is not None
         try:
-            found: Array = np.asarray(given(x, u), np.float64)
-            if _all(np.isfinite(found), None):
+            found: Array = self._given.batch(x, u)
+            if found.dtype != np.float64 or _all(np.isfinite(found), None):
                 return found
         except Exception:
             found = np.full((*x.shape[:-1], *self.function.shape, x.shape[-1]), np.nan)
+        return self._beside(self._given.batch, found, x, u)
+
+    def _beside(
+        self, given: Callable[[Array, Array], Any], found: Array, x: Array, u: Array
+    ) -> Array:
+        """Rows that are missing, from inside the bounds or, where it has none, from beside x."""
         places = [np.clip(x, *self.inner), np.clip(x + self.aside, *self.inner)]
         for place in places if np.isfinite(self.inner).any() else places[1:]:
             finite = np.isfinite(found).all(axis=-1, keepdims=True)
@@ -318,7 +327,7 @@ class Jacobian:
             f"{function.name}_jacobian", slope, (*function.shape, size), self._inputs, []
         )
         other._given.mode = "batched"
-        other.batch = other._given_batch()
+        other.batch = other._given_batch
         return other
 
     def copy(self, function: BatchedFunction) -> Jacobian:
@@ -329,7 +338,7 @@ class Jacobian:
             other.use(self.method)
         else:
             other._given = self._given.copy()
-            other.batch = other._given_batch()
+            other.batch = other._given_batch
         return other
 
     def try_batched(self, x: Array, u: Array) -> None:
