@@ -500,6 +500,7 @@ FEATURES = {
         ),
         "fewer disturbances reinitialized": (lambda: _fewer(**SMALL), conditions, AGAIN, MANY),
         "fewer disturbances extended": (_fewer, filtered(), gaps, conditions, ALONE),
+        "fewer disturbances graduated": (_fewer, losses(noise=qpmhe.GemanMcClure), {"horizon": 8}),
         "singular covariance": ("inputs", singular, gaps),
     },
     "held": {
