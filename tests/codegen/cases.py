@@ -536,6 +536,11 @@ FEATURES = {
             lambda: _inputs(disturbances=Box([-0.1] * 3, [0.2] * 3), noises=Box([-3] * 2, [3] * 2)),
             losses(noise=partial(qpmhe.Cauchy, per_component=True, threshold=0.8)), WARM,
         ),
+        # Its candidate leaves the sets while the first window fills.
+        "graduated from outside": (
+            lambda: _inputs(disturbances=Box([-INF] * 3, [0.05] * 3)),
+            losses(noise=partial(qpmhe.Cauchy, threshold=0.8)), {"horizon": 8},
+        ),
     },
     "states": {
         "states in a box": (lambda: _reaction_in(POSITIVE),),

@@ -374,7 +374,7 @@ static void mhe_weigh(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
     mhe_wrap_state(e->settings, trial->x, offset);
     cost += k->factors[0] * mhe_prior_cost(e->settings, k, offset);
     cost += mhe_hold_cost(e, k, trial->x);
-    trial->cost = isfinite(cost) ? cost : INFINITY;
+    trial->cost = cost >= 0 && isfinite(cost) ? cost : INFINITY;
 }
 
 static void mhe_set_widening(mhe_workspace *k, const mhe_settings *s, real rest)
