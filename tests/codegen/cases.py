@@ -341,6 +341,13 @@ def losses(**given):
     return changed
 
 
+def vanishing():
+    """Corrections from which the loss takes all weight, of states that one output does not see."""
+    one = _plain(_rate, lambda x: x[:1], 4, 1, dt=0.2)
+    one = replace(one, observer=Luenberger([[0.5], [2.0], [-3.0], [1.0]]))
+    return losses(disturbance=partial(qpmhe.Barron, shape=-INF, threshold=0.5))(one)
+
+
 def _tank():
     """A tank whose outflow's coefficient is a parameter, with two gauges and a push."""
     system = qpmhe.from_casadi(

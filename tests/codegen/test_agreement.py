@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
 
-from .cases import CASES, FEATURES, STEPS, case
+from .cases import CASES, FEATURES, STEPS, case, vanishing
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
@@ -120,3 +121,15 @@ def test_the_same_runs(name):
     for array in ("states", "filtered", "observer_states", "costs", "candidate_costs"):
         same(getattr(found, array), getattr(expected, array), one.tolerance, array)
     assert (found.costs <= found.candidate_costs).all()
+
+
+def test_vanishing_weights():
+    """Where a loss leaves a singular QP, its flat directions are arbitrary; both engines step."""
+    one = vanishing()
+    reference, compiled = one.estimator("python"), one.estimator("compiled")
+    for sample in one.samples:
+        expected, found = reference.update(**sample), compiled.update(**sample)
+        assert Status.IMPROVED in found.status
+        assert Status.SOLVER_FAILED not in expected.status | found.status
+        assert found.candidate_cost == pytest.approx(expected.candidate_cost, rel=1e-9)
+        assert found.cost < 1.2 * expected.cost
