@@ -348,6 +348,25 @@ def vanishing():
     return losses(disturbance=partial(qpmhe.Barron, shape=-INF, threshold=0.5))(one)
 
 
+def excluding():
+    """Curved outputs whose narrow bounds exclude each other: no trajectory satisfies all rows."""
+    generator = np.random.default_rng(37)
+    a, b, c, d = generator.normal(size=4)
+    sides = 10.0 ** generator.uniform(-2.5, -0.5, size=2)
+    system = qpmhe.from_casadi(
+        lambda x: [0.9 * x[0] + 0.3 * ca.sin(3 * a * x[1]), 0.8 * x[1] + 0.2 * b * x[0] ** 2],
+        lambda x: [c * x[0] ** 2 + ca.sin(4 * x[1]), x[0] * x[1] + d * ca.cos(3 * x[0])], n=2,
+        compiled=False, disturbances=Box(-sides, sides), noises=Box([-0.05] * 2, [0.05] * 2),
+    )
+    cost = QuadraticCost(
+        prior=np.eye(2), disturbance=np.diag(sides**-2), noise=100.0 * np.eye(2)
+    )
+    samples = recorded(system, [0.5, 0.5], seed=37, disturbance=0.2, steps=5)
+    observer = Luenberger(0.1 * generator.normal(size=(2, 2)))
+    start = generator.normal(size=2)
+    return Case(system, observer, cost, start, samples, {"horizon": 5, "max_qps": 1})
+
+
 def _tank():
     """A tank whose outflow's coefficient is a parameter, with two gauges and a push."""
     system = qpmhe.from_casadi(
