@@ -562,6 +562,10 @@ FEATURES = {
             lambda: _inputs(disturbances=Box([-0.1] * 3, [0.2] * 3), noises=Box([-3] * 2, [3] * 2)),
             losses(noise=partial(qpmhe.Cauchy, per_component=True, threshold=0.8)), WARM,
         ),
+        # The trajectory of the surrogate, not the estimate, is kept where a snapshot is taken.
+        "graduated reinitialized": ("inputs", losses(
+            noise=partial(qpmhe.GemanMcClure, threshold=0.5, graduation=100.0)
+        ), lambda one: replace(one, samples=one.samples[:14]), AGAIN, ONE, {"horizon": STEPS}),
         # Its candidate leaves the sets while the first window fills.
         "graduated from outside": (
             lambda: _inputs(disturbances=Box([-INF] * 3, [0.05] * 3)),
