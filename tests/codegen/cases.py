@@ -348,6 +348,24 @@ def vanishing():
     return losses(disturbance=partial(qpmhe.Barron, shape=-INF, threshold=0.5))(one)
 
 
+def _emptied():
+    """Two tanks that the observer empties: the outflow has no derivative there."""
+    def f(x, u):
+        first, second = 0.2 * ca.sqrt(x[0]), 0.2 * ca.sqrt(x[1])
+        return [x[0] + u[0] - first, x[1] + first - second]
+
+    system = qpmhe.from_casadi(
+        f, lambda x: [x[1], ca.sqrt(x[0])], n=2, m=1, compiled=False, states=POSITIVE
+    )
+    cost = QuadraticCost(prior=spd(11, 2), disturbance=9.0 * spd(12, 2), noise=7.0 * spd(13, 2))
+    start, generator = np.array([0.3, 0.2]), np.random.default_rng(14)
+    samples = tuple(
+        {"y": system.h(start, [0.0]) * generator.uniform(0.0, 1.5, 2), "u": [0.03]}
+        for _ in range(STEPS)
+    )
+    return Case(system, Luenberger([[0.7, 0.9], [1.3, 0.3]]), cost, start, samples)
+
+
 def excluding():
     """Curved outputs whose narrow bounds exclude each other: no trajectory satisfies all rows."""
     generator = np.random.default_rng(37)
@@ -576,6 +594,7 @@ FEATURES = {
         "states in a box": (lambda: _reaction_in(POSITIVE),),
         "states in a box, conditions": ("states in a box", gaps, conditions, AGAIN, WARM),
         "states from outside": (lambda: _reaction_in(WEDGE, (-1.0, 4.5)), MANY),
+        "states on a bound without derivative": (_emptied, gaps, ALONE),
         "states in a metric": ("states in a box", METRIC, gaps, ALONE),
         "states in a polytope": (lambda: _reaction_in(WEDGE),),
         "states in both": (lambda: _reaction_in(
