@@ -33,7 +33,7 @@ class LiftedCost(Cost):
     least_correlation = _LEAST
 
     def __init__(self, cost: Cost, space: Subspace) -> None:
-        self._cost, self.quadratic = cost, cost.quadratic
+        self._cost, self.quadratic, self.graduation = cost, cost.quadratic, cost.graduation
         self.space: Subspace = space
         self._stand_in = _of_size(space, space.inverse.T @ cost.disturbance @ space.inverse)
         eye = np.eye(cost.p)

@@ -379,9 +379,10 @@ class Problem:
         return other
 
     def judged(self, trial: Trial) -> Trial:
-        """A trial of the problem with another cost, by the cost of this one."""
-        if not math.isfinite(trial.cost):
-            return trial
+        """A trial of the problem with another cost, by the cost of this one.
+
+        One without a finite cost stays so, with the weights of this cost: a QP around it has them.
+        """
         try:
             weights, cost = self._weights_and_cost(trial.residuals)
             prior = self._formulation.prior_cost(self.offset(trial.trajectory), self.prior_weight)
@@ -390,7 +391,10 @@ class Problem:
         cost += prior if self.discounts is None else float(self.discounts[0]) * prior
         if self.hold is not None:
             cost += self._hold_cost(trial.trajectory)
-        return replace(trial, weights=weights, cost=cost + trial.penalty)
+        cost += trial.penalty
+        if not (math.isfinite(trial.cost) and 0.0 <= cost < math.inf):
+            cost = math.inf
+        return replace(trial, weights=weights, cost=cost)
 
     def failure(self, trial: Trial) -> str:
         """What the model or the cost raised at a trial, as a message; blank if nothing."""

@@ -68,6 +68,9 @@ class NearestPoint:
         self._rows = np.vstack([rows[keep] for (rows, _), keep in zip(sides, finite, strict=True)])
         self._sides = np.concatenate([s[keep] for (_, s), keep in zip(sides, finite, strict=True)])
         self._sizes, self._side_sizes = np.abs(self._rows), np.abs(self._sides)
+        # Of the first rows, which are bounds: the component, and its bound.
+        self._components = np.concatenate([np.flatnonzero(keep) for keep in finite[:2]])
+        self._bounds = np.concatenate((convex_set.upper[finite[0]], convex_set.lower[finite[1]]))
         self._has_rows = bool(convex_set.matrix.shape[0])
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.where(self._sizes > 0.0, self._side_sizes[:, None] / self._sizes, 0.0)
@@ -133,8 +136,12 @@ class NearestPoint:
                 missed[active] = 0.0
             worst = int(missed.argmax())
             if not missed[worst] > 0.0:
-                clipped: Array = np.clip(current, self._lower, self._upper)
-                return clipped
+                found: Array = np.clip(current, self._lower, self._upper)
+                # Exactly on its bounds, not beside them by rounding: there, a model may have a huge
+                # derivative where it has none on the bound.
+                bounds = [row for row in active if row < self._bounds.size]
+                found[self._components[bounds]] = self._bounds[bounds]
+                return found
             if not usable[worst]:
                 return None
             entering = self._enter(gram, reach, worst, float(missed[worst]), active, multipliers)

@@ -341,6 +341,50 @@ def losses(**given):
     return changed
 
 
+def vanishing():
+    """Corrections from which the loss takes all weight, of states that one output does not see."""
+    one = _plain(_rate, lambda x: x[:1], 4, 1, dt=0.2)
+    one = replace(one, observer=Luenberger([[0.5], [2.0], [-3.0], [1.0]]))
+    return losses(disturbance=partial(qpmhe.Barron, shape=-INF, threshold=0.5))(one)
+
+
+def _emptied():
+    """Two tanks that the observer empties: the outflow has no derivative there."""
+    def f(x, u):
+        first, second = 0.2 * ca.sqrt(x[0]), 0.2 * ca.sqrt(x[1])
+        return [x[0] + u[0] - first, x[1] + first - second]
+
+    system = qpmhe.from_casadi(
+        f, lambda x: [x[1], ca.sqrt(x[0])], n=2, m=1, compiled=False, states=POSITIVE
+    )
+    cost = QuadraticCost(prior=spd(11, 2), disturbance=9.0 * spd(12, 2), noise=7.0 * spd(13, 2))
+    start, generator = np.array([0.3, 0.2]), np.random.default_rng(14)
+    samples = tuple(
+        {"y": system.h(start, [0.0]) * generator.uniform(0.0, 1.5, 2), "u": [0.03]}
+        for _ in range(STEPS)
+    )
+    return Case(system, Luenberger([[0.7, 0.9], [1.3, 0.3]]), cost, start, samples)
+
+
+def excluding():
+    """Curved outputs whose narrow bounds exclude each other: no trajectory satisfies all rows."""
+    generator = np.random.default_rng(37)
+    a, b, c, d = generator.normal(size=4)
+    sides = 10.0 ** generator.uniform(-2.5, -0.5, size=2)
+    system = qpmhe.from_casadi(
+        lambda x: [0.9 * x[0] + 0.3 * ca.sin(3 * a * x[1]), 0.8 * x[1] + 0.2 * b * x[0] ** 2],
+        lambda x: [c * x[0] ** 2 + ca.sin(4 * x[1]), x[0] * x[1] + d * ca.cos(3 * x[0])], n=2,
+        compiled=False, disturbances=Box(-sides, sides), noises=Box([-0.05] * 2, [0.05] * 2),
+    )
+    cost = QuadraticCost(
+        prior=np.eye(2), disturbance=np.diag(sides**-2), noise=100.0 * np.eye(2)
+    )
+    samples = recorded(system, [0.5, 0.5], seed=37, disturbance=0.2, steps=5)
+    observer = Luenberger(0.1 * generator.normal(size=(2, 2)))
+    start = generator.normal(size=2)
+    return Case(system, observer, cost, start, samples, {"horizon": 5, "max_qps": 1})
+
+
 def _tank():
     """A tank whose outflow's coefficient is a parameter, with two gauges and a push."""
     system = qpmhe.from_casadi(
@@ -500,6 +544,7 @@ FEATURES = {
         ),
         "fewer disturbances reinitialized": (lambda: _fewer(**SMALL), conditions, AGAIN, MANY),
         "fewer disturbances extended": (_fewer, filtered(), gaps, conditions, ALONE),
+        "fewer disturbances graduated": (_fewer, losses(noise=qpmhe.GemanMcClure), {"horizon": 8}),
         "singular covariance": ("inputs", singular, gaps),
     },
     "held": {
@@ -535,11 +580,21 @@ FEATURES = {
             lambda: _inputs(disturbances=Box([-0.1] * 3, [0.2] * 3), noises=Box([-3] * 2, [3] * 2)),
             losses(noise=partial(qpmhe.Cauchy, per_component=True, threshold=0.8)), WARM,
         ),
+        # The trajectory of the surrogate, not the estimate, is kept where a snapshot is taken.
+        "graduated reinitialized": ("inputs", losses(
+            noise=partial(qpmhe.GemanMcClure, threshold=0.5, graduation=100.0)
+        ), lambda one: replace(one, samples=one.samples[:14]), AGAIN, ONE, {"horizon": STEPS}),
+        # Its candidate leaves the sets while the first window fills.
+        "graduated from outside": (
+            lambda: _inputs(disturbances=Box([-INF] * 3, [0.05] * 3)),
+            losses(noise=partial(qpmhe.Cauchy, threshold=0.8)), {"horizon": 8},
+        ),
     },
     "states": {
         "states in a box": (lambda: _reaction_in(POSITIVE),),
         "states in a box, conditions": ("states in a box", gaps, conditions, AGAIN, WARM),
         "states from outside": (lambda: _reaction_in(WEDGE, (-1.0, 4.5)), MANY),
+        "states on a bound without derivative": (_emptied, gaps, ALONE),
         "states in a metric": ("states in a box", METRIC, gaps, ALONE),
         "states in a polytope": (lambda: _reaction_in(WEDGE),),
         "states in both": (lambda: _reaction_in(

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
+from qpmhe.estimation.limits import NEAREST_POINTS
 
-from .cases import CASES, FEATURES, STEPS, case
+from .cases import CASES, FEATURES, STEPS, case, excluding, vanishing
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler"),
@@ -120,3 +122,27 @@ def test_the_same_runs(name):
     for array in ("states", "filtered", "observer_states", "costs", "candidate_costs"):
         same(getattr(found, array), getattr(expected, array), one.tolerance, array)
     assert (found.costs <= found.candidate_costs).all()
+
+
+def test_vanishing_weights():
+    """Where a loss leaves a singular QP, its flat directions are arbitrary; both engines step."""
+    one = vanishing()
+    reference, compiled = one.estimator("python"), one.estimator("compiled")
+    for sample in one.samples:
+        expected, found = reference.update(**sample), compiled.update(**sample)
+        assert Status.IMPROVED in found.status
+        assert Status.SOLVER_FAILED not in expected.status | found.status
+        assert found.candidate_cost == pytest.approx(expected.candidate_cost, rel=1e-9)
+        assert found.cost < 1.2 * expected.cost
+
+
+def test_searches_for_feasible_points_end():
+    """Of all QPs for feasible points in a step, both engines solve at most as many as they say."""
+    one, most = excluding(), 0.0
+    reference, compiled = one.estimator("python"), one.estimator("compiled")
+    for sample in one.samples:
+        for found in (reference.update(**sample), compiled.update(**sample)):
+            allowed = NEAREST_POINTS * (1 + found.qps)
+            assert found.nearest_points <= allowed
+            most = max(most, found.nearest_points / allowed)
+    assert most == 1.0  # else this test says nothing

@@ -188,7 +188,10 @@ def test_widened_losses_lead_to_the_sensors_that_agree_from_any_start(max_qps):
 def test_the_surrogate_goes_on_where_the_candidate_is_the_estimate():
     """In a basin that costs less at first, a candidate hides the trajectory that is followed."""
     mhe, other = (estimator(float(Y[0, :2].mean()), max_qps=2) for _ in range(2))
-    kept = [mhe.update(y) for y in Y[:4]]
+    kept = []
+    for y in Y[:4]:
+        kept.append(mhe.update(y))
+        np.testing.assert_array_equal(mhe.state, kept[-1].state)
     other.load_state_dict(mhe.state_dict())
     for y in Y[4:20]:
         kept.append(mhe.update(y))

@@ -129,3 +129,19 @@ def test_a_stable_observer_that_a_projection_in_the_euclidean_metric_destabilise
         sizes([[1.0, 2.0], [2.0, 1.0]])
     with pytest.raises(ShapeError, match="metric has shape"):
         sizes(np.eye(3))
+
+
+def test_active_bounds_hold_exactly():
+    """Not up to rounding: a model may have no derivative on a bound, and a huge one beside it."""
+    generator, active = np.random.default_rng(3), 0
+    for _ in range(100):
+        lower = generator.normal(size=3) * generator.choice([0.0, 1.0, 1e-3], size=3)
+        upper = lower + generator.uniform(0.5, 2.0, 3)
+        root = generator.normal(size=(3, 3))
+        covariance = root @ root.T * 10.0 ** generator.uniform(-3.0, 3.0)
+        nearest = NearestPoint(qpmhe.Box(lower, upper))
+        point = nearest(lower + 3.0 * generator.normal(size=3), covariance).point
+        away = np.minimum(point - lower, upper - point)
+        assert (away[away < 1e-9] == 0.0).all()
+        active += (away == 0.0).sum()
+    assert active > 200

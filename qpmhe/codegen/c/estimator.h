@@ -407,6 +407,7 @@ typedef struct {
 #else
     mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
     mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
+    int32_t has_ridge;                /* on the diagonal of the panels */
 #endif
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real residual[(MHE_HORIZON + 1) * MHE_NX], direction[(MHE_HORIZON + 1) * MHE_NX];

@@ -10,6 +10,10 @@
  * has them as they are, and cannot tell. */
 #define LEAST_FACTOR (sizeof(real) == 8 ? (real)1e-280 : (real)1e-27)
 
+/* The ridge of a Hessian that is singular up to rounding, as shares of its diagonal and of the weights'
+ * that losses have not touched: above rounding, and far below what a useful step depends on. */
+#define RIDGE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-4)
+
 static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACTOR : factor; }
 
 /* Fill panels and gradient from the terms in workspace->at, around a trajectory that starts
@@ -50,6 +54,14 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
                 row[NX + c] = next * t->coupling[r * NX + c];
             }
             g[r] += next * t->own[r];
+        }
+    }
+    for (int i = 0; k->has_ridge && i <= count; i++) {
+        const real *weight = i == 0 ? k->prior.weight
+                                    : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
+        for (int r = 0; r < NX; r++) {
+            real *pivot = k->panels + (i * NX + r) * WIDTH + r;
+            *pivot += RIDGE * *pivot + EPSILON * mhe_floored(factors[i]) * weight[r * NX + r];
         }
     }
 }

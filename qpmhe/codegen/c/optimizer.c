@@ -108,10 +108,9 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
     return 1;
 }
 
-/* Solve the QP around a trial; the increments are in k->step. With `again`, only
- * limits have changed since the last one. */
-static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
-                        const mhe_trial *around, int nearest, int again)
+/* Solve the QP around a trial, with its Hessian as it is or with a ridge. */
+static int mhe_solve_as_is(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
+                           const mhe_trial *around, int nearest, int again)
 {
     const real *prior = k->prior.mean;
     real offset[NX];
@@ -148,6 +147,23 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 #else
     (void)o; (void)again;
     return mhe_solve_free(e, k, offset, nearest) ? SOLVED : FAILED;
+#endif
+}
+
+/* Solve the QP around a trial; the increments are in k->step. With `again`, only limits have changed
+ * since the last one. Weights that a loss takes from outliers may leave a Hessian that is singular up
+ * to rounding: it gets a ridge then. */
+static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
+                        const mhe_trial *around, int nearest, int again)
+{
+#if MHE_ROLLED
+    return mhe_solve_as_is(e, k, o, around, nearest, again);
+#else
+    k->has_ridge = 0;
+    const int status = mhe_solve_as_is(e, k, o, around, nearest, again);
+    if (status != FAILED) return status;
+    k->has_ridge = 1;
+    return mhe_solve_as_is(e, k, o, around, nearest, 0);
 #endif
 }
 
@@ -235,7 +251,9 @@ static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 {
     for (int i = 0; i < MHE_NEAREST_POINTS; i++) {
         mhe_trial *trial = around == o->spare ? o->other : o->spare;
-        if (!isfinite(around->violation) || !mhe_linearize(e, k, o, around)) break;
+        if (!isfinite(around->violation) || o->nearest_points >= MHE_NEAREST_POINTS * (1 + o->qps))
+            break;
+        if (!mhe_linearize(e, k, o, around)) break;
         if (mhe_is_late(k, o)) break;
         const int status = mhe_solve_qp(e, k, o, around, 1, 0);
         o->nearest_points++;
@@ -374,7 +392,7 @@ static void mhe_weigh(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
     mhe_wrap_state(e->settings, trial->x, offset);
     cost += k->factors[0] * mhe_prior_cost(e->settings, k, offset);
     cost += mhe_hold_cost(e, k, trial->x);
-    trial->cost = isfinite(cost) ? cost : INFINITY;
+    trial->cost = cost >= 0 && isfinite(cost) ? cost : INFINITY;
 }
 
 static void mhe_set_widening(mhe_workspace *k, const mhe_settings *s, real rest)

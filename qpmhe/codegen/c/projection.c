@@ -230,6 +230,12 @@ static int mhe_nearest_in(const mhe_x_set *set, const real *P, const real *point
         }
         if (worst < 0) {
             mhe_clip(set, s);
+            /* Exactly on its bounds, not beside them by rounding: there, a model may have a huge
+             * derivative where it has none on the bound. */
+            for (int j = 0; j < NX; j++) {
+                if (n.is_active[j]) s[j] = set->upper[j];
+                if (n.is_active[NX + j]) s[j] = set->lower[j];
+            }
             memcpy(out, s, sizeof s);
             return 1;
         }
