@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import threading
 import warnings
 from collections.abc import Mapping
 from dataclasses import fields
@@ -218,7 +217,7 @@ class MovingHorizonEstimator:
             )
             warn_of_step(error, system, 3)
         self._second: SecondDerivatives | None = None
-        self._stepping = threading.Lock()  # during an update: its model must not call another one
+        self._stepping = False  # during an update: its model must not call another one
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -375,43 +374,40 @@ class MovingHorizonEstimator:
         `set` changes them for all samples.
         """
         began = perf_counter()
-        if self._stepping.locked():
+        if self._stepping:
             raise InvalidInputError(
                 "update was called within an update of the same estimator: by its own model, "
                 "observer, cost or solver, or by another thread. Take another estimator there."
             )
-        with self._stepping:  # no interrupt leaves it locked
-            return self._updated(
-                y, u, dt, noise_weight, disturbance_weight, bounds, parameters, sensors, began
-            )
-
-    def _updated(
-        self, y: ArrayLike | None, u: ArrayLike | None, dt: float | None,
-        noise_weight: ArrayLike | None, disturbance_weight: ArrayLike | None,
-        bounds: Mapping[str, ConvexSet] | None, parameters: ArrayLike | None,
-        sensors: ArrayLike | None, began: float,
-    ) -> Estimate:
-        own: Conditions | None = None
-        if sensors is None:
-            y_array = self._measurement(y)
-        else:
-            y_array, own = self._sampled(y, sensors)
-        needed = u is not None or parameters is not None or self._full_input.size
-        u_array = self._input(u, parameters) if needed else self._full_input
-        if dt is not None:
-            dt = positive("dt", dt)
-            self._check_step_length(dt)
-        if not (noise_weight is None and disturbance_weight is None and bounds is None):
-            found = self._reader.read(
-                self._engine.usual, noise_weight=noise_weight,
-                disturbance_weight=disturbance_weight, bounds=bounds,
-            )
-            own = found if own is None else own.over(found)
+        # Twice: an interrupt may come between the end of the step and the first reset.
         try:
-            return self._engine.step(y_array, u_array, dt, own, began)
-        except EngineChangeError as change:
-            self._change_engine(change)
-        return self._engine.step(y_array, u_array, dt, own, began)
+            try:
+                self._stepping = True
+                own: Conditions | None = None
+                if sensors is None:
+                    y_array = self._measurement(y)
+                else:
+                    y_array, own = self._sampled(y, sensors)
+                needed = u is not None or parameters is not None or self._full_input.size
+                u_array = self._input(u, parameters) if needed else self._full_input
+                if dt is not None:
+                    dt = positive("dt", dt)
+                    self._check_step_length(dt)
+                if not (noise_weight is None and disturbance_weight is None and bounds is None):
+                    found = self._reader.read(
+                        self._engine.usual, noise_weight=noise_weight,
+                        disturbance_weight=disturbance_weight, bounds=bounds,
+                    )
+                    own = found if own is None else own.over(found)
+                try:
+                    return self._engine.step(y_array, u_array, dt, own, began)
+                except EngineChangeError as change:
+                    self._change_engine(change)
+                return self._engine.step(y_array, u_array, dt, own, began)
+            finally:
+                self._stepping = False
+        finally:
+            self._stepping = False
 
     def _change_engine(self, change: EngineChangeError) -> None:
         self._engine = change.engine
