@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pickle
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import fields
 from time import perf_counter
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -207,6 +209,7 @@ class MovingHorizonEstimator:
         self._usual_input = np.append(np.zeros(self._inputs), nominal)
         self._full_input = self._usual_input.copy()  # each sample's, overwritten
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
+        self._sensors = (system.p,)
         self._initial_state: Array = self._checked_start(initial_state, self._own_system)
         if not is_copy:
             check_correction(
@@ -217,7 +220,6 @@ class MovingHorizonEstimator:
             )
             warn_of_step(error, system, 3)
         self._second: SecondDerivatives | None = None
-        self._stepping = False  # during an update: its model must not call another one
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -374,40 +376,38 @@ class MovingHorizonEstimator:
         `set` changes them for all samples.
         """
         began = perf_counter()
-        if self._stepping:
-            raise InvalidInputError(
-                "update was called within an update of the same estimator: by its own model, "
-                "observer, cost or solver, or by another thread. Take another estimator there."
+        # A flag would have to be reset behind the step, where an interrupt may leave it.
+        caller: FrameType | None = sys._getframe(1)
+        while caller is not None:
+            if caller.f_code is _UPDATE and caller.f_locals["self"] is self:
+                raise InvalidInputError(
+                    "update was called within an update of the same estimator: by its own model, "
+                    "observer, cost or solver. Take another estimator there."
+                )
+            caller = caller.f_back
+        own: Conditions | None = None
+        if sensors is not None:
+            y_array, own = self._sampled(y, sensors)
+        elif type(y) is np.ndarray and y.shape == self._sensors and y.dtype == np.float64:
+            y_array = y
+        else:
+            y_array = self._measurement(y)
+        needed = u is not None or parameters is not None or self._full_input.size
+        u_array = self._input(u, parameters) if needed else self._full_input
+        if dt is not None:
+            dt = positive("dt", dt)
+            self._check_step_length(dt)
+        if not (noise_weight is None and disturbance_weight is None and bounds is None):
+            found = self._reader.read(
+                self._engine.usual, noise_weight=noise_weight,
+                disturbance_weight=disturbance_weight, bounds=bounds,
             )
-        # Twice: an interrupt may come between the end of the step and the first reset.
+            own = found if own is None else own.over(found)
         try:
-            try:
-                self._stepping = True
-                own: Conditions | None = None
-                if sensors is None:
-                    y_array = self._measurement(y)
-                else:
-                    y_array, own = self._sampled(y, sensors)
-                needed = u is not None or parameters is not None or self._full_input.size
-                u_array = self._input(u, parameters) if needed else self._full_input
-                if dt is not None:
-                    dt = positive("dt", dt)
-                    self._check_step_length(dt)
-                if not (noise_weight is None and disturbance_weight is None and bounds is None):
-                    found = self._reader.read(
-                        self._engine.usual, noise_weight=noise_weight,
-                        disturbance_weight=disturbance_weight, bounds=bounds,
-                    )
-                    own = found if own is None else own.over(found)
-                try:
-                    return self._engine.step(y_array, u_array, dt, own, began)
-                except EngineChangeError as change:
-                    self._change_engine(change)
-                return self._engine.step(y_array, u_array, dt, own, began)
-            finally:
-                self._stepping = False
-        finally:
-            self._stepping = False
+            return self._engine.step(y_array, u_array, dt, own, began)
+        except EngineChangeError as change:
+            self._change_engine(change)
+        return self._engine.step(y_array, u_array, dt, own, began)
 
     def _change_engine(self, change: EngineChangeError) -> None:
         self._engine = change.engine
@@ -452,11 +452,7 @@ class MovingHorizonEstimator:
 
     def _measurement(self, y: ArrayLike | None) -> Array:
         p = self.system.p
-        if type(y) is np.ndarray and y.shape == (p,) and y.dtype == np.float64:
-            return y
-        if y is None:
-            return np.full(p, np.nan)
-        return vector("y", y, p, finite=False)
+        return np.full(p, np.nan) if y is None else vector("y", y, p, finite=False)
 
     def _sampled(self, y: ArrayLike | None, sensors: ArrayLike) -> tuple[Array, Conditions | None]:
         """y(t) with NaN where it was not sampled, and the conditions that say so."""
@@ -790,6 +786,9 @@ class MovingHorizonEstimator:
         )
         self.settings = saved["settings"]
         self.load_state_dict(saved["state"])
+
+
+_UPDATE = MovingHorizonEstimator.update.__code__
 
 
 def _nominal(parameters: ArrayLike | None) -> tuple[float, ...]:
