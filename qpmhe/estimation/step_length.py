@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 # A step that is off by more than this many standard deviations of w is too long. An Euler step is
 # a coarse map by choice, which often is what the data were simulated with.
-_TOO_LONG = {"euler": 1.0}
+_TOO_LONG = {"euler": 10.0}
 _USUALLY_TOO_LONG = 0.1
 
 # Random points within one standard deviation of the prior.

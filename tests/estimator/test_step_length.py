@@ -91,7 +91,7 @@ def test_where_there_is_no_disturbance_the_prior_is_the_unit():
 
 def test_euler_is_a_coarse_map_by_choice():
     build(*made(MILD, method="euler"))  # 0.2 deviations
-    with pytest.warns(qpmhe.ModelWarning, match=r"expected at most 1\)"):
+    with pytest.warns(qpmhe.ModelWarning, match=r"expected at most 10\)"):
         build(*made(STIFF, method="euler", dt=0.03))
 
 

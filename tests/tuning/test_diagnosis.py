@@ -35,6 +35,7 @@ def missing(case, rows):
     return {"measurements": y}
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.ModelWarning")  # a Q too small makes steps too long
 @pytest.mark.parametrize("title", planted.FAULTS)
 def test_planted_fault_is_named_first_in_most_records(title):
     kind, plant, models = planted.FAULTS[title]
