@@ -229,9 +229,10 @@ class Optimizer:
             self._descend(problem, outcome, start, limit)
             return
         best, surrogate = outcome.trial, problem.with_cost(problem.surrogate)
-        outcome.trial = surrogate.judged(best)
+        outcome.trial = began = surrogate.judged(best)
         self._descend(surrogate, outcome, start, limit)
-        found = problem.judged(outcome.trial)
+        # The candidate's own trajectory may be none of the model's, and its J that of a roll-out.
+        found = best if outcome.trial is began else problem.judged(outcome.trial)
         if found.cost < math.inf:
             outcome.followed = found.trajectory
         outcome.trial = found if found.cost < _target(best) else best

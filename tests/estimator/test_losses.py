@@ -7,6 +7,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.codegen.compiler import find_compiler
 from qpmhe.costs import Barron, Cauchy, GemanMcClure, Huber, Power, Quadratic
 from qpmhe.errors import OptionError, WeightError
 
@@ -198,3 +199,36 @@ def test_the_surrogate_goes_on_where_the_candidate_is_the_estimate():
         assert_same(other.update(y), kept[-1])
     assert any(Status.CANDIDATE in estimate.status for estimate in kept[:7])
     assert np.abs(kept[-1].state - STATES[20]).max() < 0.3
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_a_search_that_ends_at_once_does_not_take_the_candidate_for_a_find(engine):
+    """Corrections leave the directions of G, so that J of the candidate is that of a roll-out."""
+    if engine == "compiled" and find_compiler() is None:
+        pytest.skip("there is no C compiler")
+    g = np.array([[1.0], [0.02]])
+
+    def model(x):
+        return np.stack([0.9 * x[..., 0] + 0.1 * x[..., 1],
+                         0.8 * x[..., 1] + 0.1 * np.sin(x[..., 0])], -1)
+
+    system = qpmhe.System(model, lambda x: x[..., :1], n=2, p=1, disturbance_matrix=g)
+    cost = qpmhe.RobustCost(
+        prior=np.eye(2), disturbance=[[500.0]], noise=qpmhe.GemanMcClure([[10.0]])
+    )
+    observer = qpmhe.Luenberger([[0.2], [0.3]])
+    rng = np.random.default_rng(0)
+    for budget in (1e-12, 1.0):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=12, initial_state=[1.0, 0.0], engine=engine,
+            max_qps=2, time_budget=budget,
+        )
+        assert mhe.engine == engine
+        improved = 0
+        for t in range(14):
+            estimate = mhe.update(np.sin(0.3 * t) + rng.normal(size=1))
+            if estimate.improved:
+                improved += 1
+                ahead = estimate.trajectory[1:] - model(estimate.trajectory[:-1])
+                np.testing.assert_allclose(ahead, estimate.disturbances @ g.T, atol=1e-12)
+        assert bool(improved) == (budget == 1.0)

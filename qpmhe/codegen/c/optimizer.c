@@ -422,13 +422,17 @@ static void mhe_search(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int b
     mhe_weigh(e, k, o->best);
     mhe_descend(e, k, o, before, limit);
     mhe_set_widening(k, e->settings, 0);
-    mhe_weigh(e, k, o->best);
+    /* Where nothing was found, the true cost is known. That of the candidate may be of a roll-out,
+     * and its own trajectory none of the model's. */
+    const int found = memcmp(o->best->x, k->kept.x, size) != 0;
+    if (found) mhe_weigh(e, k, o->best);
+    else o->best->cost = k->kept.cost;
     o->events |= MHE_GRADUATED;
     if (isfinite(o->best->cost)) {
         memcpy(k->followed, o->best->x, size);
         o->followed = 1;
     }
-    if (o->best->cost < target) return;
+    if (found && o->best->cost < target) return;
     if (from_candidate) {
         o->spare = o->best;
         o->best = o->candidate;
