@@ -57,8 +57,9 @@ from .observers import (
 )
 
 if TYPE_CHECKING:
-    from . import certificates, plots, records, studies, tuning
-    from .tuning import diagnose, tune
+    from . import certificates, diagnosis, plots, records, studies, tuning
+    from .diagnosis import diagnose
+    from .tuning import tune
 
 
 def _compiled_engine(
@@ -86,8 +87,8 @@ load_run = Run.load
 
 
 # What most programs do without is imported when it is first named.
-_LATE_MODULES = ("certificates", "plots", "records", "studies", "tuning")
-_LATE_FUNCTIONS = {"diagnose": "tuning", "tune": "tuning"}
+_LATE_MODULES = ("certificates", "diagnosis", "plots", "records", "studies", "tuning")
+_LATE_FUNCTIONS = {"diagnose": "diagnosis", "tune": "tuning"}
 
 
 def __getattr__(name: str) -> Any:
@@ -156,6 +157,7 @@ __all__ = [
     "compile",
     "design_luenberger",
     "diagnose",
+    "diagnosis",
     "errors",
     "from_casadi",
     "from_control",

@@ -230,7 +230,7 @@ def _check_page(path: str) -> None:
 
 def _diagnose(console: Console, summary: Any, path: str, quiet: bool) -> None:
     """Look for faults in the run, and write the page."""
-    from ..tuning import diagnose
+    from ..diagnosis import diagnose
 
     model = summary.model
     try:

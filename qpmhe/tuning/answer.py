@@ -17,10 +17,10 @@ from qpmhe_solvers.values import shown
 
 from .._checks import Array, dimension
 from ..costs import Cost
+from ..diagnosis.findings import listed
 from ..errors import OptionError
 from ..observers import Observer
 from ..plots.style import STYLES, panels
-from .findings import listed
 from .likelihood import Likelihood
 from .score import Score
 from .search import NORMAL, limit

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from .._checks import Array
+from ..diagnosis.bank import FilterBank, Hypothesis
 from ..errors import QpmheError
 from ..model.expressions import import_casadi
 from ..model.system import System
-from .bank import FilterBank, Hypothesis
 from .data import Data, Mask
 from .structures import Structure
 from .weights import Weights

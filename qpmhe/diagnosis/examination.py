@@ -17,7 +17,7 @@ from ..model.residuals import difference
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
 from .faults import LEAST_GAIN, SCALED, Fault, search
 from .findings import Finding, Names, listed, number, percent
-from .memory import MemoryBank
+from .sensor_memory import MemoryBank
 from .stuck import stuck
 
 # The search takes at most so many samples: of a longer record, those least like the model.

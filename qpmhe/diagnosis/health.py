@@ -19,7 +19,7 @@ from ..plots.style import LIGHT, STYLES
 from .findings import Finding, percent
 
 if TYPE_CHECKING:
-    from .diagnosis import Diagnosis
+    from .diagnose import Diagnosis
 
 _LIMIT: dict[str, Any] = {"color": "0.35", "linewidth": 0.9, "linestyle": "--"}
 _MOST_LINES = 6

@@ -9,12 +9,12 @@ from typer.testing import CliRunner
 
 import qpmhe
 from qpmhe.cli.app import app
+from qpmhe.diagnosis import observability
+from qpmhe.diagnosis.bank import FilterBank, Hypothesis
+from qpmhe.diagnosis.faults import Fault, _disjoint
+from qpmhe.diagnosis.sensor_memory import MemoryBank
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 from qpmhe.estimation.observability import prior_shares
-from qpmhe.tuning import observability
-from qpmhe.tuning.bank import FilterBank, Hypothesis
-from qpmhe.tuning.faults import Fault, _disjoint
-from qpmhe.tuning.memory import MemoryBank
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "studies"))
 
