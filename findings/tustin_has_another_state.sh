@@ -22,7 +22,8 @@ A = numpy.array([[0.0, 1.0], [-4.0, -0.4]])
 B, C, D, dt = numpy.array([[0.0], [1.0]]), numpy.eye(2), numpy.zeros((2, 1)), 0.1
 omega = 2.5  # 25 samples a period
 physical = numpy.linalg.solve(1j * omega * numpy.eye(2) - A, B[:, 0])
-models = {method: cont2discrete((A, B, C, D), dt, method=method)[:4] for method in ("zoh", "euler", "foh", "bilinear", "backward_diff")}
+methods = "zoh", "euler", "foh", "bilinear", "backward_diff"
+models = {method: cont2discrete((A, B, C, D), dt, method=method)[:4] for method in methods}
 system = control.sample_system(control.ss(A, B, C, D), dt, method="bilinear")
 models["control, bilinear"] = system.A, system.B, system.C, system.D
 print("amplitudes under a sine, largest relative gap to those of the continuous state:")
