@@ -20,7 +20,7 @@ SHARE = 0.022
 # Examples of each property whose test names no number: in the sample, and in all.
 FEW, MANY = 6, 25
 # Begun first, so that no long test is the last one: most of these tests start processes.
-FIRST = {"studies", "tests", "examples", "records"}
+FIRST = {"studies", "tests", "cli", "examples", "records"}
 # Folders that keep every value of every parameter, and most cases that a test keeps for that.
 WHOLE, MOST = {"oracles", "properties"}, 11
 LEFT_OUT = pytest.StashKey[int]()

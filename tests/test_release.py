@@ -6,11 +6,11 @@ import tomllib
 import zipfile
 from pathlib import Path
 
-import check_dist
 from packaging.requirements import Requirement
 from packaging.version import Version
 
 import qpmhe
+from tests import check_dist
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import qpmhe
-from adapters.twins import NONE, M, N, P, check, output, plain, points, rate
 from qpmhe import from_casadi
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import CompilationError, InvalidInputError, ModelError, OptionError, ShapeError
+from tests.adapters.twins import NONE, M, N, P, check, output, plain, points, rate
 
 ca = pytest.importorskip("casadi")
 

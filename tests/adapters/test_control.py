@@ -8,9 +8,9 @@ import pytest
 from scipy.signal import cont2discrete
 
 import qpmhe
-from adapters.twins import same
 from qpmhe import System, from_control
 from qpmhe.errors import InvalidInputError, ModelError, OptionError
+from tests.adapters.twins import same
 
 A = np.array([[0.0, 1.0], [-2.0, -0.3]])
 B, C, D = np.array([[0.0], [1.5]]), np.array([[1.0, 0.2]]), np.array([[0.4]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import qpmhe
-from adapters.twins import NONE, same
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
+from tests.adapters.twins import NONE, same
 
 jax = pytest.importorskip("jax")
 jnp = jax.numpy

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import qpmhe
-from adapters import twins
-from adapters.twins import LANGUAGES, STEPS, THETA, M, N, P, made, plain, points
 from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
+from tests.adapters import twins
+from tests.adapters.twins import LANGUAGES, STEPS, THETA, M, N, P, made, plain, points
 
 # Those that evaluate by code of another package, and those whose functions pickle.
 FOREIGN = ["casadi", "interpreted", "jax"]
@@ -248,7 +248,7 @@ def test_pickled_here_and_in_a_spawned_process(language, monkeypatch):
     assert system.states is box
     (x,), (u,) = points(1)
     data = pickle.dumps((system, x, u))
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         there = pool.submit(value_of, data).result(timeout=100)
     for found in (value_of(data), there):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import special
 
-from adapters.twins import NONE, same
 from qpmhe import System, from_sympy
 from qpmhe.errors import ModelError
+from tests.adapters.twins import NONE, same
 
 sympy = pytest.importorskip("sympy")
 X = sympy.symbols("x1 x2")

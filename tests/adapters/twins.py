@@ -5,10 +5,10 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from estimator.plain import euler, rk4
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
+from tests.estimation.plain import euler, rk4
 
 NONE = np.zeros(0)
 FUNCTIONS = ("f", "h", "f_jacobian", "h_jacobian")

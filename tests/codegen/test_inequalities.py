@@ -4,9 +4,9 @@ import functools
 
 import numpy as np
 import pytest
-from oracles.window_qps import SOLVED, CSolver, random_qp
 
 from qpmhe.codegen.compiler import find_compiler
+from tests.oracles.window_qps import SOLVED, CSolver, random_qp
 
 piqp = pytest.importorskip("piqp")
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")

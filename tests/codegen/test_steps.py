@@ -5,7 +5,6 @@ import ctypes
 import casadi as ca
 import numpy as np
 import pytest
-from oracles.test_kalman import Plant, distance, kalman
 
 import qpmhe
 from qpmhe import Status
@@ -13,6 +12,7 @@ from qpmhe.codegen import write
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
 from qpmhe.estimation.snapshot import read, written
+from tests.oracles.test_kalman import Plant, distance, kalman
 
 from .cases import case
 

@@ -1,4 +1,4 @@
-"""The folder of examples on the path: `examples` itself is the name of this package."""
+"""The folder of examples on the path, as its programs have it."""
 
 import sys
 from pathlib import Path

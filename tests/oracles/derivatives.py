@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from estimator.untraced import untraced
 
 import qpmhe
+from tests.estimation.untraced import untraced
 
 # Of the largest entry of a derivative: differences of the fourth order reach less.
 ACCURACY = 1e-6

@@ -5,12 +5,12 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from estimator.untraced import untraced
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import qpmhe
 from qpmhe.estimation.sensitivity import NAMES
+from tests.estimation.untraced import untraced
 
 from .derivatives import (
     ALL,

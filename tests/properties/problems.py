@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 import qpmhe
-from tests.estimator.untraced import untraced
+from tests.estimation.untraced import untraced
 from tests.oracles.nlp import Row, Window, ca, module_of, quadratic, spd, times
 
 SETS = {"states": "x", "disturbances": "w", "noises": "v"}

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from estimator.untraced import untraced
 from scipy.optimize import least_squares
 
 import qpmhe
 from qpmhe import Status
+from tests.estimation.untraced import untraced
 
 from .plain import observer_path
 from .plain import steps as steps_of

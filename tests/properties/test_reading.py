@@ -12,8 +12,8 @@ from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import QpmheError
 from qpmhe.solvers import available
 from tests.codegen.cases import CASES, FEATURES, Case, case
-from tests.estimator.same import assert_same
-from tests.estimator.systems import Pendulum
+from tests.estimation.same import assert_same
+from tests.estimation.systems import Pendulum
 
 # Without inequalities, and ProxQP's dense solver: even of two equal QPs in a row, solved by two new
 # solvers, its last digit depends on where memory happens to lie.

@@ -7,12 +7,12 @@ import sys
 import numpy as np
 import pytest
 import qpsolvers
-from solvers.problems import CASES, make
 
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.studies.qpbenchmark_set import export_qpbenchmark
 from qpmhe_solvers import QP, create
 from qpmhe_solvers.files import dump
+from tests.solvers.problems import CASES, make
 
 
 @pytest.fixture

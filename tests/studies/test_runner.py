@@ -10,14 +10,14 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from rich.console import Console
-from solvers.hostile_backend import CrashingOnce, entry
-from solvers.problems import registered
 
 import qpmhe_solvers
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.studies import Store, StoreError, Study, StudyError, run, runner
 from qpmhe.studies import store as store_module
 from qpmhe.studies.store import Writer
+from tests.solvers.hostile_backend import CrashingOnce, entry
+from tests.solvers.problems import registered
 
 from .report_study import command
 

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from estimator.untraced import untraced as untraced_function
 
 import qpmhe
 from qpmhe.tuning.data import checked_data
 from qpmhe.tuning.likelihood import Likelihood
 from qpmhe.tuning.structures import Structure
 from qpmhe.tuning.weights import KINDS, Weights
+from tests.estimation.untraced import untraced as untraced_function
 
 
 def untraced(system):

@@ -7,8 +7,7 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError
-
-from .spoil import check, cost_of
+from tests.estimation.spoil import check, cost_of
 
 A, B = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[0.0], [1.0]])
 C, START = np.array([[1.0, 0.5], [0.0, 2.0]]), np.array([1.0, -1.0])

@@ -7,8 +7,7 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import ModelError
-
-from .spoil import check
+from tests.estimation.spoil import check
 
 NONE = np.zeros(0)
 COMPLEX, DIFFERENCES = "complex step", "finite differences"

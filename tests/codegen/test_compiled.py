@@ -12,8 +12,9 @@ from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
 from qpmhe.estimation.snapshot import read
-from tests.codegen.cases import Case, case, recorded, spd
-from tests.codegen.test_agreement import ARRAYS, agree
+
+from .cases import Case, case, recorded, spd
+from .test_agreement import ARRAYS, agree
 
 casadi = pytest.importorskip("casadi")
 pytestmark = [

@@ -6,10 +6,9 @@ import pytest
 import qpmhe
 from qpmhe import Status
 from qpmhe.errors import InvalidInputError, OptionError
-
-from . import spoil
-from .plain import differences, spd
-from .spoil import check, cost_of
+from tests.estimation import spoil
+from tests.estimation.plain import differences, spd
+from tests.estimation.spoil import check, cost_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 each_filter = pytest.mark.parametrize("make", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])

@@ -10,9 +10,8 @@ import qpmhe
 from qpmhe import Status
 from qpmhe.errors import ShapeError, WeightError
 from qpmhe.observers.projection import NearestPoint
-
-from .spoil import observer_alone
-from .systems import linear
+from tests.estimation.spoil import observer_alone
+from tests.estimation.systems import linear
 
 INF = math.inf
 

@@ -9,9 +9,8 @@ import qpmhe
 from qpmhe import Box, Luenberger, MovingHorizonEstimator, QuadraticCost
 from qpmhe.certificates.monitor import _barred
 from qpmhe.errors import InvalidInputError
-
-from .plain import spd
-from .spoil import check
+from tests.estimation.plain import spd
+from tests.estimation.spoil import check
 
 PRIOR = np.array([1.0, 0.5])  # standard deviations of speed and of gain
 DT, NOISE, WANDER, HORIZON = 0.1, 0.05, 0.01, 10

@@ -17,10 +17,9 @@ from qpmhe.observers import (
     UnscentedKalman,
     design_luenberger,
 )
-
-from .plain import spd
-from .spoil import check, observer_alone
-from .systems import linear
+from tests.estimation.plain import spd
+from tests.estimation.spoil import check, observer_alone
+from tests.estimation.systems import linear
 
 DT = 0.05
 NONE = np.zeros(0)

@@ -9,8 +9,7 @@ import pytest
 import qpmhe
 from qpmhe import Box, Constraint, Polytope, Status
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
-
-from .same import assert_same
+from tests.estimation.same import assert_same
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 

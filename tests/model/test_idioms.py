@@ -11,10 +11,11 @@ import pytest
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.model.tracing import traced
+from tests.estimation import spoil
+from tests.estimation.same import Interruption
+from tests.estimation.spoil import cost_of
 
-from . import idioms, spoil
-from .same import Interruption
-from .spoil import cost_of
+from . import idioms
 
 
 def points(count, seed=5):

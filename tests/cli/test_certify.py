@@ -13,8 +13,7 @@ from qpmhe import certificates
 from qpmhe.certificates.evidence import at_most
 from qpmhe.cli.certify import certify
 from qpmhe.errors import OptionError, QpmheError
-
-from .helpers import box
+from tests.certificates.helpers import box
 
 MODEL = '''
 import numpy as np

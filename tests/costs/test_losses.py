@@ -10,10 +10,9 @@ from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.costs import Barron, Cauchy, GemanMcClure, Huber, Power, Quadratic
 from qpmhe.errors import OptionError, WeightError
-
-from .plain import differences, huber, quadratic, spd
-from .same import assert_same
-from .spoil import check
+from tests.estimation.plain import differences, huber, quadratic, spd
+from tests.estimation.same import assert_same
+from tests.estimation.spoil import check
 
 DIAGONAL = np.diag([4.0, 0.25, 1.5])
 FULL = spd(np.random.default_rng(1), 3)

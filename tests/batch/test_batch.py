@@ -9,9 +9,8 @@ import qpmhe
 from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, ShapeError
-
-from .spoil import check
-from .untraced import untraced
+from tests.estimation.spoil import check
+from tests.estimation.untraced import untraced
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 NAN = np.nan

@@ -12,9 +12,8 @@ import pytest
 import qpmhe
 from qpmhe import Huber, ObserverPrior, Power, QuadraticCost, RobustCost
 from qpmhe.errors import InvalidInputError, OptionError, WeightError
-
-from .plain import spd
-from .spoil import check
+from tests.estimation.plain import spd
+from tests.estimation.spoil import check
 
 TERMS = ("prior", "disturbance", "noise")
 

@@ -5,12 +5,12 @@ import io
 import numpy as np
 import pytest
 from rich.console import Console
-from solvers.problems import CASES, make, registered
 
 from qpmhe.cli import solve_qp
 from qpmhe.errors import BackendError, InvalidInputError, OptionError
 from qpmhe_solvers import QP, Backend, SolverOptions, available, create
 from qpmhe_solvers.files import dump, load
+from tests.solvers.problems import CASES, make, registered
 
 
 class Screen:

@@ -5,9 +5,8 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError
-
-from . import spoil
-from .spoil import cost_of
+from tests.estimation import spoil
+from tests.estimation.spoil import cost_of
 
 YS = np.random.default_rng(2).normal(size=30)
 

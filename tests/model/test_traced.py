@@ -11,10 +11,9 @@ import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import EngineWarning, OptionError
 from qpmhe.model.tracing import traced
-
-from . import spoil
-from .same import Interruption
-from .spoil import cost_of
+from tests.estimation import spoil
+from tests.estimation.same import Interruption
+from tests.estimation.spoil import cost_of
 
 ZOO = qpmhe.models.catalogue()
 ENGINES = ["python", "compiled"] if find_compiler() else ["python"]
