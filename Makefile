@@ -6,7 +6,7 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: reproduce test test-all lint types examples gallery benchmarks comparison choice certificates docs release-check minimal-versions clean
+.PHONY: reproduce test test-all test-rest lint types examples gallery benchmarks comparison choice certificates docs release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.
 $(VENV)/.%: pyproject.toml
@@ -17,12 +17,15 @@ $(VENV)/.%: pyproject.toml
 reproduce: $(VENV)/.solvers
 	$(BIN)/qpmhe reproduce $(ARGS)
 
-# A sample of five minutes on two cores: every test, but not all of its cases.
+# Some cases of every test that is not slow, all cases, and what the first leaves out.
 test: $(VENV)/.test
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal $(ARGS)
 
 test-all: $(VENV)/.test
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --all $(ARGS)
+
+test-rest: $(VENV)/.test
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal --rest $(ARGS)
 
 # Style, and which room may import which.
 lint: $(VENV)/.dev

@@ -1,12 +1,13 @@
-"""Which tests run: a sample of about five minutes, or everything with ``--all``.
+"""Which cases run: some of every test that is not slow, all, or those that the first leave out.
 
-The sample holds every test but those marked ``slow``. Of a test with several cases it holds one
-and a share of the others: first those that bring new values of the parameters, and in `oracles`
-and `properties` all of these, up to a number that seeds alone exceed. The choice depends on the
-names of the cases only, so that the processes of pytest-xdist agree on it.
+`make test` runs the tests that have no parameters, and of each test with parameters up to `CASES`
+of its cases, or `MORE` in the folders of `DEEP`. They are taken one by one: each is the first of
+those that have most values of parameters which no case before it has; once every value is there,
+no more are taken. Tests that are marked `slow` are left out. ``--all`` runs everything; ``--rest``
+runs everything that `make test` does not, and once more, at full length, the tests that are marked
+`shortened`, which do less without ``--all``.
 """
 
-import hashlib
 import os
 import sys
 from collections import defaultdict
@@ -14,22 +15,19 @@ from collections import defaultdict
 import hypothesis
 import pytest
 
-SEED = 1
-# The share of the cases beyond the first that a test keeps.
-SHARE = 0.022
-# Examples of each property whose test names no number: in the sample, and in all.
+CASES, MORE, DEEP = 3, 12, {"oracles", "properties"}
+# Examples of each property whose test names no number: without --all, and with it.
 FEW, MANY = 6, 25
 # Begun first, so that no long test is the last one: most of these tests start processes.
 FIRST = {"studies", "tests", "cli", "examples", "records"}
-# Folders that keep every value of every parameter, and most cases that a test keeps for that.
-WHOLE, MOST = {"oracles", "properties"}, 11
-LEFT_OUT = pytest.StashKey[int]()
-COLLECTED = pytest.StashKey[int]()
+# How many cases run, and of how many.
+CASES_OF = pytest.StashKey[tuple[int, int]]()
 
 
 def pytest_addoption(parser):
     group = parser.getgroup("qpmhe")
     group.addoption("--all", action="store_true", help="run all cases of all tests, slow ones too")
+    group.addoption("--rest", action="store_true", help="run what is left out without --all")
     group.addoption(
         "--fuzz-steps", type=int, default=0, metavar="N",
         help="random steps to compare with the second implementation (default: some hundreds)",
@@ -38,6 +36,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    config.option.all = config.option.all or config.option.rest
     examples = MANY if config.option.all else FEW
     hypothesis.settings.register_profile("here", max_examples=examples)
     hypothesis.settings.load_profile("here")
@@ -51,60 +50,77 @@ def named(config, item):
     return any("::" in one and one.rpartition("::")[2] == item.name for one in config.args)
 
 
-def sample(cases):
-    """One of the cases and a share of the others, new values of the parameters first."""
-    cases = sorted(cases, key=lambda item: hashlib.sha256(f"{SEED}{item.nodeid}".encode()).digest())
-    seen, kept, others = set(), [], []
-    for item in cases:
-        values = {(name, id(value)) for name, value in item.callspec.params.items()}
-        (others if values <= seen else kept).append(item)
+def values_of(item):
+    """The values of a case's parameters; they are objects that all cases of a test share."""
+    return {(name, id(value)) for name, value in item.callspec.params.items()}
+
+
+def some(cases):
+    """Some cases of one test, each with as many new values of parameters as there are."""
+    most = MORE if cases[0].path.parent.name in DEEP else CASES
+    left, kept, seen = [(item, values_of(item)) for item in cases], [], set()
+    while left and len(kept) < most:
+        item, values = max(left, key=lambda one: len(one[1] - seen))
+        if values <= seen:
+            break
+        left.remove((item, values))
+        kept.append(item)
         seen |= values
-    wanted = 1 + round(SHARE * (len(cases) - 1))
-    if cases[0].path.parent.name in WHOLE:
-        wanted = max(wanted, min(len(kept), MOST))
-    return (kept + others)[:wanted]
+    return kept
+
+
+def chosen(items):
+    """The cases that `make test` runs."""
+    tests = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("slow") is None:
+            tests[item.nodeid.partition("[")[0]].append(item)
+    return {
+        item for cases in tests.values()
+        for item in (some(cases) if hasattr(cases[0], "callspec") else cases)
+    }
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
-    config.stash[COLLECTED] = config.stash[LEFT_OUT] = len(items)
-    tests, kept = defaultdict(list), set()
-    for item in items:
-        if config.option.all or named(config, item):
-            kept.add(item)
-        elif item.get_closest_marker("slow") is None:
-            tests[item.nodeid.partition("[")[0]].append(item)
-    for cases in tests.values():
-        kept.update(sample(cases) if len(cases) > 1 else cases)
+    collected, kept, option = len(items), set(items), config.option
+    if option.rest:
+        kept -= {one for one in chosen(items) if one.get_closest_marker("shortened") is None}
+    elif not option.all:
+        kept = chosen(items) | {item for item in items if named(config, item)}
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    config.stash[CASES_OF] = len(kept), collected
     kept = [item for item in items if item in kept]
     items[:] = sorted(kept, key=lambda item: item.path.parent.name not in FIRST)
-    config.stash[LEFT_OUT] -= len(items)
 
 
 def pytest_sessionfinish(session):
     if hasattr(session.config, "workeroutput"):  # a process of pytest-xdist
-        stash = session.config.stash
-        session.config.workeroutput["left_out"] = stash.get(LEFT_OUT, 0), stash.get(COLLECTED, 0)
+        session.config.workeroutput["cases"] = session.config.stash.get(CASES_OF, None)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node, error):
-    left_out, collected = getattr(node, "workeroutput", {}).get("left_out", (0, 0))
-    node.config.stash[LEFT_OUT], node.config.stash[COLLECTED] = left_out, collected
+    cases = getattr(node, "workeroutput", {}).get("cases")
+    if cases:
+        node.config.stash[CASES_OF] = tuple(cases)
 
 
 def pytest_report_header(config):
-    chosen = "all" if config.option.all else f"a sample (seed {SEED}); --all runs all of them"
-    return f"cases: {chosen}"
+    if config.option.rest:
+        return "cases: those that make test leaves out"
+    if config.option.all:
+        return "cases: all"
+    return (
+        f"cases: up to {CASES} of each test, {MORE} in {' and '.join(sorted(DEEP))}, none of slow "
+        "ones; --all runs all, --rest the others"
+    )
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    left_out, collected = config.stash.get(LEFT_OUT, 0), config.stash.get(COLLECTED, 0)
-    if left_out:
-        terminalreporter.write_line(
-            f"{left_out} of {collected} cases left out; --all (make test-all) runs them too"
-        )
+    cases = config.stash.get(CASES_OF, None)
+    if cases:
+        terminalreporter.write_line(f"cases: {cases[0]} of {cases[1]}")
 
 
 @pytest.fixture(autouse=True)

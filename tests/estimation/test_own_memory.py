@@ -142,6 +142,7 @@ def stride(pytestconfig):
     return 150 if pytestconfig.option.all else 300
 
 
+@pytest.mark.shortened
 @pytest.mark.parametrize("name", ["reinitialized in a set", "smoothed", "kalman", "compiled"])
 def test_an_interrupted_step_was_not_taken(name, stride):
     options, generator = CASES[name], np.random.default_rng(1)

@@ -201,6 +201,7 @@ def test_of_a_linear_system_they_are_the_kalman_filters(horizon):
             )
 
 
+@pytest.mark.shortened
 @pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
 @settings(deadline=None)
 @given(

@@ -28,6 +28,7 @@ FEW = {"numpy": (120, 40), "casadi": (180, 90), "jax": (90, 45)}
 WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing in writings]
 
 
+@pytest.mark.shortened
 @pytest.mark.parametrize("seed", [3, 11])
 def test_cheap_steps_keep_the_promise(pytestconfig, seed):
     steps = 1000 if pytestconfig.option.all else 200
@@ -75,6 +76,7 @@ def test_the_judge_of_mixed_steps_sees_a_broken_promise():
     }
 
 
+@pytest.mark.shortened
 @pytest.mark.parametrize(("source", "writing"), WAYS)
 def test_every_step_is_what_it_says(pytestconfig, source, writing):
     if source != "numpy":

@@ -105,6 +105,7 @@ class Case:
 special = st.tuples(st.integers(0, 7), st.integers(0, 1), st.sampled_from(SPECIALS))
 
 
+@pytest.mark.shortened
 @pytest.mark.parametrize("backend", qpmhe.solvers.available())
 @settings(derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
