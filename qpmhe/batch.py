@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import InitVar, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from time import perf_counter
@@ -221,9 +221,7 @@ class BatchEstimator:
         if isinstance(self._engine, _Looped):
             return self._engine.step(y, u)
         try:
-            return BatchEstimate(
-                **self._engine.step(y, u), delay=self.settings.delay, engine=self.engine
-            )
+            return BatchEstimate(**self._engine.step(y, u), engine=self.engine)
         except ModelChangedError as error:
             self._leave_compiled(error)
         return self._step(y, u)
@@ -260,9 +258,8 @@ class BatchEstimator:
         found = BatchRun(
             states=np.empty((shape[0], shape[1] + 1, n)), filtered=np.empty((*shape, n)),
             observer_states=np.empty((shape[0], shape[1] + 1, n)),
-            delayed=np.full((*shape, n), np.nan), costs=np.empty(shape),
-            candidate_costs=np.empty(shape), statuses=np.empty(shape, np.int64),
-            qps=np.empty(shape, np.intp),
+            costs=np.empty(shape), candidate_costs=np.empty(shape),
+            statuses=np.empty(shape, np.int64), qps=np.empty(shape, np.intp),
             rejected_sensors=np.empty(
                 (*shape, len(self.observer.sensors) * self.observer.rejects), np.bool_
             ),
@@ -273,8 +270,6 @@ class BatchEstimator:
             one = self._step(ys[:, t], us[:, t])
             found.states[:, t + 1], found.filtered[:, t] = one.states, one.filtered
             found.observer_states[:, t + 1] = one.observer_states
-            if one.delayed is not None:
-                found.delayed[:, t] = one.delayed
             found.rejected_sensors[:, t] = one.rejected_sensors
             found.costs[:, t], found.candidate_costs[:, t] = one.costs, one.candidate_costs
             found.statuses[:, t], found.qps[:, t] = one.flags, one.qps
@@ -305,7 +300,6 @@ class _Looped:
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array,
         traced: bool = True,
     ) -> None:
-        self._delay = settings.delay
         scaled = system.copy(_scales(system, cost, observer), traced=traced)
         self.engines = [
             PythonEngine(scaled.copy(traced=traced), observer, cost, settings, state.copy())
@@ -359,7 +353,6 @@ class _Looped:
                 np.array([one.filtered for one in found]),
                 np.array([one.observer_state for one in found]),
                 np.array([one.rejected for one in found]),
-                self._delay,
             )
         except BaseException:
             for engine in self.engines:
@@ -388,8 +381,6 @@ class BatchEstimate:
         The observers' states z(t+1), from which they continue.
     rejected_sensors : (K, s) bool array
         Whether each observer's gate rejected each of its s sensors; s is 0 without a gate.
-    delayed : (K, n) array or None
-        Estimates of x(t+1-k) for the estimator's delay k.
     engine : str
         The engine that ran the step: ``python`` or ``compiled``.
     """
@@ -404,12 +395,7 @@ class BatchEstimate:
     filtered: Array
     observer_states: Array
     rejected_sensors: NDArray[np.bool_]
-    delay: InitVar[int] = 0
     engine: str = "python"
-
-    def __post_init__(self, delay: int) -> None:
-        newest = self.trajectories.shape[1] - 1
-        self.delayed = None if delay > newest else self.trajectories[:, newest - delay]
 
     @property
     def states(self) -> Array:
@@ -446,9 +432,8 @@ class BatchRun:
         Estimates of x(0), ..., x(T); the estimate of x(t) does not use y(t).
     observer_states : (K, T + 1, n) array
         The observers' own states z(0), ..., z(T).
-    filtered, delayed : (K, T, n) array
-        Estimates of x(t) that use y(t), and delayed estimates, NaN until the windows reach the
-        delay.
+    filtered : (K, T, n) array
+        Estimates of x(t) that use y(t).
     costs, candidate_costs : (K, T) array
         True cost J of estimates and candidates.
     statuses, qps : (K, T) int array
@@ -462,7 +447,6 @@ class BatchRun:
     states: Array
     observer_states: Array
     filtered: Array
-    delayed: Array
     costs: Array
     candidate_costs: Array
     statuses: Flags

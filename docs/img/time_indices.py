@@ -39,7 +39,7 @@ with rc_context({"font.size": 10.0, "text.color": INK, "svg.hashsalt": "qpmhe"})
     panel.plot([0, 1], [STATE] * 2, "o", color=INK, markersize=8)
     panel.plot(4, STATE, "o", color=INK, markersize=8)
     for k, color, label in (
-        (3, GREEN, "delayed\n(delay=3)"), (5, BLUE, "filtered"), (6, ORANGE, "state"),
+        (3, GREEN, "trajectory[-4]"), (5, BLUE, "filtered"), (6, ORANGE, "state"),
     ):
         panel.plot(k, STATE, "o", color=color, markersize=10, zorder=3)
         panel.text(k + 0.05, STATE - 0.17, label, ha="left", va="top", color=color)

@@ -198,7 +198,7 @@ def judge(
             for start in record.starts:
                 mhe.reset(start)
                 run = mhe.run(record.measurements, record.inputs)
-                estimates = causal(run, mhe)
+                estimates = run.filtered
                 size = problem.error(estimates, record.truth)
                 errors.append(rms(size[record.tunes :]))
                 whole.append(rms(size))
@@ -221,18 +221,6 @@ def outside(system: qpmhe.System, estimates: Array) -> float:
         system.states.violation(x, rounding=slack) > 0.0
         for x, slack in zip(estimates, rounding, strict=True) if not np.isnan(x).any()
     ]))
-
-
-def causal(run: Any, mhe: Any) -> Array:
-    """Estimates of x(0), ..., x(T-1): with y of their own time, or with a delay's more."""
-    settings = getattr(mhe, "settings", None)
-    delay = 0 if settings is None else settings.delay
-    if not delay:
-        return run.filtered
-    # delayed[t] is the estimate of x(t + 1 - delay).
-    found = np.full_like(run.filtered, np.nan)
-    found[: len(found) + 1 - delay] = run.delayed[delay - 1 :]
-    return found
 
 
 def rms(size: Array) -> float:

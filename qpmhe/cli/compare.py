@@ -13,7 +13,7 @@ from rich.console import Console
 from .._checks import count, make_folder
 from ..errors import OptionError
 from ..studies import Store, Study, StudyError, run
-from ..studies.grid import READING, WORDS, Measure
+from ..studies.grid import WORDS, Measure
 from ..studies.report import check_libraries
 from . import options
 from .report import show_report
@@ -28,6 +28,7 @@ _FAILING = typer.Option(metavar="DIR", help="Folder for QPs on which a backend f
 _RETRY = typer.Option("--retry-failed", help="Rerun failed cells.")
 
 
+@options.reads_record("max_gap")
 def compare(
     model: Annotated[
         list[str] | None,
@@ -87,31 +88,17 @@ def compare(
     scheduler: Annotated[str | None, _SCHEDULER] = None,
     retry_failed: Annotated[bool, _RETRY] = False,
     keep_failing: Annotated[Path | None, _FAILING] = None,
-    time: options.Time = None,
-    outputs: options.Outputs = None,
-    inputs: options.Inputs = None,
-    truth: options.Truth = None,
-    dt: options.Step = None,
-    time_scale: options.TimeScale = 1.0,
-    skip_repeated: options.SkipRepeated = False,
-    separator: options.Separator = None,
-    decimal: options.Decimal = "auto",
-    encoding: options.Encoding = "utf-8",
-    skip_lines: options.SkipLines = 0,
-    time_format: options.TimeFormat = None,
-    missing: options.Missing = None,
+    reading: Any = None,
 ) -> None:
     """Compare QP backends, caps and numbers of QPs: accuracy and time, a table and a report."""
-    given = locals()
-    reading = {key: given[key] for key in READING if given[key] is not None} if record else {}
     if model is None and steps is None and record is None:
         steps = 100  # all backends at all caps are to be done within ten minutes
     with named_as_options(
         "noise_levels", "seeds", "steps", "deadline", "cell_timeout", starts="--start"
     ):
         what = Study(
-            models=model or ("batch_reactor",), records=record or (), reading=reading,
-            backends=backend or None,
+            models=model or ("batch_reactor",), records=record or (),
+            reading=reading if record else {}, backends=backend or None,
             qps=_numbers("qps", qps),
             solver_iterations=_numbers("solver_iterations", solver_iterations),
             horizons=_numbers("horizons", horizons),

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ..records.bounds import BoundOptions
 
 
+@options.reads_record("truth")
 def estimate(
     model: options.Model,
     record: Annotated[
@@ -29,9 +30,6 @@ def estimate(
     out: Annotated[
         str, typer.Option(help="File to write, .csv or .parquet; - is standard output.")
     ] = "-",
-    time: options.Time = None,
-    outputs: options.Outputs = None,
-    inputs: options.Inputs = None,
     horizon: options.Horizon = None,
     backend: Annotated[str | None, typer.Option(help="QP backend.")] = None,
     max_qps: Annotated[
@@ -89,31 +87,23 @@ def estimate(
     checkpoint_every: Annotated[
         int | None, typer.Option(min=1, help="Samples between checkpoints; default 100.")
     ] = None,
-    dt: options.Step = None,
-    time_scale: options.TimeScale = 1.0,
     equal_steps: Annotated[
         bool,
         typer.Option("--equal-steps", help="Require equal steps; each row is written at once."),
     ] = False,
-    max_gap: options.MaxGap = 500,
-    skip_repeated: options.SkipRepeated = False,
-    separator: options.Separator = None,
-    decimal: options.Decimal = "auto",
-    encoding: options.Encoding = "utf-8",
-    skip_lines: options.SkipLines = 0,
-    time_format: options.TimeFormat = None,
-    missing: options.Missing = None,
     diagnose: Annotated[
         str | None,
         typer.Option(metavar="FILE.html", help="Look for faults of sensors, model and weights, "
                                                "and write a page about them."),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    reading: Any = None,
 ) -> None:
     """Estimate the states of a measured record; in a pipe, line by line."""
     given: dict[str, Any] = {
         name: value for name, value in locals().items() if value is not None
     }
+    given |= given.pop("reading")
     if max_qps is not None:
         given["max_qps"] = _number("--max-qps", max_qps)
     if max_solver_iterations is not None:

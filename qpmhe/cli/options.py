@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Callable
+from functools import wraps
+from inspect import Parameter, signature
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -14,45 +17,9 @@ InitialState = Annotated[
     str | None, typer.Option(help="Initial estimate, numbers separated by commas; default is the "
                                   "model's.")
 ]
-Time = Annotated[str | None, typer.Option(help="Column of the time.")]
-Outputs = Annotated[
-    str | None, typer.Option(help="Columns of the outputs: y1=COLUMN,y2=COLUMN.")
-]
-Inputs = Annotated[str | None, typer.Option(help="Columns of the inputs: u1=COLUMN,u2=COLUMN.")]
-Step = Annotated[
-    float | None, typer.Option(help="Usual step of a discrete-time model, in the model's unit "
-                                    "of time.")
-]
-TimeScale = Annotated[float, typer.Option(help="The record's unit of time in the model's: 0.001 "
-                                               "for a record in ms and a model in s.")]
-MaxGap = Annotated[
-    int, typer.Option(min=0, help="Largest number of missing samples in a row.")
-]
 Engine = Annotated[
     str | None,
     typer.Option(help="python, compiled, or auto: the compiled step if qpmhe compile has made it."),
-]
-Truth = Annotated[
-    str | None, typer.Option(help="Columns of true states: x1=COLUMN,x2=COLUMN.")
-]
-SkipRepeated = Annotated[
-    bool, typer.Option("--skip-repeated", help="Skip lines with the same time as the line before.")
-]
-Separator = Annotated[
-    str | None, typer.Option(help="Separator of a CSV file: a character, or comma, semicolon, "
-                                  "tab, bar, space.")
-]
-Decimal = Annotated[Literal["auto", ".", ","], typer.Option(help="Decimal mark.")]
-Encoding = Annotated[str, typer.Option(help="Text encoding of a CSV file.")]
-SkipLines = Annotated[int, typer.Option(min=0, help="Lines of a CSV file above its header.")]
-TimeFormat = Annotated[
-    str | None,
-    typer.Option(help="Format of the dates, such as '%d/%m/%Y %H:%M:%S'; ISO dates and "
-                      "DD.MM.YYYY need none."),
-]
-Missing = Annotated[
-    list[str] | None,
-    typer.Option(metavar="WORD", help="Word for a missing value; may be repeated."),
 ]
 Width = Annotated[
     str | None,
@@ -60,3 +27,63 @@ Width = Annotated[
                       "(174 mm) or a number of inches."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
+
+# How a record is read: type, default and option.
+_READING: dict[str, tuple[Any, Any, Any]] = {
+    "time": (str | None, None, typer.Option(help="Column of the time.")),
+    "outputs": (str | None, None, typer.Option(
+        help="Columns of the outputs: y1=COLUMN,y2=COLUMN.")),
+    "inputs": (str | None, None, typer.Option(
+        help="Columns of the inputs: u1=COLUMN,u2=COLUMN.")),
+    "truth": (str | None, None, typer.Option(
+        help="Columns of true states: x1=COLUMN,x2=COLUMN.")),
+    "dt": (float | None, None, typer.Option(
+        help="Usual step of a discrete-time model, in the model's unit of time.")),
+    "time_scale": (float, 1.0, typer.Option(
+        help="The record's unit of time in the model's: 0.001 for a record in ms and a model in "
+             "s.")),
+    "max_gap": (int, 500, typer.Option(
+        min=0, help="Largest number of missing samples in a row.")),
+    "skip_repeated": (bool, False, typer.Option(
+        "--skip-repeated", help="Skip lines with the same time as the line before.")),
+    "separator": (str | None, None, typer.Option(
+        help="Separator of a CSV file: a character, or comma, semicolon, tab, bar, space.")),
+    "decimal": (Literal["auto", ".", ","], "auto", typer.Option(help="Decimal mark.")),
+    "encoding": (str, "utf-8", typer.Option(help="Text encoding of a CSV file.")),
+    "skip_lines": (int, 0, typer.Option(min=0, help="Lines of a CSV file above its header.")),
+    "time_format": (str | None, None, typer.Option(
+        help="Format of the dates, such as '%d/%m/%Y %H:%M:%S'; ISO dates and DD.MM.YYYY need "
+             "none.")),
+    "missing": (list[str] | None, None, typer.Option(
+        metavar="WORD", help="Word for a missing value; may be repeated.")),
+}
+
+
+def reads_record(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options for reading a record, without some.
+
+    The command gets those that were given, or have a default, as the dict ``reading``.
+    """
+    chosen = [name for name in _READING if name not in left_out]
+
+    def extended(command: Callable[..., None]) -> Callable[..., None]:
+        @wraps(command)
+        def called(**given: Any) -> None:
+            reading = {name: given.pop(name) for name in chosen}
+            given["reading"] = {name: one for name, one in reading.items() if one is not None}
+            command(**given)
+
+        # Typer reads the options from here.
+        own = dict(signature(command, eval_str=True).parameters)
+        del own["reading"]
+        for name in chosen:
+            kind, default, option = _READING[name]
+            own[name] = Parameter(name, Parameter.KEYWORD_ONLY, default=default,
+                                  annotation=Annotated[kind, option])
+        called.__signature__ = signature(command).replace(  # type: ignore[attr-defined]
+            parameters=[one.replace(kind=Parameter.KEYWORD_ONLY) for one in own.values()]
+        )
+        called.__annotations__ = {name: one.annotation for name, one in own.items()}
+        return called
+
+    return extended

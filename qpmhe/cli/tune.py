@@ -17,6 +17,7 @@ from . import options
 from .values import arguments_of, named_as_options, read_state, with_arguments
 
 
+@options.reads_record()
 def tune(
     model: options.Model,
     record: Annotated[
@@ -47,10 +48,6 @@ def tune(
         typer.Option(help="What to minimise after the likelihood; auto: the state error if --truth "
                           "is given."),
     ] = "auto",
-    truth: options.Truth = None,
-    time: options.Time = None,
-    outputs: options.Outputs = None,
-    inputs: options.Inputs = None,
     initial_state: options.InitialState = None,
     held_out: Annotated[float, typer.Option(help="Share of the blocks held out to judge the "
                                                  "result.")] = 0.25,
@@ -61,20 +58,11 @@ def tune(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the starting points.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Searches to run in parallel.")] = 1,
     engine: options.Engine = None,
-    dt: options.Step = None,
-    time_scale: options.TimeScale = 1.0,
-    max_gap: options.MaxGap = 500,
-    skip_repeated: options.SkipRepeated = False,
-    separator: options.Separator = None,
-    decimal: options.Decimal = "auto",
-    encoding: options.Encoding = "utf-8",
-    skip_lines: options.SkipLines = 0,
-    time_format: options.TimeFormat = None,
-    missing: options.Missing = None,
     overwrite: options.Overwrite = False,
     picture: Annotated[
         Path | None, typer.Option(help="PNG of the weights and the held-out scores.")
     ] = None,
+    reading: Any = None,
 ) -> None:
     """Choose the weights of an estimator from records; if stopped, the same command resumes."""
     from ..plots import save
@@ -99,14 +87,7 @@ def tune(
         **{name: value for name, value in given.items() if value is not None},
     )
     mhe = loaded.estimator
-    read = [
-        read_record(
-            path, loaded, time=time, outputs=outputs, inputs=inputs, truth=truth, dt=dt,
-            time_scale=time_scale, max_gap=max_gap, skip_repeated=skip_repeated,
-            separator=separator, decimal=decimal, encoding=encoding, skip_lines=skip_lines,
-            time_format=time_format, missing=missing or (), report=_note,
-        ) for path in record
-    ]
+    read = [read_record(path, loaded, **reading, report=_note) for path in record]
     records = [
         TuningRecord(each.measurements, each.inputs, each.states, each.lengths, name=path)
         for path, each in zip(record, read, strict=True)

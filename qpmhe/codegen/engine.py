@@ -72,7 +72,7 @@ class CompiledEngine:
         space = directions.cost.space
         self._to_disturbances = None if space is None else space.to_disturbances
         n, p, m, horizon = system.n, system.p, system.m, settings.horizon
-        self._sizes, self._delay = (n, p, horizon), settings.delay
+        self._sizes = n, p, horizon
         self._workspace = library.workspace()
         self._memory = library.estimators(initial_state[None])
         self._y, self._u = np.zeros(p), np.zeros(max(m, 1))
@@ -249,8 +249,7 @@ class CompiledEngine:
         if self._rejects:
             rejected = self._out[0]["rejected"].astype(np.bool_)
         return CompiledEstimate(
-            block, numbers, time, self._sizes, self._delay, dropped, self._to_disturbances,
-            rejected,
+            block, numbers, time, self._sizes, dropped, self._to_disturbances, rejected,
         )
 
     def _rejecting(self, rejected: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
@@ -300,8 +299,8 @@ class CompiledEngine:
             states=np.vstack((start, log.states)), filtered=log.filtered, costs=log.costs,
             candidate_costs=log.candidate_costs, times=times,
             solve_times=np.full(samples, np.nan), qps=log.qps.astype(np.intp),
-            solver_iterations=log.iterations.astype(np.intp), delayed=log.delayed,
-            flags=log.flags, engine=self.name, rejected_sensors=self._rejecting(log.rejected),
+            solver_iterations=log.iterations.astype(np.intp), flags=log.flags,
+            engine=self.name, rejected_sensors=self._rejecting(log.rejected),
             observer_states=np.vstack((observer_start, log.observer_states)),
         )
 

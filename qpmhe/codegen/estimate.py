@@ -37,17 +37,17 @@ class CompiledWatch(ObserverWatch):
 class CompiledEstimate(Estimate):
     """An estimate whose arrays are views of one block, made on access."""
 
-    __slots__ = ("_block", "_delay", "_numbers", "_sizes", "_to_disturbances")
+    __slots__ = ("_block", "_numbers", "_sizes", "_to_disturbances")
 
     engine = "compiled"
 
     def __init__(
-        self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int], delay: int,
+        self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int],
         dropped: tuple[DroppedRow, ...] = (), to_disturbances: Array | None = None,
         rejected: NDArray[np.bool_] | None = None,
     ) -> None:
         self._block, self._numbers, self.time = block, numbers, time
-        self._sizes, self._delay, self.dropped = sizes, delay, dropped
+        self._sizes, self.dropped = sizes, dropped
         self._to_disturbances, self._rejected = to_disturbances, rejected
         n = sizes[0]
         end = 2 + (numbers[0] + 1) * n
@@ -55,7 +55,7 @@ class CompiledEstimate(Estimate):
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (
-            self._block, self._numbers, self.time, self._sizes, self._delay, self.dropped,
+            self._block, self._numbers, self.time, self._sizes, self.dropped,
             self._to_disturbances, self._rejected,
         )
         return _restored, (arguments, self.step_time)
@@ -137,12 +137,6 @@ class CompiledEstimate(Estimate):
         """z(t+1), the state from which the observer continues."""
         n = self._sizes[0]
         return self._block[-2 * n : self._block.size - n]
-
-    @property
-    def delayed(self) -> Array | None:  # type: ignore[override]
-        """Estimate of x(t+1-k) for the estimator's delay k."""
-        at = self._numbers[0] - self._delay
-        return None if at < 0 else self.trajectory[at]
 
     @property
     def solve_time(self) -> float:  # type: ignore[override]

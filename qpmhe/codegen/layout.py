@@ -204,7 +204,7 @@ class Layout:
         fields += [(name, r, n) for name in ("inner_lower", "inner_upper", "aside")]
         options = (
             "metric_settled", "project", "max_qps", "uncapped", "patience", "max_iterations",
-            "infeasible", "start_at_best", "reinitialize", "smooth", "delay",
+            "infeasible", "start_at_best", "reinitialize", "smooth",
         )
         fields += [(name, np.int32) for name in options]
         if self.clock:
@@ -438,7 +438,6 @@ def _filled(
     record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["smooth"] = settings.arrival == "smoothed"
-    record["delay"] = settings.delay
     if layout.clock:
         record["time_budget"] = settings.time_budget
     return record

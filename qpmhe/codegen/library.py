@@ -218,8 +218,8 @@ class RunLog:
     """Arrays for what `mhe_run` writes, and the structure that points to them."""
 
     def __init__(self, shape: tuple[int, ...], n: int, sensors: int) -> None:
-        self.states, self.filtered, self.delayed, self.observer_states = (
-            np.empty((*shape, n)) for _ in range(4)
+        self.states, self.filtered, self.observer_states = (
+            np.empty((*shape, n)) for _ in range(3)
         )
         self.costs, self.candidate_costs = np.empty(shape), np.empty(shape)
         self.flags, self.qps, self.iterations = (np.empty(shape, np.int32) for _ in range(3))
@@ -228,7 +228,7 @@ class RunLog:
     def pointers(self, first: int) -> Any:
         """The C structure of pointers to the entries from an index on."""
         arrays = (
-            self.states, self.filtered, self.delayed, self.costs, self.candidate_costs,
+            self.states, self.filtered, self.costs, self.candidate_costs,
             self.flags, self.qps, self.iterations, self.observer_states, self.rejected,
         )
         addresses = [array.ctypes.data + first * array.strides[0] for array in arrays]

@@ -160,7 +160,7 @@ class CompiledMembers:
         self._watch.warn(*log.watched(self._horizon, dropped), 3)
         return {
             "states": np.concatenate((start[:, None], log.states), axis=1),
-            "filtered": log.filtered, "delayed": log.delayed,
+            "filtered": log.filtered,
             "observer_states": np.concatenate((observers[:, None], log.observer_states), axis=1),
             "costs": log.costs, "candidate_costs": log.candidate_costs,
             "statuses": log.flags.astype(np.int64), "qps": log.qps.astype(np.intp),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Callable
 from html import escape
 from pathlib import Path
@@ -15,7 +13,7 @@ from .._checks import make_folder
 from .._version import __version__
 from ..errors import InvalidInputError
 from ..plots.steps import outcomes
-from ..plots.style import LIGHT, STYLES
+from ..plots.style import LIGHT, STYLES, svg
 from .findings import Finding, percent
 
 if TYPE_CHECKING:
@@ -293,15 +291,11 @@ def _item(one: Finding) -> str:
 
 
 def _svg(diagnosis: Diagnosis, one: _Figure, number: int) -> str:
-    """One figure as SVG for a page, with text as text; the number makes its ids unique."""
+    """One figure as SVG for the page; the number makes its ids unique."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(LIGHT):
         figure = Figure(figsize=(5.2, 2.6), layout="constrained")
         one.paint(diagnosis, figure.subplots())
-        written = io.StringIO()
-        figure.savefig(written, format="svg", metadata={"Date": None})
-    text = written.getvalue()
-    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
-    return re.sub(r'(id="|url\(#|href="#)', rf"\g<1>f{number}-", text)
+    return svg(figure, f"f{number}")

@@ -299,7 +299,6 @@ class PythonEngine:
             outcome.solve_time,
             outcome.corrections,
             outcome.dropped,
-            settings.delay,
             outcome.nearest_points,
             filtered,
             self._disturbances,

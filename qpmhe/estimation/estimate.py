@@ -149,8 +149,8 @@ class Estimate:
     With N_t = min(t + 1, N) stages in the window, the trajectory holds the estimates of
     x(t+1-N_t), ..., x(t+1), made from the measurements y(t+1-N_t), ..., y(t).
 
-    The arrays belong to the caller: no estimator reads them again. ``state``, ``filtered`` and
-    ``delayed`` are views of ``trajectory``: copy a state to change or keep it on its own.
+    The arrays belong to the caller: no estimator reads them again. ``state`` and
+    ``filtered`` are views of ``trajectory``: copy a state to change or keep it on its own.
 
     Attributes
     ----------
@@ -163,7 +163,8 @@ class Estimate:
         Estimate of x(t) that uses y(t). Where the candidate is the estimate, this is the observer's
         measurement update, or z(t) for an observer without one.
     trajectory : (N_t + 1, n) array
-        Estimates of all states in the window.
+        Estimates of all states in the window. ``trajectory[-1 - k]`` is the estimate of x(t+1-k):
+        from k = 2 on, it has used k - 1 measurements after its own time, as a smoother does.
     disturbances : (N_t, r) array
         w(i) = x(i+1) - f(x(i)) along the trajectory; with a ``disturbance_matrix`` G, the w(i)
         for which G w(i) is nearest to this difference.
@@ -177,8 +178,6 @@ class Estimate:
     observer_state : (n,) array
         z(t+1), the state from which the observer continues. With ``candidate="reinitialized"`` this
         observer restarted at the window's first estimate.
-    delayed : (n,) array or None
-        Estimate of x(t+1-k) for the estimator's delay k; None until the window reaches it.
     dropped : tuple of DroppedRow
         The inequalities that the estimate violates because no trajectory satisfying all of them was
         found at a cost up to the candidate's.
@@ -203,9 +202,9 @@ class Estimate:
 
     __slots__ = (
         "_filtered", "_rejected", "_residuals", "_width", "candidate", "candidate_cost",
-        "corrections", "cost", "delayed", "dropped", "message", "nearest_points",
-        "observer_state", "qps", "solve_time", "solver_iterations", "state", "status", "step_time",
-        "time", "trajectory",
+        "corrections", "cost", "dropped", "message", "nearest_points", "observer_state",
+        "qps", "solve_time", "solver_iterations", "state", "status", "step_time", "time",
+        "trajectory",
     )
 
     engine = "python"
@@ -225,7 +224,6 @@ class Estimate:
         solve_time: float,
         corrections: int = 0,
         dropped: tuple[DroppedRow, ...] = (),
-        delay: int = 0,
         nearest_points: int = 0,
         filtered: Array | None = None,
         disturbances: int | None = None,
@@ -245,9 +243,6 @@ class Estimate:
         self.qps, self.solver_iterations = qps, solver_iterations
         self.corrections, self.nearest_points, self.dropped = corrections, nearest_points, dropped
         self._filtered = filtered
-        self.delayed: Array | None = self.state if delay == 0 else None
-        if 0 < delay < trajectory.shape[0]:
-            self.delayed = trajectory[trajectory.shape[0] - 1 - delay]
         self.solve_time, self.step_time = solve_time, float("nan")
 
     @property

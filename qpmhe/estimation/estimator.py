@@ -113,9 +113,6 @@ class MovingHorizonEstimator:
         the estimate made N samples ago. The paper's theorem does not cover the latter, its outlook.
     time_budget : float or None
         Seconds for one update: no QP starts later, and backends with a time limit stop.
-    delay : int
-        ``estimate.delayed`` is the estimate of the state this many steps before
-        ``estimate.state``; at most N.
     isolated : bool
         Whether the backend solves in a separate process, so that a crash of compiled code only
         fails the QP, and the time budget stops any backend. It adds some tenths of a millisecond to
@@ -176,7 +173,6 @@ class MovingHorizonEstimator:
         warm_start: bool = False,
         candidate: str = "observer",
         time_budget: float | None = None,
-        delay: int = 0,
         isolated: bool = False,
         arrival: str = "observer",
         parameters: ArrayLike | None = None,
@@ -184,7 +180,7 @@ class MovingHorizonEstimator:
         is_copy = "settings" in vars(self)  # from `__setstate__`: no warning is given twice
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
-            engine, project_observer, infeasible, warm_start, candidate, time_budget, delay,
+            engine, project_observer, infeasible, warm_start, candidate, time_budget,
             isolated, arrival, _nominal(parameters),
         )
         self.system, self.observer, self.cost = system, observer, cost

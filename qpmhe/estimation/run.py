@@ -30,7 +30,7 @@ Integers = NDArray[np.intp]
 
 _PER_STEP = (
     "filtered", "costs", "candidate_costs", "times", "solve_times", "qps", "solver_iterations",
-    "delayed", "rejected_sensors",
+    "rejected_sensors",
 )
 
 
@@ -76,8 +76,6 @@ class Run:
         QPs solved.
     solver_iterations : (T,) array
         The solver's own iterations, -1 where it reports none.
-    delayed : (T, n) array
-        Delayed estimates, NaN until the window reaches the delay.
     flags : (T,) array
         Values of the statuses.
     observer_states : (T + 1, n) array
@@ -119,14 +117,13 @@ class Run:
         solve_times: Array,
         qps: Integers,
         solver_iterations: Integers,
-        delayed: Array,
         flags: NDArray[np.integer[Any]],
         observer_states: Array,
         covariances: Array | None = None,
         rejected_sensors: NDArray[np.bool_] | None = None,
         engine: str = "python",
     ) -> None:
-        self.states, self.filtered, self.delayed = states, filtered, delayed
+        self.states, self.filtered = states, filtered
         self.costs, self.candidate_costs = costs, candidate_costs
         self.times, self.solve_times = times, solve_times
         self.qps, self.solver_iterations = qps, solver_iterations
@@ -157,7 +154,6 @@ class Run:
         start = numbers("start", start)
         n = start.size
         first = start if observer_start is None else observer_start
-        nothing = np.full(n, np.nan)
         return cls(
             states=np.array([start, *(e.state for e in estimates)]),
             filtered=np.array([e.filtered for e in estimates]).reshape(-1, n),
@@ -170,9 +166,6 @@ class Run:
                 [-1 if e.solver_iterations is None else e.solver_iterations for e in estimates],
                 dtype=np.intp,
             ),
-            delayed=np.array(
-                [nothing if e.delayed is None else e.delayed for e in estimates]
-            ).reshape(-1, n),
             flags=np.array([e.status.value for e in estimates], dtype=np.intp),
             observer_states=np.array([first, *(e.observer_state for e in estimates)]),
             covariances=covariances,

@@ -37,7 +37,6 @@ class Settings:
     warm_start: bool = False
     candidate: str = "observer"
     time_budget: float | None = None
-    delay: int = 0
     isolated: bool = False
     arrival: str = "observer"
     parameters: tuple[float, ...] = ()
@@ -56,12 +55,6 @@ class Settings:
         positive("tolerance", self.tolerance)
         if self.time_budget is not None:
             positive("time_budget", self.time_budget)
-        object.__setattr__(self, "delay", count("delay", self.delay, 0))
-        if self.delay > self.horizon:
-            raise OptionError(
-                f"delay is {self.delay!r}; expected at most the horizon, {self.horizon}: older "
-                "states are not in the window."
-            )
         for name in ("project_observer", "warm_start", "isolated"):
             flag(name, getattr(self, name))
         for name, choices in (

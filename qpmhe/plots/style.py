@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from io import StringIO
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -188,6 +190,18 @@ def save(
         for one in paths:
             figure.savefig(one, dpi=200 if inches is None else 300)
     return paths
+
+
+def svg(figure: Figure, prefix: str) -> str:
+    """A figure as an SVG element of a page, with text as text; the prefix makes its ids unique."""
+    from matplotlib import rc_context
+
+    written = StringIO()
+    with rc_context(LIGHT):
+        figure.savefig(written, format="svg", metadata={"Date": None})
+    text = written.getvalue()
+    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
+    return re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{prefix}-", text)
 
 
 def inches_of(width: str | float | None) -> float | None:

@@ -21,7 +21,6 @@ class _Kept(NamedTuple):
     state: Array
     filtered: Array
     observer_state: Array
-    delayed: Array | None
     rejected: NDArray[np.bool_]
     cost: float
     candidate_cost: float
@@ -53,9 +52,8 @@ class KeptRun:
         self._lengths.append(length)
         self._estimates.append(_Kept(
             estimate.state.copy(), estimate.filtered.copy(), estimate.observer_state.copy(),
-            None if estimate.delayed is None else estimate.delayed.copy(),
             estimate.rejected.copy(),
-            *(getattr(estimate, name) for name in _Kept._fields[5:]),
+            *(getattr(estimate, name) for name in _Kept._fields[4:]),
         ))
 
     def run(self) -> Run:

@@ -50,11 +50,11 @@ FIELDS = {
     "candidate_costs": "candidate_cost", "statuses": "status", "qps": "qps",
     "improved": "improved",
 }
-RUNS = ("states", "filtered", "observer_states", "costs", "qps", "delayed", "rejected_sensors")
+RUNS = ("states", "filtered", "observer_states", "costs", "qps", "rejected_sensors")
 CASES = {
     "observers": (3, {}, {"max_qps": 0, "threads": 1, "horizon": 1}),
     # Fewer members would share a thread.
-    "threads": (40, {}, {"max_qps": None, "warm_start": True, "delay": 3, "threads": 2}),
+    "threads": (40, {}, {"max_qps": None, "warm_start": True, "threads": 2}),
     "sets": (3, {"disturbances": qpmhe.Box([-0.1] * 2, [0.1] * 2)}, {"max_qps": 2}),
     "gates": (5, {"h": turn, "p": 2, "observer": KALMAN}, {"candidate": "reinitialized"}),
     "inputs": (3, {"f": driven, "h": lambda x, u: x[..., :1] + u[..., :1], "m": 3}, {}),

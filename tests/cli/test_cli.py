@@ -86,7 +86,7 @@ def test_a_bad_option_is_reported_in_a_line(option, value, words, monkeypatch, c
 
 
 def test_compare_report_export_and_a_study_with_an_unknown_key(tmp_path):
-    pytest.importorskip("plotly")
+    pytest.importorskip("jinja2")
     pytest.importorskip("joblib")
     store, out = tmp_path / "new" / "store.sqlite", tmp_path / "report"
     options = "--backend", "banded", "--qps", "0,1", "--seeds", 2, "--steps", 5, "--jobs", 1

@@ -516,7 +516,7 @@ FEATURES = {
         "reactor with gaps": ("reactor", gaps),
         "reactor conditions": ("reactor with gaps", with_conditions, AGAIN, WARM),
         "inputs": (_inputs,),
-        "inputs converged": ("inputs", gaps, MANY, {"delay": 2}),
+        "inputs converged": ("inputs", gaps, MANY),
         "inputs reinitialized": ("inputs", AGAIN, WARM, ONE, conditions),
         "one of each": (lambda: _plain(ca.sin, lambda x: x, 1, 1, horizon=1), gaps),
         "euler": (lambda: _plain(_rate, lambda x: x[:1], 3, 1, dt=0.2, method="euler"), gaps, WARM),
@@ -634,7 +634,7 @@ FEATURES = {
     "observers": {
         "smoothed": ("inputs", SMOOTH, {"horizon": 4}, gaps, AGAIN, with_changes),
         "extended": ("inputs", filtered(weight=spd(1, 3)), with_conditions),
-        "extended prior": ("inputs", filtered(), gaps, SMOOTH, WARM, {"delay": 1}),
+        "extended prior": ("inputs", filtered(), gaps, SMOOTH, WARM),
         # Some covariances are then singular up to rounding, and the weights as large as can be.
         "extended singular": ("inputs", filtered(**SINGULAR), looser),
         "extended conditions": ("reactor", filtered(
@@ -650,7 +650,7 @@ FEATURES = {
         "gated": ("inputs", judged(Gate(0.95, reopen=2, groups=[[1, 0]])), prior_by(), conditions),
         "gated in states": ("inputs and states", judged(Gate(reopen=2)), gaps, AGAIN, WARM),
         "gated angles": (_ship, judged(Gate(reopen=2)), gaps),
-        "weighted": ("inputs", judged(HuberInnovation(0.7, reopen=1)), SMOOTH, {"delay": 1}),
+        "weighted": ("inputs", judged(HuberInnovation(0.7, reopen=1)), SMOOTH),
         "unscented gated in states": (
             "inputs and states", judged(Gate(reopen=2), UKF), gaps, conditions,
         ),

@@ -17,7 +17,6 @@ pytestmark = [
 
 ARRAYS = (
     "state", "filtered", "trajectory", "candidate", "observer_state", "disturbances", "noises",
-    "delayed",
 )
 EVENTS = (
     "status", "qps", "dropped", "time", "corrections", "nearest_points", "rejected_sensors",

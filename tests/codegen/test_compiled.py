@@ -113,7 +113,7 @@ def test_the_same_estimates_whatever_comes(name):
     """And copies of an estimator, however they are made, go on to the last bit."""
     one = MODELS[name]()
     for k, way in enumerate((
-        {"max_qps": 3, "delay": 1}, {"max_qps": None, "warm_start": True},
+        {"max_qps": 3}, {"max_qps": None, "warm_start": True},
         {"max_qps": None, "backend": "banded", "tolerance": 1e-3, "candidate": "reinitialized"},
     )):
         reference, compiled = (one.estimator(engine, **way) for engine in ENGINES)
@@ -188,7 +188,7 @@ def test_damaged_snapshots_are_refused_whole():
 
 def test_a_record_is_its_samples():
     """Longer than what is handed to C at once, with missing samples, and in several calls."""
-    one, options = wide(), {"warm_start": True, "delay": 2}
+    one, options = wide(), {"warm_start": True}
     ys = np.resize([
         np.full(one.system.p, NAN) if sample["y"] is None else sample["y"]
         for sample in spoilt(one, np.random.default_rng(4), share=0.1)

@@ -9,7 +9,7 @@ import qpmhe
 from qpmhe.estimation.snapshot import read
 
 WITHIN = str(pathlib.Path(qpmhe.__file__).parent)
-NAMES = ("trajectory", "state", "filtered", "candidate", "disturbances", "noises", "delayed")
+NAMES = ("trajectory", "state", "filtered", "candidate", "disturbances", "noises")
 
 
 def assert_same(found, expected, ignoring=None):

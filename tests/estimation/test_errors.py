@@ -115,7 +115,7 @@ def test_options_out_of_range():
     for name, value, *words in (
         ("horizon", 0, "expected an integer >= 1"), ("max_qps", 1.5, "expected an integer >= 0"),
         ("tolerance", math.nan, "a finite number > 0"), ("time_budget", 0, "finite number > 0"),
-        ("delay", 4, "at most the horizon, 3"), ("warm_start", "best", "True or False"),
+        ("warm_start", "best", "True or False"),
         ("infeasible", "drop", "'drop_rows'", "'keep_candidate'"),
     ):
         check(OptionError, [f"{name} is {value!r}", *words], estimator, **{name: value})

@@ -14,7 +14,7 @@ BOX = {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9])}
 # Outside of which the candidate is, now and then.
 NARROW = {"disturbances": qpmhe.Box([-0.1, -0.1], [0.1, 0.1])}
 CASES = {
-    "delayed": {"delay": 2, "discount": 0.8, "held": {1: 0.5}},
+    "discounted": {"discount": 0.8, "held": {1: 0.5}},
     "reinitialized in a set": {"candidate": "reinitialized", "sets": BOX, "warm_start": True},
     "dropped": {"sets": NARROW, "max_qps": 2},
     "smoothed": {"arrival": "smoothed", "discount": 0.8, "warm_start": True},

@@ -16,7 +16,7 @@ from .systems import pendulum
 from .untraced import untraced
 
 OPTIONS = {
-    "observer alone": {"max_qps": 0, "delay": 3},
+    "observer alone": {"max_qps": 0},
     "smoothed": {"arrival": "smoothed", "candidate": "reinitialized"},
     "kalman": {"kalman": True, "candidate": "reinitialized"},
     "sets": {"states": qpmhe.Box([-0.9, -0.9], [0.9, 0.9]), "robust": 0.3, "warm_start": True},
@@ -143,7 +143,7 @@ def test_caps_and_policies_may_change(engine):
     """The observer's part is the same then; terms that were not there are computed."""
     for first, second in (
         ({"max_qps": 0}, {"max_qps": 2}), ({"max_qps": 3}, {"max_qps": 0}),
-        ({}, {"max_qps": None, "tolerance": 1e-6, "solver_tolerance": 1e-5, "delay": 1}),
+        ({}, {"max_qps": None, "tolerance": 1e-6, "solver_tolerance": 1e-5}),
         ({}, {"warm_start": True, "max_qps": None, "max_solver_iterations": 70}),
         ({"infeasible": "keep_candidate"}, {"infeasible": "drop_rows"}),
     ):

@@ -116,6 +116,11 @@ def test_the_least_cost_is_found_from_far_away_and_the_command_runs(parts, tmp_p
     for start in (problem.records[0].starts[0], problem.records[1].starts[0]):
         off = problem.error(ways[car.CAUSAL](start).run(y, u).filtered, found.positions[:, :2])
         assert off[-5:].max() < 3.0
+    # The late estimates are states of the same run's trajectories, in the rows of their own times.
+    late = ways[car.LATE](start).run(y, u).filtered
+    off = problem.error(late, found.positions[:, :2])
+    assert np.isnan(off[1:]).all()
+    assert off[0] < 3.0
     filtered = ways["EKF, Huber innovation"](start).run(y, u).filtered
     assert problem.error(filtered, found.positions[:, :2])[-5:].min() > 10.0
     given = ["--quick", "--data", str(tmp_path / "made"), "--out", str(tmp_path / "out")]

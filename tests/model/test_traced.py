@@ -227,7 +227,7 @@ def test_a_warning_as_an_error_takes_no_sample(engine):
 
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 @pytest.mark.parametrize("options", [
-    {"candidate": "reinitialized", "delay": 2}, {"arrival": "smoothed", "warm_start": True},
+    {"candidate": "reinitialized"}, {"arrival": "smoothed", "warm_start": True},
 ], ids=["reinitialized", "smoothed"])
 def test_what_a_compiled_estimator_hands_over_is_all_it_knew(options):
     one, two = (estimator(Plant().system(), engine, **options) for engine in ENGINES)
@@ -243,8 +243,6 @@ def test_what_a_compiled_estimator_hands_over_is_all_it_knew(options):
             found = two.update(y, **own)
         np.testing.assert_allclose(found.trajectory, expected.trajectory, atol=1e-8)
         assert found.cost == pytest.approx(expected.cost, rel=1e-8)
-        if expected.delayed is not None:
-            np.testing.assert_allclose(found.delayed, expected.delayed, atol=1e-8)
     assert two.engine == "python"
 
 

@@ -35,7 +35,7 @@ CASES = {
 
 def compared(one, most, **options):
     """How many windows were compared, and those whose cost Ipopt undercuts from there as well."""
-    options = {"max_qps": None, "horizon": 4, "candidate": "observer", "delay": 0} | options
+    options = {"max_qps": None, "horizon": 4, "candidate": "observer"} | options
     mhe, total, above = one.estimator(**options, infeasible="drop_rows"), 0, []
     for t, sample in enumerate(one.samples):
         estimate = one.update(mhe, sample)

@@ -70,11 +70,7 @@ class Case:
             del one.sets["states"]
         if self.writing == "compiled" and "states" not in one.sets and rng.random() < 0.6:
             engine = engine or "compiled"
-        one.options |= {
-            "horizon": int(rng.integers(1, 13)), "delay": int(rng.integers(0, 4)),
-            "engine": engine or "python",
-        }
-        one.options["delay"] = min(one.options["delay"], one.options["horizon"])
+        one.options |= {"horizon": int(rng.integers(1, 13)), "engine": engine or "python"}
         if engine != "compiled":
             one.options["backend"] = str(rng.choice(BACKENDS))
             one.options["max_solver_iterations"] = [None, None, 1, 3][rng.integers(4)]
@@ -143,7 +139,6 @@ class Case:
             arrays = [
                 estimate.trajectory, estimate.candidate, estimate.disturbances, estimate.noises,
                 estimate.state, estimate.filtered, mhe.state,
-                *([] if estimate.delayed is None else [estimate.delayed]),
             ]
             if self.scribble:
                 for array in arrays:
@@ -235,9 +230,6 @@ class Case:
             tolerance = 0.0 if expected is z[t] else 1e-5
         close = np.allclose(estimate.filtered, expected, rtol=0, atol=tolerance * size)
         wrong(not close, "filtered is", estimate.filtered, "not", expected, status)
-        delay = one.options["delay"]
-        other = delay <= K and not np.array_equal(estimate.delayed, x[K - delay])
-        wrong(other, "delayed is another state")
         missing = not np.isfinite(samples[-1].y).all()
         wrong(missing != (Status.MISSING in status), status, "of y =", samples[-1].y)
         history.append(estimate.state.copy())

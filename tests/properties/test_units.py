@@ -53,7 +53,7 @@ def other_units(one, base, most):
 
 def numbers(one, estimate, units):
     """The numbers of an estimate, taken back to the units in which it was drawn."""
-    states = ("state", "filtered", "delayed", "trajectory", "candidate")
+    states = ("state", "filtered", "trajectory", "candidate")
     return {
         **{name: getattr(estimate, name) / units.states for name in states},
         "noises": estimate.noises / units.outputs,
@@ -69,7 +69,7 @@ def posed_twice(seed, kind, base, most):
     one = Problem(seed, KINDS[kind], STEPS)
     found = []
     for units in (one.own_units, other_units(one, base, most)):
-        mhe = one.estimator(units, delay=1)
+        mhe = one.estimator(units)
         estimates = [one.update(mhe, sample, units) for sample in one.samples]
         late = STEPS - min(2, mhe.horizon)
         estimates.append(mhe.amend(late, np.ones(one.p) * units.outputs))

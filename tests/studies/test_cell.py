@@ -88,7 +88,7 @@ def test_shares_of_steps_that_fail_are_fallback():
     ones = np.ones(8)
     found = metrics.outcomes(qpmhe.Run(
         states=np.zeros((9, 1)), filtered=ones[:, None], costs=ones, candidate_costs=ones,
-        times=ones, solve_times=ones, qps=np.arange(8), delayed=ones[:, None],
+        times=ones, solve_times=ones, qps=np.arange(8),
         solver_iterations=np.array([-1, 4] + [-1] * 6), observer_states=np.zeros((9, 1)),
         flags=np.array([flag.value for flag in flags]),
     ))

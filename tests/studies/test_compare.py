@@ -94,10 +94,10 @@ def test_a_study_file_names_store_and_report_and_failed_cells_are_reported(tmp_p
 def test_what_the_report_needs_is_missed_before_any_cell_runs(tmp_path, monkeypatch):
     with pytest.raises(InvalidInputError, match="cannot make the folder"):
         command("study", study_file(tmp_path), "--out", tmp_path / "mine.toml" / "out")
-    monkeypatch.setattr("qpmhe.studies.report.page.find_spec", lambda one: one != "itables")
+    monkeypatch.setattr("qpmhe.studies.report.page.find_spec", lambda one: one != "jinja2")
     for words in (["compare", "--backend", "banded", "--store", tmp_path / "s.sqlite"],
                   ["study", study_file(tmp_path)]):
-        with pytest.raises(InvalidInputError, match=r"the report needs itables.*qpmhe\[studies\]"):
+        with pytest.raises(InvalidInputError, match=r"the report needs jinja2.*qpmhe\[studies\]"):
             command(*words, "--out", tmp_path / "out")
     assert [one.name for one in tmp_path.iterdir()] == ["mine.toml"]
 

@@ -19,10 +19,10 @@ RINGS = {0.0: 1, 1.0: 6, 2.0: 12}
 
 @dataclass
 class Taken:
-    """Estimates of a record as `qpmhe.Run` has them."""
+    """Estimates of a record: with y of their own time, and with y of so many samples after it."""
 
     filtered: Array
-    delayed: Array
+    late: Array
     times: Array
 
 
@@ -40,14 +40,17 @@ class Bank:
         make(start), a `qpmhe.MovingHorizonEstimator`.
     spread : (2,) array
         Standard deviations of the first two states.
+    delay : int
+        How many steps a late estimate lies before the window's end.
     compiled : bool
         Whether to compile the step.
     """
 
     def __init__(
-        self, make: Callable[[Array], qpmhe.MovingHorizonEstimator], spread: Array, compiled: bool
+        self, make: Callable[[Array], qpmhe.MovingHorizonEstimator], spread: Array, delay: int,
+        compiled: bool,
     ) -> None:
-        self._make, self._spread, self._compiled = make, spread, compiled
+        self._make, self._spread, self._delay, self._compiled = make, spread, delay, compiled
         self._taken: dict[bytes, Taken] = {}  # the causal and the late estimates are of one run
 
     def causal(self, start: Array) -> View:
@@ -90,7 +93,7 @@ class Bank:
         # The number is halved whenever the window has doubled; one is left when it is full.
         halvings = int(np.ceil(np.log2(len(members))))
         cuts = {max(1, round(horizon / 2.0**one)) for one in range(halvings)}
-        filtered, delayed = np.full((2, len(y), start.size), np.nan)
+        filtered, late = np.full((2, len(y), start.size), np.nan)
         times = np.zeros(len(y))
         for t in range(len(y)):
             began = perf_counter()
@@ -98,12 +101,13 @@ class Bank:
             order = np.argsort([one.cost for one in found], kind="stable")
             best = found[order[0]]
             filtered[t] = best.filtered
-            if best.delayed is not None:
-                delayed[t] = best.delayed
+            if self._delay < len(best.trajectory):
+                # The trajectory ends at x(t + 1).
+                late[t + 1 - self._delay] = best.trajectory[-1 - self._delay]
             if t + 1 in cuts:
                 members = [members[k] for k in order[: (len(members) + 1) // 2]]
             times[t] = perf_counter() - began
-        return Taken(filtered, delayed, times)
+        return Taken(filtered, late, times)
 
 
 class View:
@@ -116,24 +120,18 @@ class View:
     start : (n,) array
         The initial state.
     late : bool
-        Whether to take the delayed ones.
+        Whether to take the late ones.
     """
 
     def __init__(self, bank: Bank, start: Array, late: bool) -> None:
         self._bank, self._start, self._late = bank, start, late
-        one = bank.member(start)
-        self.engine = one.engine
-        self._delay = one.settings.delay
+        self.engine = bank.member(start).engine
 
     def reset(self, start: Array) -> None:
         """Start anew."""
         self._start = start
 
     def run(self, y: Array, u: Array) -> Taken:
-        """The estimates; the late ones in the rows of the times that they are of."""
+        """The estimates, of which the gallery judges ``filtered``."""
         taken = self._bank.run(self._start, y, u)
-        if not self._late:
-            return taken
-        moved = np.full_like(taken.filtered, np.nan)
-        moved[: len(y) + 1 - self._delay] = taken.delayed[self._delay - 1 :]
-        return Taken(moved, taken.delayed, taken.times)
+        return Taken(taken.late, taken.late, taken.times) if self._late else taken

@@ -182,9 +182,9 @@ def own(drive: Drive, compiled: bool, problem: Problem, weights: Weights) -> dic
         noise, drive.deviation * np.sqrt(noise[0, 0]), per_component=True, graduation=1.0,
     ))
     bank = Bank(
-        partial(problem.estimator, weights=weights, cost=redescending,
-                delay=min(round(DELAY / step), horizon), **options),
-        np.sqrt(weights.prior.diagonal()[:2]), compiled=compiled,
+        partial(problem.estimator, weights=weights, cost=redescending, **options),
+        np.sqrt(weights.prior.diagonal()[:2]), delay=min(round(DELAY / step), horizon),
+        compiled=compiled,
     )
     return {
         "EKF, Huber innovation": partial(

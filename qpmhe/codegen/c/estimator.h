@@ -238,7 +238,6 @@ typedef struct {
     int32_t start_at_best;     /* start at the shifted previous estimate where it is better */
     int32_t reinitialize;      /* observer restarted at the estimate of the window's start */
     int32_t smooth;            /* prior at the previous estimate of the window's first state */
-    int32_t delay;             /* of the delayed estimates that mhe_run writes */
 #if MHE_CLOCK
     double time_budget;        /* seconds from the start of a step, after which no QP begins */
     double (*clock)(void);     /* seconds from any start; a null pointer: no budget is kept */
@@ -436,7 +435,7 @@ typedef struct {
 
 /* Where mhe_run writes, one entry for each sample; a null pointer omits an output. */
 typedef struct {
-    mhe_real *states, *filtered, *delayed;   /* MHE_NX each */
+    mhe_real *states, *filtered;   /* MHE_NX each */
     mhe_real *costs, *candidate_costs;
     int32_t *status, *qps, *iterations;
     mhe_real *observer_states;     /* MHE_NX each */

@@ -288,13 +288,8 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
             mhe_outcome o;
             const mhe_sample sample = mhe_usual_sample(y + at * NY, u ? u + at * NU : 0);
             mhe_step(e, k, &sample, &o);
-            const int count = e->length, delay = e->settings->delay;
-            const real *newest = o.best->x + count * NX;
-            for (int j = 0; j < NX; j++) {
-                if (log->states) log->states[at * NX + j] = newest[j];
-                if (log->delayed)
-                    log->delayed[at * NX + j] = delay <= count ? newest[j - delay * NX] : NAN;
-            }
+            if (log->states)
+                memcpy(log->states + at * NX, o.best->x + e->length * NX, NX * sizeof(real));
             if (log->observer_states)
                 memcpy(log->observer_states + at * NX, e->z_end, sizeof e->z_end);
             if (log->filtered) mhe_filtered(e, &o, log->filtered + at * NX);

@@ -20,8 +20,8 @@ _FEW_SEEDS = 10
 _RMSE = (
     "An RMSE has no unit: each state's is divided by the state's root mean square distance from "
     "its initial estimate over the record, and the states' mean square is taken. So 1 is the error "
-    "of keeping the initial estimate for ever. The first figure's menu and the table give the RMSE "
-    "of each state in its unit."
+    "of keeping the initial estimate for ever. The table gives the RMSE of each state in its "
+    "unit."
 )
 _NO_TRUTH = (
     "The true states are not known, so J ranks the configurations, relative to the converged J of "

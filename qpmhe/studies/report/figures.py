@@ -33,49 +33,41 @@ _QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
 _SIZES, _LARGEST = {"0": 9.5, "1": 5.1, "2": 6.5}, 8.1
 
 
-def with_states(summary: DataFrame, count: int) -> DataFrame:
-    """A summary with columns for the RMSE of each state, and for its limits."""
-    columns = {}
-    for suffix in ("", "_low", "_high"):
-        lists = summary[f"rmse_states{suffix}"]
-        for j in range(count):
-            columns[f"rmse_{j + 1}{suffix}"] = [
-                one[j] if isinstance(one, list) and len(one) > j else np.nan for one in lists
-            ]
-    return summary.assign(**columns)
-
-
-def accuracy(summary: DataFrame, metric: str, label: str, front: Any) -> Drawing | None:
-    """Accuracy against time, one point per configuration; ``front`` marks the rows on the front."""
-    usable = summary["time_median"].notna() & np.isfinite(summary[metric].astype(float))
-    rows, best = summary[usable], summary[usable & np.asarray(front, dtype=bool)]
+def accuracy(summary: DataFrame) -> Drawing | None:
+    """Accuracy against time, one point per configuration, and the Pareto front."""
+    by = measure(summary)
+    rows = summary[summary["time_median"].notna() & np.isfinite(summary[by].astype(float))]
     if rows.empty:
         return None
-    best = best.sort_values("time_median")
+    best = rows[rows["pareto"]].sort_values("time_median")
     marks = [Mark(
-        "front", best["time_median"].tolist(), best[metric].tolist(),
-        hover=[configuration_words(row) for _, row in best.iterrows()], meta={"role": "front"},
+        "front", best["time_median"].tolist(), best[by].tolist(),
+        words=[configuration_words(row) for _, row in best.iterrows()],
     )]
     for backend, mine in rows.groupby("backend", sort=False):
         marks.append(Mark(
-            "points", mine["time_median"].tolist(), mine[metric].tolist(), str(backend),
-            [_hover(row, metric, label) for _, row in mine.iterrows()], _bars(mine, metric),
+            "points", mine["time_median"].tolist(), mine[by].tolist(), str(backend),
+            [_told(row, by) for _, row in mine.iterrows()], _bars(mine, by),
             sizes=[_SIZES.get(qps_words(one), _LARGEST) for one in mine["qps"]],
             hollow=mine["solver_iterations"].notna().tolist(),
-            pale=(mine["failures"] > 0).tolist(), meta={"backend": str(backend)},
+            pale=(mine["failures"] > 0).tolist(),
         ))
     return Drawing([Panel(
         Axis("median time per step", "time", rows["time_median"].tolist()),
-        Axis(label, "error", rows[metric].tolist()), marks,
-    )], 480)
+        Axis(RANKED_BY[by], "error", rows[by].tolist()), marks,
+    )])
 
 
-def anytime(summary: DataFrame) -> Drawing | None:
+def anytime(summary: DataFrame, start: str) -> Drawing | None:
     """RMSE and cost ratio against the cap, a line for each backend and number of QPs per sample.
 
-    Without the cost ratio where the study has none, and nothing of one backend at one cap.
+    The sequences of QPs begin at ``start``. Without the cost ratio where the study has none, and
+    nothing of one backend at one cap.
     """
-    rest = summary[(summary["backend"] != "observer") & (summary["failures"] == 0)]
+    rest = summary[
+        (summary["backend"] != "observer") & (summary["failures"] == 0)
+        & (summary["start"] == start)
+    ]
     if len(rest[["backend", "solver_iterations"]].drop_duplicates()) < 2:
         return None
     observer = summary[summary["backend"] == "observer"]
@@ -86,25 +78,21 @@ def anytime(summary: DataFrame) -> Drawing | None:
     metrics = [(name, label) for name, label in metrics if rest[name].notna().any()]
     for metric, label in metrics:
         marks = [
-            Mark("level", order, [float(row[metric])] * len(order), "observer",
-                 [_hover(row)] * len(order), meta={"backend": "observer"})
+            Mark("level", order, [float(row[metric])] * len(order), "observer")
             for _, row in observer.iterrows() if not missing(row[metric])
         ]
-        for (backend, qps, start), rows in rest.groupby(
-            ["backend", "qps", "start"], dropna=False, sort=False
-        ):
+        for (backend, qps), rows in rest.groupby(["backend", "qps"], dropna=False, sort=False):
             marks.append(Mark(
                 "line", [cap_words(one) for one in rows["solver_iterations"]],
-                rows[metric].astype(float).tolist(), str(backend),
-                [_hover(row) for _, row in rows.iterrows()], _bars(rows, metric),
-                meta={"backend": str(backend), "qps": qps_words(qps), "start": str(start)},
+                rows[metric].astype(float).tolist(), str(backend), bars=_bars(rows, metric),
+                meta={"qps": qps_words(qps)},
             ))
         title = "cap on the solver's iterations" if metric == metrics[-1][0] else ""
         panels.append(Panel(
             Axis(title, "category", order),
             Axis(label, "error", summary[metric].astype(float).tolist()), marks,
         ))
-    return Drawing(panels, 60 + 250 * len(panels)) if panels else None
+    return Drawing(panels) if panels else None
 
 
 #: What errors are drawn against: the column, the words of the axis and the letter of files.
@@ -169,7 +157,7 @@ def _sweep(rows: DataFrame, name: str, lines: str | None) -> tuple[Drawing, dict
     if name == "qps":
         axis = Axis(words, "category", ranked(map(qps_words, rows["qps"])))
     values = rows[by].astype(float).tolist()
-    found = Drawing([Panel(axis, Axis(RANKED_BY[by], "error", values), marks)], 400)
+    found = Drawing([Panel(axis, Axis(RANKED_BY[by], "error", values), marks)])
     return found, styles(looks)
 
 
@@ -182,18 +170,16 @@ def times(found: list[Spread], deadline: float | None) -> Drawing | None:
     marks = []
     for one in found:
         low, first, median, third, high, most = map(seconds, one.quantiles)
-        observer = one.backend == "observer"
         marks.append(Mark(
             "box", one.quantiles, [one.backend], one.backend,
-            [f"<b>{one.backend}</b>, {one.steps} steps<br>1 % {low}, 25 % {first}, median {median},"
-             f"<br>75 % {third}, 99 % {high}, longest {most}"],
-            meta={"backend": one.backend, **({} if observer else {
-                "qps": one.qps, "cap": one.cap, "start": one.start})},
+            [f"{one.backend}, {one.steps} steps\n1 % {low}, 25 % {first}, median {median}\n"
+             f"75 % {third}, 99 % {high}, longest {most}"],
+            meta={} if one.backend == "observer" else {"qps": one.qps},
         ))
     values = [value for one in found for value in one.quantiles]
     return Drawing(
         [Panel(Axis("time per step", "time", values), Axis("", "category", names), marks)],
-        180 + 34 * len(names), deadline,
+        deadline,
         "time per step (box: quartiles; whiskers: 1 % and 99 %; tick: longest)"
         + ("" if deadline is None else "; dotted: deadline"),
     )
@@ -209,21 +195,19 @@ def performance(found: list[Profile]) -> Drawing | None:
     for one in found:
         x, y = one.steps(last)
         marks.append(Mark(
-            "steps", x.tolist(), y.tolist(), one.backend,
-            [f"<b>{one.words}</b><br>{percent(share)} of {one.problems} problems within "
-             f"{number(ratio)} times the fastest" for ratio, share in zip(x, y, strict=True)],
-            meta={"backend": one.backend}, label=one.words,
+            "steps", x.tolist(), y.tolist(), one.backend, label=one.words,
         ))
     return Drawing([Panel(
         Axis("time / fastest backend's time", "ratio", [1.0, last]),
         Axis(f"share of {found[0].problems} problems solved", "share"), marks,
-    )], 420)
+    )])
 
 
-def _hover(row: Any, metric: str = "rmse", label: str = "RMSE") -> str:
-    shown = {"rmse": "RMSE"} | {metric: label}
-    lines = [
-        f"<b>{configuration_words(row)}</b>" + (" (Pareto front)" if row["pareto"] else ""),
+def _told(row: Any, by: str) -> str:
+    """What a point tells of its configuration."""
+    shown = {"rmse": "RMSE"} | {by: RANKED_BY[by]}
+    return "\n".join([
+        configuration_words(row) + (" (Pareto front)" if row["pareto"] else ""),
         *(f"{words} {number(row[name])} ({number(row[f'{name}_low'])} to "
           f"{number(row[f'{name}_high'])})" for name, words in shown.items()),
         f"RMSE settled {number(row['rmse_settled'])}, J / converged {number(row['cost_ratio'])}",
@@ -231,8 +215,7 @@ def _hover(row: Any, metric: str = "rmse", label: str = "RMSE") -> str:
         f"{seconds(row['time_median_high'])}), 99 % {seconds(row['time_p99'])}",
         f"improved {percent(row['improved'])} of the steps, {row['seeds']} seeds"
         + (f", {row['failures']} failed" if row["failures"] else ""),
-    ]
-    return "<br>".join(lines)
+    ])
 
 
 def _bars(rows: DataFrame, name: str) -> tuple[list[float], list[float]]:
@@ -248,25 +231,23 @@ class Spread:
 
     backend: str
     qps: str
-    cap: str
-    start: str
     quantiles: list[float]
     steps: int
 
 
-def spreads(frame: DataFrame) -> list[Spread]:
-    """Quantiles over the steps of all seeds, for each backend, QPs per sample, cap and start."""
+def spreads(cells: DataFrame, start: str) -> list[Spread]:
+    """Quantiles over the steps of all seeds: the observer's, and without a cap from this start."""
+    uncapped = cells["solver_iterations"].isna() & (cells["start"] == start)
     found = []
-    for (backend, qps, cap, start), rows in frame.groupby(
-        ["backend", "qps", "solver_iterations", "start"], dropna=False
+    for (backend, qps), rows in cells[uncapped | (cells["backend"] == "observer")].groupby(
+        ["backend", "qps"], dropna=False
     ):
         parts = [np.asarray(one, dtype=float) for one in rows["times"] if one is not None]
         parts = [one[np.isfinite(one)] for one in parts if one.ndim == 1]
         values = np.concatenate(parts) if parts else np.empty(0)
         if values.size:
             found.append(Spread(
-                str(backend), qps_words(qps), cap_words(cap), str(start),
-                np.quantile(values, _QUANTILES).tolist(), values.size,
+                str(backend), qps_words(qps), np.quantile(values, _QUANTILES).tolist(), values.size,
             ))
     return found
 

@@ -1,0 +1,125 @@
+"""The table of a report's page: a row for each configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from .answers import Case
+from .words import cap_words, missing, number, percent, qps_words, ranked
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+# Column of the summary, heading, and the factor to what is shown (None: a count); what decides
+# comes first.
+_NUMBERS: tuple[tuple[str, str, float | None], ...] = (
+    ("rmse", "RMSE", 1.0),
+    ("rmse_half", "±\u00a095\u00a0%", 1.0),
+    ("cost_ratio", "J / converged", 1.0),
+    ("time_median", "time median (µs)", 1e6),
+    ("time_p99", "time 99\u00a0% (µs)", 1e6),
+    ("late", "late (%)", 100.0),
+    ("nees", "NEES", 1.0),
+    ("failures", "failed runs", None),
+    ("failed_steps", "failed steps (%)", 100.0),
+    ("fallback", "fallback (%)", 100.0),
+    ("improved", "improved (%)", 100.0),
+    ("cap_hits", "cap hits (%)", 100.0),
+    ("rmse_settled", "RMSE settled", 1.0),
+    ("cost", "mean J", 1.0),
+    ("time_half", "time ±\u00a095\u00a0% (µs)", 1e6),
+    ("time_p95", "time 95\u00a0% (µs)", 1e6),
+    ("time_max", "time max (µs)", 1e6),
+    ("kept", "kept (%)", 100.0),
+    ("qps_mean", "QPs used", 1.0),
+    ("solver_iterations_mean", "solver iterations", 1.0),
+    ("seeds", "seeds", None),
+)
+# The table is in the order of the first of these that it has.
+_ORDER = ("time_median", "rmse", "cost")
+_WHY = {
+    "CONVERGED": "converged", "UNCONVERGED": "not converged", "NO_DECREASE": "no decrease",
+    "SOLVER_STOPPED": "solver stopped",
+    "SOLVER_FAILED": "solver failed", "MODEL_FAILED": "model failed", "TIME_UP": "time up",
+    "ROWS_DROPPED": "rows dropped", "CANDIDATE_OUTSIDE": "candidate outside",
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What a cell shows, and by what its column is sorted; texts stand at the left."""
+
+    text: str
+    rank: str = ""
+    left: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Headings, whether their columns are texts, and rows with the key of their case."""
+
+    headings: list[tuple[str, bool]]
+    rows: list[tuple[str, list[Cell]]]
+
+
+def table(cases: list[Case]) -> Table:
+    """The configurations of all cases, the fastest first."""
+    import pandas as pd
+
+    summary = pd.concat([case.summary.assign(case=case.key) for case in cases], ignore_index=True)
+    summary = summary.assign(
+        rmse_half=(summary["rmse_high"] - summary["rmse_low"]) / 2,
+        time_half=(summary["time_median_high"] - summary["time_median_low"]) / 2,
+    )
+    order = next((one for one in _ORDER if summary[one].notna().any()), _ORDER[0])
+    summary = summary.sort_values(order, kind="stable")
+    columns = _named(summary)
+    for name, heading, scale in _NUMBERS:
+        if summary[name].notna().any():
+            columns[heading] = [_number(one, scale) for one in summary[name]]
+    columns["RMSE by state"] = [Cell(_numbers(one), left=True) for one in summary["rmse_states"]]
+    columns["why a sequence ended"] = [Cell(_why(one), left=True) for one in summary["reasons"]]
+    return Table(
+        [(heading, cells[0].left) for heading, cells in columns.items()],
+        [*zip(summary["case"], map(list, zip(*columns.values(), strict=True)), strict=True)],
+    )
+
+
+def _named(summary: DataFrame) -> dict[str, list[Cell]]:
+    """The columns that name a configuration, without those in which all agree."""
+    columns = {"backend": [Cell(str(one), left=True) for one in summary["backend"]]}
+    horizons = ["usual" if missing(one) else str(int(one)) for one in summary["horizon"]]
+    for heading, words in (
+        ("model", summary["model"].astype(str)), ("N", horizons),
+        ("start", summary["start"].astype(str)),
+    ):
+        if len(set(words)) > 1:
+            columns[heading] = [Cell(one, left=heading != "N") for one in words]
+    for heading, words in (
+        ("QPs", [qps_words(one) for one in summary["qps"]]),
+        ("cap", [cap_words(one) for one in summary["solver_iterations"]]),
+    ):
+        places = {word: str(place) for place, word in enumerate(ranked(words))}
+        columns[heading] = [Cell(one, places[one]) for one in words]
+    columns["front"] = [Cell("front" if one else "", left=True) for one in summary["pareto"]]
+    return columns
+
+
+def _number(value: Any, scale: float | None) -> Cell:
+    """A number with three digits, a count where there is no scale; unknown ones are last."""
+    if missing(value):
+        return Cell(number(value), "Infinity")
+    return Cell(str(int(value)) if scale is None else number(scale * value), repr(float(value)))
+
+
+def _numbers(values: Any) -> str:
+    return ", ".join(f"{one:.3g}" for one in values) if isinstance(values, list) else ""
+
+
+def _why(shares: Any) -> str:
+    if not isinstance(shares, dict):
+        return ""
+    return ", ".join(
+        f"{_WHY[flag]} {percent(share)}" for flag, share in shares.items() if flag in _WHY
+    )
