@@ -363,8 +363,6 @@ class PythonEngine:
         """Forget all measurements and start at this state."""
         self._solver.forget()
         window = self._fresh_window(initial_state, self._tools)
-        window.enter_states(0, 0)
-        window.trust_start()
         self.replace(Memory(self._tools, window, None, (0, 0), [window.initial_state]))
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:

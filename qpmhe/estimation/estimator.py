@@ -237,7 +237,8 @@ class MovingHorizonEstimator:
         Parameters
         ----------
         initial_state : (n,) array_like, optional
-            A new initial estimate; the former one if left out.
+            A new initial estimate; the former one if left out. Both are projected onto the X that
+            `set` has left.
 
         Raises
         ------
@@ -248,7 +249,9 @@ class MovingHorizonEstimator:
         try:
             if initial_state is not None:
                 self._initial_state = self._checked_start(initial_state, self._engine.system)
-            self._engine.reset(self._initial_state)
+            # X may be another one than that in which the former state is.
+            start, _ = _inside(self._engine.system, self.observer, self.cost, self._initial_state)
+            self._engine.reset(start)
         except BaseException:
             self._initial_state = before
             self._own_system.use_call_modes(modes)
@@ -827,7 +830,15 @@ def check_start(
 ) -> Array:
     """Check that model and observer work at an initial state; return it, projected onto X."""
     try:
-        state = _inside(system, observer, cost, state, name)
+        start, is_moved = _inside(system, observer, cost, state)
+        if is_moved:
+            warnings.warn(
+                f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the "
+                f"estimator starts at the nearest point of the set, {start.tolist()}.",
+                ObserverWarning,
+                stacklevel=4,
+            )
+        state = start
         system.check(state, np.zeros(system.m) if u is None else u)
         observer.check(system, state)
     except ModelError as error:
@@ -838,25 +849,19 @@ def check_start(
 
 
 def _inside(
-    system: System, observer: Observer, cost: Cost, state: Array, name: str
-) -> Array:
+    system: System, observer: Observer, cost: Cost, state: Array
+) -> tuple[Array, bool]:
+    """An initial state in X, in its turn, and whether it was projected."""
     if system.states is None:
-        return state
+        return state, False
     if system.turns is not None:
         state = system.turns(state)
     nearest = NearestPoint(system.states)
     if nearest.contains(state):
-        return state
+        return state, False
     weight = observer.metric
     if weight is None:
         weight = cost.initial_weight(observer.initial_covariance())
     if weight.shape[0] != system.n:
-        return state  # `Observer.check` then reports the wrong size
-    inside = nearest(state, inverse(weight)).point
-    warnings.warn(
-        f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the estimator "
-        f"starts at the nearest point of the set, {inside.tolist()}.",
-        ObserverWarning,
-        stacklevel=5,
-    )
-    return inside
+        return state, False  # `Observer.check` then reports the wrong size
+    return nearest(state, inverse(weight)).point, True

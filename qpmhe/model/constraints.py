@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,8 @@ Mask = NDArray[np.bool_]
 _NAMES = ("x", "u", "w", "v")
 # Multiples of the standard deviations within which the scale of a row is looked for.
 _REACHES = (1.0, 10.0, 100.0, 1000.0)
+# Standard deviations of d that a state moves by in a window, as a rule at most.
+_WANDERED = 30.0
 # Step of second derivatives, as a share of the standard deviations.
 _MOVE = 2.0**-12
 # Points at which constraints are compared with another system's.
@@ -209,21 +211,30 @@ class _Bound:
         self.function.try_again(probes)
         self.jacobian.use_scales(deviations, None, probes)
 
-    def scale(self, start: Array, deviations: Array, u: Array) -> Array:
-        """The largest change (size,) of each row within a standard deviation around a start."""
-        moves = np.vstack((np.eye(self._d), -np.eye(self._d), np.ones(self._d), -np.ones(self._d)))
-        for inputs in (u, np.full_like(u, 0.5)):
-            for reach in _REACHES:
-                points = np.vstack((start, start + reach * deviations * moves))
-                values = self.values(points, np.tile(inputs, (len(points), 1)))
-                change = np.abs(values[1:] - values[0])
-                change = np.where(np.isfinite(change), change, 0.0).max(axis=0) / reach
-                if (change > 0.0).all():
-                    return np.asarray(change)
-        size = np.abs(values[0])
+    def scale(self, start: Array, deviations: Array, typical: Array, u: Array) -> Array:
+        """The largest change (size,) of each row within a standard deviation around a start.
+
+        Where that is more, it is the change within the typical magnitudes or, if greater, the
+        row's value: a vague prior tells nothing about how large a miss is.
+        """
+        far, size = self._change(start, deviations, u)
+        near, _ = self._change(start, typical, u)
+        near = np.maximum(near, size)
         # A constant row holds everywhere or nowhere: any scale will do.
-        other = np.where(np.isfinite(size) & (size > 0.0), size, 1.0)
-        return np.where(change > 0.0, change, other)
+        far = np.where(far > 0.0, far, np.where(size > 0.0, size, 1.0))
+        return np.where(near > 0.0, np.minimum(near, far), far)
+
+    def _change(self, start: Array, deviations: Array, u: Array) -> tuple[Array, Array]:
+        """The largest change of each row within deviations, and its value's size; 0 if unknown."""
+        moves = np.vstack((np.eye(self._d), -np.eye(self._d), np.ones(self._d), -np.ones(self._d)))
+        for inputs, reach in product((u, np.full_like(u, 0.5)), _REACHES):
+            points = np.vstack((start, start + reach * deviations * moves))
+            values = self.values(points, np.tile(inputs, (len(points), 1)))
+            change, size = np.abs(values[1:] - values[0]), np.abs(values[0])
+            change = np.where(np.isfinite(change), change, 0.0).max(axis=0) / reach
+            if (change > 0.0).all():
+                break
+        return change, np.where(np.isfinite(size), size, 0.0)
 
     def values(self, s: Array, u: Array) -> Array:
         """Values along points s (K, d), (K, size); infinity where it raises or is not finite."""
@@ -369,18 +380,24 @@ class ConstraintFunctions:
     ) -> None:
         """Take the rows' scale around a start, by deviations x (n,) and covariances of d and v.
 
+        A state's typical magnitude is its start's or what disturbances move it by, if these are
+        smaller than its deviation.
+
         ``through`` (r, n) maps d = x+ - f(x) to w; None for the identity.
         """
         self._through = through
         w = np.sqrt((d if through is None else through @ d @ through.T).diagonal())
         v = np.sqrt(v.diagonal())
+        usual = np.maximum(np.abs(start), _WANDERED * np.sqrt(d.diagonal()))
+        usual = np.where(usual > 0.0, np.minimum(x, usual), x)
         found, u = [], np.zeros(self._m)
         for one in self._bound:
             deviations = one.joined({"x": x, "w": w, "v": v})
             one.use_scales(deviations)
             s = one.joined(self._start(start))
             one.jacobian.check(s, u)
-            found.append(one.scale(s, deviations, u))
+            typical = one.joined({"x": usual, "w": w, "v": v})
+            found.append(one.scale(s, deviations, typical, u))
         self.scale = np.concatenate(found)
 
     def counting(self, count: int, observed: Mask | None) -> Mask:

@@ -35,6 +35,7 @@ OPTIONS = {
 if find_compiler() is not None:
     OPTIONS["sets, kalman, in C"] = OPTIONS["sets, kalman"] | {"engine": "compiled"}
 every = pytest.mark.parametrize("name", OPTIONS)
+ENGINES = ["python"] if find_compiler() is None else ["python", "compiled"]
 # The sets are narrow: rows are dropped for long, and a start may lie outside.
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 
@@ -133,6 +134,24 @@ def test_set_before_the_first_sample_projects_the_start():
         mhe, states = estimator(sets=SETS, kalman=kalman), Box([0.6, -1.0], [1.0, np.inf])
         assert mhe.set(bounds={"states": states}) is None
         assert states.violation(mhe.state) == 0.0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("project", [True, False])
+@pytest.mark.parametrize("kalman", [None, "ExtendedKalman"])
+def test_a_reset_starts_in_the_present_states(kalman, project, engine):
+    """As the estimator that is made with them, whose initial state is projected in any case."""
+    states = Box([0.8, 0.3], WIDE.upper) & ROW
+    options = {"kalman": kalman, "project_observer": project, "engine": engine}
+    mhe, new = estimator(SETS, **options), estimator(SETS | {"states": states}, **options)
+    mhe.update([0.1, 0.2, 0.3], [0.4])
+    mhe.set(bounds={"states": states})
+    mhe.reset()
+    assert states.violation(mhe.state) == 0.0
+    for sample in samples(6, 3, True):
+        one, other = mhe.update(**sample), new.update(**sample)
+        assert one.cost == pytest.approx(other.cost, rel=1e-12)
+        assert one.candidate == pytest.approx(other.candidate, rel=1e-12)
 
 
 def test_states_move_into_other_bounds_in_the_observers_metric():

@@ -114,3 +114,29 @@ def test_with_active_rows_both_engines_agree(sets):
         np.testing.assert_allclose(two.costs[3:], one.costs[3:], rtol=allowed)
         active += np.abs(one.filtered - free.filtered).max() > 1e-3
     assert active == 3
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e7])
+@pytest.mark.parametrize("start", [[0.0, 0.0], [1.9, 0.1]])
+@pytest.mark.parametrize("ratio", [1e2, 1e6, 1e10])
+def test_a_hard_constraint_holds_beside_a_vague_prior(ratio, start, unit):
+    """The state with the least J is the point of a ball nearest to y."""
+    system = qpmhe.System(
+        lambda x: 1.0 * x, lambda x: 1.0 * x, n=2, p=2,
+        constraints=[qpmhe.Constraint(lambda x: x @ x / unit**2 - 4.0)],
+    )
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=(0.1 * ratio * unit) ** 2 * np.eye(2), disturbance=(0.01 * unit) ** 2 * np.eye(2),
+        noise=(0.1 * unit) ** 2 * np.eye(2),
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(0.5 * np.eye(2)), cost, horizon=1,
+        initial_state=unit * np.array(start), max_qps=None,
+    )
+    active = 0
+    for y in 2.0 * np.random.default_rng(0).normal(size=(30, 2)):
+        x, length = mhe.update(unit * y).trajectory[0] / unit, np.linalg.norm(y)
+        active += length > 2.0
+        assert x @ x <= 4.0 + 1e-7
+        np.testing.assert_allclose(x, y * min(1.0, 2.0 / length), rtol=0, atol=1e-8 + 5 / ratio**2)
+    assert active > 10
