@@ -53,7 +53,9 @@ def test_reproduce_writes_what_it_says(tmp_path, method):
     assert summary["Ipopt converged"] == pytest.approx(summary["converged"], rel=1e-6)
 
 
-def test_reproduction_over_seeds_is_the_mean_of_single_ones():
+def test_reproduction_over_seeds_is_the_mean_of_single_ones(monkeypatch):
+    # The backends are compared on one record: their rows are none of these.
+    monkeypatch.setattr("qpmhe.studies.paper.available", lambda: ["banded"])
     options = {"steps": 6, "backend_name": "banded"}
     one, two = (qpmhe.studies.reproduce(seed=k, **options) for k in (4, 5))
     found = qpmhe.studies.reproduce(seed=4, seeds=2, **options)
