@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Set
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +18,8 @@ from .. import studies
 from ..studies.environment import environment_words
 from ..studies.report.answers import Case, cases, chosen
 from ..studies.report.words import cap_words, number, percent, qps_words, seconds
-from ..studies.summary import TOLERANCE
+from ..studies.row import SHOWN
+from ..studies.summary import TOLERANCE, with_halves
 from . import options
 from .values import read_width
 
@@ -30,42 +30,11 @@ _MOST_ROWS = 40
 _BEST = "[bold green]{}*[/]"
 
 
-@dataclass(frozen=True)
-class _Column:
-    """A column of the table: of the summary, heading, words, whether less is better."""
-
-    name: str
-    heading: str
-    words: Callable[[Any], str]
-    less: bool | None = None  # None: neither is better
-
-
-# In the order in which they stand.
-_COLUMNS = (
-    _Column("rmse", "RMSE", number, True),
-    _Column("rmse_half", "± 95 %", number),
-    _Column("rmse_settled", "RMSE\nsettled", number, True),
-    _Column("nees", "NEES", number),
-    _Column("cost", "J", number, True),
-    _Column("cost_ratio", "J /\nconv.", number, True),
-    _Column("time_median", "median", seconds, True),
-    _Column("time_p95", "95 %", seconds, True),
-    _Column("time_p99", "99 %", seconds, True),
-    _Column("time_max", "max", seconds, True),
-    _Column("late", "late", percent, True),
-    _Column("improved", "impr.", percent, False),
-    _Column("kept", "kept", percent),
-    _Column("fallback", "fall-\nback", percent, True),
-    _Column("failed_steps", "failed\nsteps", percent, True),
-    _Column("cap_hits", "cap\nhits", percent),
-)
-# Those that are always shown: NEES and late are there only where they were asked for.
-_ALWAYS = ("rmse", "time_median", "late", "nees")
-# The others, in the order in which they are given the room that is left.
-_THEN = (
-    "cost_ratio", "improved", "rmse_half", "rmse_settled", "time_p99", "failed_steps", "cap_hits",
-    "fallback", "time_p95", "kept", "time_max", "cost",
-)
+# The columns that a terminal may show, in their order, and how their numbers are written.
+_COLUMNS = {name: one for name, one in SHOWN.items() if one.short}
+_WORDS: dict[str, Callable[[Any], str]] = {
+    "number": number, "seconds": seconds, "share": percent,
+}
 
 
 def report(
@@ -112,14 +81,15 @@ def show(console: Console, summary: DataFrame) -> None:
         console.print(f"[bold]{case.title}[/]", highlight=False)
         for answer in case.answers():
             console.print(f"  [bold]{answer.question}:[/] {answer.text}", highlight=False)
-        rows = case.summary.assign(
-            rmse_half=(case.summary["rmse_high"] - case.summary["rmse_low"]) / 2
-        )
-        filled = {one.name for one in _COLUMNS if rows[one.name].notna().any()}
-        chosen_ones = filled & {*_ALWAYS, *([] if case.by == "rmse" else ["cost"])}
-        for name in _THEN:
+        rows = with_halves(case.summary)
+        filled = {name for name in _COLUMNS if rows[name].notna().any()}
+        chosen_ones = {
+            name for name in filled
+            if _COLUMNS[name].rank == 0 or (name == "cost" and case.by != "rmse")
+        }
+        for name in sorted(filled - chosen_ones, key=lambda name: _COLUMNS[name].rank):
             more = chosen_ones | {name}
-            if name in filled and _width(console, _table(case, rows, more)) <= console.width:
+            if _width(console, _table(case, rows, more)) <= console.width:
                 chosen_ones = more
         console.print(_table(case, rows, chosen_ones, filled - chosen_ones))
 
@@ -132,9 +102,9 @@ def _width(console: Console, table: Table) -> int:
 def _table(
     case: Case, rows: DataFrame, names: Set[str], absent: Set[str] = frozenset()
 ) -> Table:
-    columns = [one for one in _COLUMNS if one.name in names]
+    columns = {name: one for name, one in _COLUMNS.items() if name in names}
     best = {
-        one.name: _best(rows.loc[case.whole.index], one.name, one.less) for one in columns
+        name: _best(rows.loc[case.whole.index], name, one.less) for name, one in columns.items()
     }
     drawn, caption = rows, "*: best."
     if rows["time_median"].notna().any():
@@ -147,9 +117,9 @@ def _table(
         )
     if absent:
         left_out = [
-            ("time " if one.name.startswith("time_") else "")
-            + one.heading.replace("-\n", "").replace("\n", " ")
-            for one in _COLUMNS if one.name in absent
+            ("time " if one.kind == "seconds" else "")
+            + str(one.short).replace("-\n", "").replace("\n", " ")
+            for name, one in _COLUMNS.items() if name in absent
         ]
         caption += f" Only in the report, for want of room: {', '.join(left_out)}."
     table = Table(
@@ -162,14 +132,14 @@ def _table(
             head, no_wrap=not named, overflow="fold", min_width=8 if named else None,
             justify="left" if named else "right",
         )
-    for one in columns:
-        table.add_column(one.heading, no_wrap=True, justify="right")
+    for one in columns.values():
+        table.add_column(str(one.short), no_wrap=True, justify="right")
     table.add_column("failed\nruns", no_wrap=True, justify="right")
     table.add_column("", no_wrap=True)
     for index, row in drawn.sort_values(["time_median", "rmse"]).iterrows():
         cells = [
-            _BEST.format(one.words(row[one.name])) if index == best[one.name]
-            else one.words(row[one.name]) + " " for one in columns
+            (_BEST if index == best[name] else "{} ").format(_WORDS[one.kind](row[name]))
+            for name, one in columns.items()
         ]
         table.add_row(
             str(row["backend"]), qps_words(row["qps"]).replace("converged", "conv."),

@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -25,8 +25,7 @@ from ..models import Record
 from . import metrics
 from .environment import environment
 from .experiment import Source, experiment
-
-Result = dict[str, Any]
+from .row import Cell, Row
 
 #: Engine of all cells: only the Python step calls the backends that a study compares.
 ENGINE = "python"
@@ -34,42 +33,6 @@ ENGINE = "python"
 OBSERVER = "observer"
 # Failing QPs that are kept of one cell, at most.
 _KEPT = 20
-
-
-@dataclass(frozen=True)
-class Cell:
-    """What distinguishes one run from all others of a study.
-
-    ``backend`` is `OBSERVER` if no QP is solved. ``qps`` is None to iterate to convergence;
-    ``solver_iterations``, the cap inside each QP, is None for the solver's default. ``noise_level``
-    multiplies the standard deviations of the simulated disturbance and noise.
-    """
-
-    model: str
-    backend: str
-    qps: int | None
-    solver_iterations: int | None
-    horizon: int
-    start: str
-    seed: int
-    steps: int
-    noise_level: float = 1.0
-
-    @property
-    def key(self) -> str:
-        """A text that identifies the cell."""
-        qps = "converged" if self.qps is None else self.qps
-        cap = "none" if self.solver_iterations is None else self.solver_iterations
-        level = "" if self.noise_level == 1.0 else f"/noise={self.noise_level:g}"
-        return (
-            f"{self.model}/{self.backend}/i={qps}/cap={cap}/N={self.horizon}/{self.start}"
-            f"/T={self.steps}{level}/seed={self.seed}"
-        )
-
-    @property
-    def configuration(self) -> tuple[object, ...]:
-        """Everything but the seed."""
-        return astuple(replace(self, seed=0))
 
 
 @dataclass(frozen=True)
@@ -102,7 +65,7 @@ class OutOfTimeError(Exception):
     """The cell's time is up."""
 
 
-def compute(task: Task) -> Result:
+def compute(task: Task) -> Row:
     """Run a cell; an exception in it becomes a row."""
     began = perf_counter()
     with _ended_after(task.hard_limit):
@@ -116,12 +79,9 @@ def compute(task: Task) -> Result:
             return failure(task, f"{type(error).__name__}: {error}")
 
 
-def failure(task: Task, reason: str) -> Result:
+def failure(task: Task, reason: str) -> Row:
     """The row of a cell that failed."""
-    return {
-        **_fields(task), "outcome": "failed", "reason": " ".join(reason.split())[:500],
-        "environment": environment(),
-    }
+    return Row(**_fields(task), outcome="failed", reason=" ".join(reason.split())[:500])
 
 
 @contextmanager
@@ -135,11 +95,14 @@ def _ended_after(seconds: float) -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
 
 
-def _fields(task: Task) -> Result:
-    return {"key": task.cell.key, **vars(task.cell), "parts": task.parts, "shared": task.shared}
+def _fields(task: Task) -> dict[str, Any]:
+    return {
+        **vars(task.cell), "parts": task.parts, "shared": task.shared,
+        "environment": environment(),
+    }
 
 
-def _measured(task: Task, limit: float) -> Result:
+def _measured(task: Task, limit: float) -> Row:
     cell, found = task.cell, experiment(task.source)
     if task.registered is not None:
         _register(task.registered)
@@ -148,36 +111,36 @@ def _measured(task: Task, limit: float) -> Result:
         _warm_up(task, limit)
     run = _run(task, record, limit, covariances="covariance" in task.parts)
     residual = found.system.state_residual
-    row: Result = {
-        **_fields(task), "outcome": "done", "reason": "", "environment": environment(),
+    measured: dict[str, Any] = {
         **metrics.accuracy(run.states, record.states, found.settled, residual),
         **metrics.outcomes(run),
     }
     if "time" in task.parts:
-        row |= metrics.timing(run.times)
+        measured |= metrics.timing(run.times)
     if run.covariances is not None:
-        row["nees"] = metrics.consistency(run.states, record.states, run.covariances, residual)
+        measured["nees"] = metrics.consistency(run.states, record.states, run.covariances, residual)
     if "accuracy" in task.parts:
         try:
             reference = _reference(task, record, limit)
         except OutOfTimeError as error:
-            row["reason"] = f"no cost ratio: the converged reference ran out of time, {error}"
+            measured["reason"] = f"no cost ratio: the converged reference ran out of time, {error}"
             reference = None
-        row["cost_ratio"] = metrics.cost_ratio(run.costs, reference)
+        measured["cost_ratio"] = metrics.cost_ratio(run.costs, reference)
     if task.keep:
-        row["trajectory"] = {
+        measured["trajectory"] = {
             "times": found.times(cell.steps),
             "states": record.states,
             "estimates": run.states if residual is None
             else residual.aligned(run.states, record.states),
             "labels": list(found.labels), "title": found.title, "time_unit": found.time_unit,
         }
-    if task.failing is not None and {"SOLVER_FAILED", "SOLVER_STOPPED"} & row["reasons"].keys():
+    stopped = {"SOLVER_FAILED", "SOLVER_STOPPED"} & measured["reasons"].keys()
+    if task.failing is not None and stopped:
         try:
             _keep_failing(task, task.failing, record, limit)
         except (InvalidInputError, OutOfTimeError) as error:
-            row["reason"] = f"not all failing QPs were kept: {error}"
-    return row
+            measured["reason"] = f"not all failing QPs were kept: {error}"
+    return Row(**_fields(task), **measured, outcome="done")
 
 
 def _keep_failing(task: Task, folder: Path, record: Record, limit: float) -> None:

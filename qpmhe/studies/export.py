@@ -16,15 +16,10 @@ from ..errors import InvalidInputError, OptionError
 from .environment import environment_words
 from .report.answers import cases
 from .report.words import cap_words, qps_words
+from .row import SHOWN
 from .store import Store, opened
 from .summary import student, summarise
 
-# Column of the summary, heading, and the factor to what is shown.
-_COLUMNS = (
-    ("rmse", "RMSE", 1.0), ("cost", r"$J$", 1.0), ("cost_ratio", r"$J / J^*$", 1.0),
-    ("time_median", r"time ($\mu$s)", 1e6), ("late", r"late (\%)", 100.0),
-    ("improved", r"improved (\%)", 100.0), ("failed_steps", r"failed steps (\%)", 100.0),
-)
 _SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     **{mark: f"\\{mark}" for mark in "&%$#_{}"},
@@ -117,13 +112,14 @@ def _exponent(value: float, digits: int) -> int:
 
 
 def _table(title: str, rows: Any, machines: list[str]) -> str:
-    shown = [one for one in _COLUMNS if rows[one[0]].notna().any()]
+    shown = {name: one for name, one in SHOWN.items() if one.latex and rows[name].notna().any()}
     starts = ["start"] if rows["start"].nunique() > 1 else []
     # A cost says little where the error is known.
     if rows["rmse"].notna().any():
-        shown = [one for one in shown if one[0] != "cost"]
+        shown.pop("cost", None)
     seeds = int(rows["seeds"].max())
-    heads = ["backend", "QPs", "cap", *starts, *(words for _, words, _ in shown), "failed runs"]
+    numbers = [str(one.latex) for one in shown.values()]
+    heads = ["backend", "QPs", "cap", *starts, *numbers, "failed runs"]
     lines = [
         f"% {title}".replace("\n", " "),
         *(f"% {words}".replace("\n", " ") for words in machines),
@@ -138,8 +134,8 @@ def _table(title: str, rows: Any, machines: list[str]) -> str:
         count = row["seeds"] - row["failures"]
         quantile = float(student(np.array([count]))[0]) if count > 1 else math.nan
         cells = [
-            with_error(scale * float(row[name]), scale * _half(row, name) / quantile)
-            for name, _, scale in shown
+            with_error(one.scale * float(row[name]), one.scale * _half(row, name) / quantile)
+            for name, one in shown.items()
         ]
         failed = f"{row['failures']} of {row['seeds']}" if row["failures"] else "0"
         lines.append(" & ".join([

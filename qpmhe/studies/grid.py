@@ -25,8 +25,9 @@ from qpmhe_solvers.values import shown
 from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, InvalidInputError, ModelError, OptionError
 from ..models.loading import check_named_in_file, find
-from .cell import OBSERVER, Cell
+from .cell import OBSERVER
 from .experiment import Source, experiment
+from .row import Cell
 
 if TYPE_CHECKING:
     from .store import Store

@@ -6,6 +6,7 @@ import json
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import checked_path, need
 from ..errors import InvalidInputError, QpmheError
+from .row import Row
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -28,26 +30,19 @@ _APPLICATION = 0x71706D68
 # Seconds to wait for another program's lock.
 _PATIENCE = 10.0
 
-#: Type in SQLite of each column, in the order of the data frame.
+_SQL = {"int": "INTEGER", "int | None": "INTEGER", "bool": "INTEGER", "float": "REAL",
+        "Array | None": "BLOB"}
+_PANDAS = {"int": "int64", "int | None": "Int64", "bool": "bool", "float": "float64"}
+_STORED = {
+    one.name: str(one.type) for one in fields(Row) if one.metadata.get("stored", True)
+} | {"environment": "int"}  # its number
+#: Type in SQLite of each column, in the order of the data frame; lists and dicts are JSON texts.
 COLUMNS = {
-    "key": "TEXT PRIMARY KEY", "model": "TEXT", "backend": "TEXT", "qps": "INTEGER",
-    "solver_iterations": "INTEGER", "horizon": "INTEGER", "start": "TEXT", "seed": "INTEGER",
-    "steps": "INTEGER", "noise_level": "REAL", "outcome": "TEXT", "reason": "TEXT", "rmse": "REAL",
-    "rmse_settled": "REAL", "rmse_states": "TEXT", "rmse_settled_states": "TEXT",
-    "nees": "REAL", "cost": "REAL", "cost_ratio": "REAL", "improved": "REAL", "kept": "REAL",
-    "fallback": "REAL", "reasons": "TEXT", "cap_hits": "REAL", "qps_mean": "REAL",
-    "solver_iterations_mean": "REAL", "time_median": "REAL", "time_p95": "REAL",
-    "time_p99": "REAL", "time_max": "REAL", "times": "BLOB", "shared": "INTEGER",
-    "environment": "INTEGER", "finished": "TEXT", "parts": "TEXT",
+    "key": "TEXT PRIMARY KEY", **{name: _SQL.get(kind, "TEXT") for name, kind in _STORED.items()}
 }
-_JSON = ("rmse_states", "rmse_settled_states", "reasons")
+_JSON = tuple(name for name, kind in _STORED.items() if kind.startswith(("list", "dict")))
 _ARRAYS = ("times", "states", "estimates")
-_TYPES = {
-    **{name: "float64" for name, kind in COLUMNS.items() if kind == "REAL"},
-    **dict.fromkeys(("qps", "solver_iterations"), "Int64"),
-    **dict.fromkeys(("horizon", "seed", "steps", "environment"), "int64"),
-    "shared": "bool",
-}
+_TYPES = {name: _PANDAS[kind] for name, kind in _STORED.items() if kind in _PANDAS}
 _TABLES = (
     f"CREATE TABLE cells ({', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())})",
     "CREATE TABLE environments (id INTEGER PRIMARY KEY, settings TEXT UNIQUE)",
@@ -99,18 +94,10 @@ class Store:
     def frame(self) -> DataFrame:
         """All cells as a pandas.DataFrame, one row each, in the order of their keys' first storing.
 
-        Its columns are
-
-        - key, model, backend, qps (NA: to convergence), solver_iterations (NA: no cap), horizon,
-          start, seed, steps, noise_level: the cell;
-        - outcome ("done", "failed") and reason;
-        - rmse, rmse_settled, rmse_states, rmse_settled_states, nees, cost, cost_ratio, improved,
-          kept, fallback, reasons, cap_hits, qps_mean, solver_iterations_mean: see
-          `qpmhe.studies.metrics`;
-        - time_median, time_p95, time_p99, time_max [s], late (share of steps over the last study's
-          deadline), times (seconds of each step, None where not measured), shared (whether other
-          cells ran meanwhile);
-        - environment (index into ``meta()["environments"]``) and finished (UTC).
+        Its columns are ``key`` and the attributes of `qpmhe.studies.row.Row`, without those that
+        are not stored; ``environment`` is the index into ``meta()["environments"]``, and ``late``
+        follows from the times and the last study's deadline. NA in ``qps`` is a sequence to
+        convergence, in ``solver_iterations`` no cap.
         """
         pandas = need("pandas", "a data frame of results")
         with _reading(self.path) as connection:
@@ -130,7 +117,8 @@ class Store:
                 for one in times
             ]
             frame["times"] = pandas.Series(times, dtype=object)
-            frame.insert(frame.columns.get_loc("times"), "late", pandas.Series(late, dtype=float))
+            place = frame.columns.get_loc("improved")
+            frame.insert(place, "late", pandas.Series(late, dtype=float))
         whole: DataFrame = frame
         return whole
 
@@ -230,19 +218,19 @@ class Writer:
             rows = self._connection.execute(f"SELECT key, parts FROM cells {where}").fetchall()
             return {key: frozenset(parts.split(",")) for key, parts in rows}
 
-    def put(self, result: dict[str, Any]) -> None:
+    def put(self, result: Row) -> None:
         """Store what `qpmhe.studies.cell.compute` gives, in place of an earlier result."""
         connection = self._connection
-        row = {name: result.get(name) for name in COLUMNS}
+        row: dict[str, Any] = {name: getattr(result, name) for name in COLUMNS}
         row |= {name: json.dumps(row[name]) for name in _JSON if row[name] is not None}
-        row["parts"], row["finished"] = ",".join(sorted(result["parts"])), _now()
+        row["parts"], row["finished"] = ",".join(sorted(result.parts)), _now()
         if row["times"] is not None:
             row["times"] = np.asarray(row["times"], "f4").tobytes()
         with _explained(self._path), _transaction(connection):
-            row["environment"] = _environment(connection, result["environment"])
+            row["environment"] = _environment(connection, result.environment)
             connection.execute(_PUT, [*row.values()])
-            if "trajectory" in result:
-                content = result["trajectory"]
+            if result.trajectory is not None:
+                content = result.trajectory
                 content = content | {name: content[name].tolist() for name in _ARRAYS}
                 connection.execute(
                     "INSERT OR REPLACE INTO trajectories VALUES (?, ?)",

@@ -13,24 +13,13 @@ from qpmhe_solvers.values import shown
 
 from .._checks import numbers
 from ..errors import InvalidInputError, ShapeError
+from .row import CONFIGURATION, HALVES, METRICS
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-#: What distinguishes configurations.
-CONFIGURATION = (
-    "model", "backend", "qps", "solver_iterations", "horizon", "start", "steps", "noise_level",
-)
 #: What configurations must share to be compared with each other.
 PROBLEM = ("model", "noise_level", "horizon", "steps")
-#: Columns that are averaged over seeds.
-METRICS = (
-    "rmse", "rmse_settled", "nees", "cost", "cost_ratio", "improved", "kept", "fallback",
-    "failed_steps", "cap_hits", "qps_mean", "solver_iterations_mean", "time_median", "time_p95",
-    "time_p99", "time_max", "late", "rmse_excess",
-)
-_SHARES = ("improved", "kept", "fallback", "failed_steps", "cap_hits", "late")
-_POSITIVE = tuple(name for name in METRICS if name != "rmse_excess")
 _STATES = ("rmse_states", "rmse_settled_states")
 _DERIVED = ("failed_steps", "rmse_excess")
 _NEEDED = (
@@ -135,6 +124,13 @@ def summarise(frame: DataFrame) -> DataFrame:
     return summary
 
 
+def with_halves(summary: DataFrame) -> DataFrame:
+    """A summary with half the width of the limits, for what tables show it of."""
+    return summary.assign(**{
+        f"{name}_half": (summary[f"{name}_high"] - summary[f"{name}_low"]) / 2 for name in HALVES
+    })
+
+
 def _failed_share(reasons: Any, steps: Any) -> float:
     if not isinstance(reasons, dict) or not steps:
         return np.nan
@@ -159,9 +155,9 @@ def _add_means(summary: DataFrame, done: DataFrame, names: list[str]) -> None:
     half = student(count) * deviation / np.sqrt(count)
     for name in names:
         low, high = mean[name] - half[name], mean[name] + half[name]
-        if name in _POSITIVE:
+        if name != "rmse_excess":
             low = low.clip(lower=0.0)
-        if name in _SHARES:
+        if METRICS[name].kind == "share":
             high = high.clip(upper=1.0)
         summary[name], summary[f"{name}_low"], summary[f"{name}_high"] = mean[name], low, high
 

@@ -13,9 +13,10 @@ from qpmhe.cli.app import app
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.models.loading import find
 from qpmhe.records import CheckpointError, checkpoints, estimate_record
-from qpmhe.studies.cell import Cell, Task, _estimator
+from qpmhe.studies.cell import Task, _estimator
 from qpmhe.studies.experiment import Source
 from qpmhe.studies.paper import PaperStudy
+from qpmhe.studies.row import Cell
 
 pytest.importorskip("casadi")
 needed = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")

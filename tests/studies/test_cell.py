@@ -7,8 +7,9 @@ import qpmhe
 from qpmhe.models.loading import find
 from qpmhe.studies import cell as module
 from qpmhe.studies import metrics
-from qpmhe.studies.cell import OBSERVER, Cell, Task, compute
+from qpmhe.studies.cell import OBSERVER, Task, compute
 from qpmhe.studies.experiment import Source
+from qpmhe.studies.row import Cell
 
 ALL = frozenset({"accuracy", "time", "covariance"})
 ODD = "tests/studies/odd_models.py"
@@ -47,17 +48,18 @@ def test_a_cell_is_the_run_of_an_estimator_made_by_hand(qps, cap, backend, start
         qps, cap, "auto" if backend == OBSERVER else backend, start, model
     )
     row = row_of(qps, cap, backend, start=start, model=model, keep=True)
-    assert (row["outcome"], row["reason"]) == ("done", "")
-    assert row["trajectory"]["estimates"] == pytest.approx(found, rel=1e-9, abs=1e-12)
+    assert (row.outcome, row.reason) == ("done", "")
+    assert row.trajectory["estimates"] == pytest.approx(found, rel=1e-9, abs=1e-12)
     errors = found - states
     scenario = qpmhe.models.catalogue()[model]().scenario
     settled = round(scenario.settling_time / scenario.dt)
     assert 0 < settled < STEPS
     relative = (errors / np.sqrt(((states - found[0]) ** 2).mean(axis=0))) ** 2
     for suffix, first in (("", 0), ("_settled", settled)):
-        assert row[f"rmse{suffix}"] == pytest.approx(np.sqrt(relative[first:].mean()), rel=1e-12)
+        whole = np.sqrt(relative[first:].mean())
+        assert getattr(row, f"rmse{suffix}") == pytest.approx(whole, rel=1e-12)
         by_state = np.sqrt((errors[first:] ** 2).mean(axis=0))
-        assert row[f"rmse{suffix}_states"] == pytest.approx(by_state, rel=1e-12)
+        assert getattr(row, f"rmse{suffix}_states") == pytest.approx(by_state, rel=1e-12)
     iterations = [e.solver_iterations for e in estimates if e.solver_iterations is not None]
     _, _, converged, _ = by_hand(None, start=start, model=model)
     pairs = zip(estimates, converged, strict=True)
@@ -71,9 +73,9 @@ def test_a_cell_is_the_run_of_an_estimator_made_by_hand(qps, cap, backend, start
         "nees": np.mean([e @ np.linalg.inv(P) @ e
                          for e, P in zip(errors[1:], covariances, strict=True)]),
     }.items():
-        assert row[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
+        assert getattr(row, name) == pytest.approx(value, rel=1e-9, nan_ok=True), name
     for flag in qpmhe.Status:
-        assert row["reasons"].get(flag.name, 0) == sum(flag in e.status for e in estimates)
+        assert row.reasons.get(flag.name, 0) == sum(flag in e.status for e in estimates)
 
 
 def test_shares_of_steps_that_fail_are_fallback():
@@ -122,14 +124,17 @@ def test_only_what_was_asked_for_is_measured():
         row = row_of(None, parts=[part], horizon=3)
         for name, of in (("times", "time"), ("time_max", "time"), ("cost_ratio", "accuracy"),
                          ("nees", "covariance"), ("trajectory", None)):
-            assert (name in row) == (part == of)
+            value = getattr(row, name)
+            known = value is not None and not np.isnan(value).any()
+            assert known == (part == of)
         if part == "accuracy":  # the reference has the cell's own horizon
-            assert row["cost_ratio"] == pytest.approx(1, rel=1e-6)
+            assert row.cost_ratio == pytest.approx(1, rel=1e-6)
         if part == "time":
-            times = row["times"]
+            times = row.times
             assert (times.shape, times.dtype, (times > 0).all()) == ((STEPS,), np.float32, True)
             for name, share in (("median", 50), ("p95", 95), ("p99", 99), ("max", 100)):
-                assert row[f"time_{name}"] == pytest.approx(np.percentile(times, share), rel=1e-5)
+                quantile = np.percentile(times, share)
+                assert getattr(row, f"time_{name}") == pytest.approx(quantile, rel=1e-5)
 
 
 def test_whatever_is_raised_becomes_a_row_unless_it_is_the_user(monkeypatch):
@@ -139,9 +144,9 @@ def test_whatever_is_raised_becomes_a_row_unless_it_is_the_user(monkeypatch):
         ("batch_reactor", 1e-9, "out of time: 1 of "),
     ):
         row = row_of(model=model, timeout=timeout, seed=1)
-        assert (row["outcome"], row["model"]) == ("failed", model)
-        assert row["reason"].startswith(words)
-        assert row["environment"]["versions"]["numpy"] == np.__version__
+        assert (row.outcome, row.model) == ("failed", model)
+        assert row.reason.startswith(words)
+        assert row.environment["versions"]["numpy"] == np.__version__
 
     def ends(error):
         def function(*_):
@@ -150,9 +155,9 @@ def test_whatever_is_raised_becomes_a_row_unless_it_is_the_user(monkeypatch):
 
     monkeypatch.setattr(module, "_reference", ends(module.OutOfTimeError("3 of 30 steps.")))
     row = row_of()
-    assert (row["outcome"], np.isfinite(row["rmse"])) == ("done", True)
-    assert np.isnan(row["cost_ratio"])
-    assert "reference ran out of time" in row["reason"]
+    assert (row.outcome, np.isfinite(row.rmse)) == ("done", True)
+    assert np.isnan(row.cost_ratio)
+    assert "reference ran out of time" in row.reason
     monkeypatch.setattr(module, "experiment", ends(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
         row_of()

@@ -5,6 +5,7 @@ import os
 import sqlite3
 import sys
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -14,8 +15,9 @@ from qpmhe.errors import InvalidInputError
 from qpmhe.models.loading import find
 from qpmhe.studies import Store, StoreError, Study, export, summarise, write_report
 from qpmhe.studies import store as module
-from qpmhe.studies.cell import Cell, Task, compute, failure
+from qpmhe.studies.cell import Task, compute, failure
 from qpmhe.studies.experiment import Source
+from qpmhe.studies.row import Cell
 
 SETTINGS = Study(backends=["banded"], deadline=1e-6).settings()
 BOTH = ("accuracy", "time")
@@ -42,7 +44,9 @@ def path(tmp_path):
 
 def test_a_row_comes_back_as_it_was_put_and_the_settings_and_environments(path):
     result = compute(task(parts=(*BOTH, "covariance"), keep=True, shared=True))
-    other = {**compute(task(1, qps=None)), "environment": {**result["environment"], "cpu": "a"}}
+    other = replace(
+        compute(task(1, qps=None)), environment={**result.environment, "cpu": "a"}
+    )
     store = stored(path, result, other)
     frame = store.frame()
     assert (list(frame["seed"]), list(frame["environment"])) == ([0, 1], [0, 1])
@@ -51,18 +55,18 @@ def test_a_row_comes_back_as_it_was_put_and_the_settings_and_environments(path):
         if name == "solver_iterations":
             assert pd.isna(row[name])
         elif name not in ("environment", "finished", "parts"):
-            np.testing.assert_equal(row[name], result[name], name)
+            np.testing.assert_equal(row[name], getattr(result, name), name)
     assert row["late"] == 1.0  # the deadline is a microsecond
     assert pd.isna(frame["qps"].iloc[1])
     assert str(frame["qps"].dtype) == str(frame["solver_iterations"].dtype) == "Int64"
-    found = store.trajectory(result["key"])
+    found = store.trajectory(result.key)
     for name in ("times", "states", "estimates"):
-        np.testing.assert_array_equal(found.pop(name), result["trajectory"].pop(name))
-    assert found == result["trajectory"]
+        np.testing.assert_array_equal(found.pop(name), result.trajectory.pop(name))
+    assert found == result.trajectory
     assert store.trajectory("no such key") is None
     meta = store.meta()
     assert (meta["study"], meta["schema"]) == (SETTINGS, module.SCHEMA)
-    assert meta["environments"] == [result["environment"], other["environment"]]
+    assert meta["environments"] == [result.environment, other.environment]
     stored(path, settings={**SETTINGS, "deadline": None})
     assert [item["deadline"] for item in store.meta()["studies"]] == [1e-6, None]
     assert store.frame()["late"].isna().all()
@@ -83,10 +87,10 @@ def test_parts_that_are_measured_later_are_added_and_failures_replaced(path):
     row = after(accurate)
     assert (row["outcome"], row["times"], row["shared"]) == ("done", None, False)
     row = after(timed)
-    assert (row["cost_ratio"], row["shared"]) == (accurate["cost_ratio"], True)
+    assert (row["cost_ratio"], row["shared"]) == (accurate.cost_ratio, True)
     # A failure takes nothing away from what is there.
     last = after(failure(task(parts=(*BOTH, "covariance")), "too late"))
-    assert (last["outcome"], last["time_median"]) == ("done", timed["time_median"])
+    assert (last["outcome"], last["time_median"]) == ("done", timed.time_median)
 
 
 def change(path, command):

@@ -146,8 +146,8 @@ def test_figures_of_the_old_file_are_not_shown_for_the_new_one(here):
     (cell,) = Study(models=[model], **SMALL).cells()
     other = replace(source, model=replace(source.model, fingerprint="0" * 16))
     row = compute(Task(cell, other, frozenset({"accuracy"}), 60.0))  # a worker with another file
-    assert row["outcome"] == "failed"
-    assert "differs from the one that the study was started with" in row["reason"]
+    assert row.outcome == "failed"
+    assert "differs from the one that the study was started with" in row.reason
     write(here)
     assert rmse(model, "old.sqlite") == old
 

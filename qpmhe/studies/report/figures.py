@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..._checks import Array
-from ..summary import CONFIGURATION, PROBLEM, RANKED_BY, measure
+from ..row import CONFIGURATION
+from ..summary import PROBLEM, RANKED_BY, measure
 from .answers import NEAR
 from .drawing import Axis, Drawing, Mark, Panel, Style, styles
 from .words import (

@@ -5,37 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from ..row import SHOWN, Column
+from ..summary import with_halves
 from .answers import Case
 from .words import cap_words, missing, number, percent, qps_words, ranked
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# Column of the summary, heading, and the factor to what is shown (None: a count); what decides
-# comes first.
-_NUMBERS: tuple[tuple[str, str, float | None], ...] = (
-    ("rmse", "RMSE", 1.0),
-    ("rmse_half", "±\u00a095\u00a0%", 1.0),
-    ("cost_ratio", "J / converged", 1.0),
-    ("time_median", "time median (µs)", 1e6),
-    ("time_p99", "time 99\u00a0% (µs)", 1e6),
-    ("late", "late (%)", 100.0),
-    ("nees", "NEES", 1.0),
-    ("failures", "failed runs", None),
-    ("failed_steps", "failed steps (%)", 100.0),
-    ("fallback", "fallback (%)", 100.0),
-    ("improved", "improved (%)", 100.0),
-    ("cap_hits", "cap hits (%)", 100.0),
-    ("rmse_settled", "RMSE settled", 1.0),
-    ("cost", "mean J", 1.0),
-    ("time_half", "time ±\u00a095\u00a0% (µs)", 1e6),
-    ("time_p95", "time 95\u00a0% (µs)", 1e6),
-    ("time_max", "time max (µs)", 1e6),
-    ("kept", "kept (%)", 100.0),
-    ("qps_mean", "QPs used", 1.0),
-    ("solver_iterations_mean", "solver iterations", 1.0),
-    ("seeds", "seeds", None),
-)
 # The table is in the order of the first of these that it has.
 _ORDER = ("time_median", "rmse", "cost")
 _WHY = {
@@ -68,16 +45,12 @@ def table(cases: list[Case]) -> Table:
     import pandas as pd
 
     summary = pd.concat([case.summary.assign(case=case.key) for case in cases], ignore_index=True)
-    summary = summary.assign(
-        rmse_half=(summary["rmse_high"] - summary["rmse_low"]) / 2,
-        time_half=(summary["time_median_high"] - summary["time_median_low"]) / 2,
-    )
     order = next((one for one in _ORDER if summary[one].notna().any()), _ORDER[0])
-    summary = summary.sort_values(order, kind="stable")
+    summary = with_halves(summary.sort_values(order, kind="stable"))
     columns = _named(summary)
-    for name, heading, scale in _NUMBERS:
+    for name, one in sorted(SHOWN.items(), key=lambda item: item[1].rank):
         if summary[name].notna().any():
-            columns[heading] = [_number(one, scale) for one in summary[name]]
+            columns[one.title] = [_number(value, one) for value in summary[name]]
     columns["RMSE by state"] = [Cell(_numbers(one), left=True) for one in summary["rmse_states"]]
     columns["why a sequence ended"] = [Cell(_why(one), left=True) for one in summary["reasons"]]
     return Table(
@@ -106,11 +79,12 @@ def _named(summary: DataFrame) -> dict[str, list[Cell]]:
     return columns
 
 
-def _number(value: Any, scale: float | None) -> Cell:
-    """A number with three digits, a count where there is no scale; unknown ones are last."""
+def _number(value: Any, column: Column) -> Cell:
+    """A count, or a number with three digits in the column's unit; unknown ones are last."""
     if missing(value):
         return Cell(number(value), "Infinity")
-    return Cell(str(int(value)) if scale is None else number(scale * value), repr(float(value)))
+    words = str(int(value)) if column.kind == "count" else number(column.scale * value)
+    return Cell(words, repr(float(value)))
 
 
 def _numbers(values: Any) -> str:
