@@ -4,7 +4,8 @@ import shutil
 
 import numpy as np
 import pytest
-from golden import HERE, Comparison, Server, compare
+
+from .golden import HERE, Comparison, Server, compare
 
 NAME = "inputs"
 PLANTED = """

@@ -39,10 +39,10 @@ def write(
 
     The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
     factorisation (active sets where inequalities bind), the check by the true cost, and the
-    fallback, without allocation and with bounded loops. ``engine="compiled"`` compiles the same
-    text. Gain, options and present weights and sets of the estimator become
-    ``<name>_default_settings``; the top of the header says how to call it. Parameters are the last
-    inputs of each sample.
+    fallback, without allocation and with bounded loops. It is what ``engine="compiled"`` compiles,
+    without what this estimator does not use. Gain, options and present weights and sets of the
+    estimator become ``<name>_default_settings``; the top of the header says how to call it.
+    Parameters are the last inputs of each sample.
 
     Parameters
     ----------
@@ -81,6 +81,7 @@ def write(
     from ..estimation.estimator import MovingHorizonEstimator
     from .fmu import write_fmu
     from .library import generated
+    from .strip import stripped
 
     if not isinstance(estimator, MovingHorizonEstimator):
         raise InvalidInputError(
@@ -107,6 +108,7 @@ def write(
         estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real,
         estimator.usual,
     )
+    files = dict(zip(files, stripped(*files.values()), strict=True))
     try:
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)

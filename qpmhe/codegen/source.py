@@ -6,6 +6,7 @@ import re
 from functools import lru_cache
 from importlib.resources import files
 from string import Template
+from textwrap import indent
 from typing import Any
 
 import numpy as np
@@ -119,7 +120,7 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         # Its tables compute with indices, which are exact in double precision alone.
         + '#pragma GCC diagnostic ignored "-Wconversion"\n' * single + "#endif",
         "#define casadi_real mhe_real", code,
-        "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif",
+        "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif\n",
         *calls, template("model.c"),
     ))
 
@@ -203,7 +204,8 @@ def estimator_files(
         "optimizer.c", "step.c",
     )
     single = layout.real == "float"
-    body = prologue() + model_source(model, single) + "\n".join(template(part) for part in parts)
+    texts = model_source(model, single), *(template(part) for part in parts)
+    body = prologue() + "\n".join(texts)
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
         f"const mhe_settings mhe_default_settings = {_initializer(settings)};\n"
@@ -217,8 +219,8 @@ def estimator_files(
 def _initializer(record: NDArray[Any]) -> str:
     names = record.dtype.names
     if names:
-        inner = ",\n".join(f"    .{name} = {_initializer(record[name])}" for name in names)
-        return f"{{\n{inner}\n}}"
+        inner = ",\n".join(f".{name} = {_initializer(record[name])}" for name in names)
+        return f"{{\n{indent(inner, '    ')}\n}}"
     if record.shape:
         return "{" + ", ".join(_initializer(item) for item in record) + "}"
     value = record.item()

@@ -42,19 +42,18 @@ typedef $real mhe_real;
 #define MHE_X_SET $x_set
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
+#define MHE_X_ROWS $x_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
 #define MHE_WIDENED $widened   /* whether a loss is widened while the first window fills */
 #define MHE_OWN_LOSSES $own_losses /* users' functions: 1 of the prior, 2 of w, 4 of v */
 #define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
 #define MHE_CLOCK $clock /* whether time_budget is kept */
-#define MHE_X_ROWS $x_rows
-/* Whether outputs, states have angles (1), or a function for their differences (2). */
-#define MHE_OUTPUT_RESIDUAL $output_residual
-#define MHE_STATE_RESIDUAL $state_residual
-#define MHE_OBSERVER $observer   /* MHE_GAIN, MHE_EXTENDED, ... */
+#define MHE_OUTPUT_RESIDUAL $output_residual /* 1: outputs have angles; 2: a function for differences */
+#define MHE_STATE_RESIDUAL $state_residual /* the same of states */
+#define MHE_OBSERVER $observer /* 0: a gain; 1, 2: extended, unscented filter; 3: a function */
 #define MHE_COVARIANCE $covariance /* whether the observer's covariance is computed */
 #define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
-#define MHE_INNOVATION $innovation /* 0: all innovations count; MHE_GATED or MHE_WEIGHTED */
+#define MHE_INNOVATION $innovation /* 0: all innovations count; 1: a gate; 2: Huber's weights */
 #define MHE_SENSORS $sensors    /* sensors whose innovations are tested */
 #define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_QUIET $quiet /* directions of x(t+1) - f without a disturbance */
@@ -66,14 +65,11 @@ typedef $real mhe_real;
 /* Step lengths, tolerances and thresholds. */
 $limits
 
-/* What corrects the observer: a constant gain, an extended or an unscented Kalman filter, or a
- * function of its state and the fitting error. */
+/* Values of MHE_OBSERVER, and of MHE_INNOVATION. */
 #define MHE_GAIN 0
 #define MHE_EXTENDED 1
 #define MHE_UNSCENTED 2
-#define MHE_FUNCTION 3
-
-/* Rules for innovations: a gate, or Huber's weights. */
+#define MHE_FUNCTION 3 /* of its state and the fitting error */
 #define MHE_GATED 1
 #define MHE_WEIGHTED 2
 
@@ -148,6 +144,7 @@ typedef struct {
 } mhe_x_set;
 
 /* Matrices are stored by rows. Weights are inverse covariances. */
+
 #if MHE_COVARIANCE
 typedef struct {
     mhe_real initial[MHE_NX * MHE_NX]; /* of the initial error */

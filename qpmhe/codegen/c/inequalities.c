@@ -1,3 +1,6 @@
+/* What becomes of a QP. */
+enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
+
 /* The QP with inequalities: a primal-dual active-set method, and where that does not settle an
  * interior-point method of Mehrotra's kind. The matrices of both have the form of factor.c, or of
  * elimination.c where some directions have no disturbance.
@@ -7,8 +10,6 @@
  * The rows c of stage i are those of W (on d(i+1) - A d(i)), of V (on -C d(i)) and of X (on d(i)):
  * each set's components first, then its general inequalities. The last stage has rows of X only;
  * its places for others are without limits. */
-
-enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
 
 /* Iterations in which residuals must shrink to a share, and those that are left more time: near a
  * vertex, they may linger. */

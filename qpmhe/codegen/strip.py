@@ -1,0 +1,115 @@
+"""Written C without what the numbers in its header rule out."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+# Stands for lines that were left out.
+_GAP = "\x01\n"
+_DIRECTIVE = re.compile(r"#\s*(ifdef|ifndef|if|elif|else|endif)\b(.*)")
+_MACRO = re.compile(r"^#define (\w+)\b(\([^)]*\))?((?:[^\\\n]|\\[^\n]|\\\n)*)\n", re.M)
+_FUNCTION = re.compile(
+    r"^static [^;={]*?\b(\w+)\([^;{]*\)\s*\{(?:[^\n]*\}\n|.*?^\}\n)", re.M | re.S
+)
+_QUIET = re.compile(r'/\*.*?\*/|"(?:\\.|[^"\\\n])*"', re.S)
+# Warnings of functions without use are switched off around those that many estimators do not need.
+_UNUSED = re.compile(
+    r'(?:/\*[^\n]*\*/\n)?#if defined\(__GNUC__\)\n#pragma GCC diagnostic push\n'
+    r'#pragma GCC diagnostic ignored "-Wunused-function"\n#endif\n(.*?)'
+    r'#if defined\(__GNUC__\)\n#pragma GCC diagnostic pop\n#endif\n', re.S
+)
+_COMMENT = r"/\*(?:(?!\*/).)*\*/\n"
+# Of a comment, what it is about was left out: right behind it, or all up to the next headline.
+_STALE = re.compile(
+    rf"^{_COMMENT}(?:(?:{_GAP})+(?=\n|\Z)|\n(?:\n|{_GAP})*{_GAP}(?:\n|{_GAP})*(?={_COMMENT}\n|\Z))",
+    re.M | re.S,
+)
+
+
+def stripped(header: str, source: str) -> tuple[str, str]:
+    """Header and source without conditionals that are decided, and what is without use then.
+
+    Conditionals on the compiler stay. The object code is the same wherever the compiler leaves out
+    functions that nobody calls, as GCC does from -O1 on.
+    """
+    macros: dict[str, str] = {}
+    texts = [_resolved(header, macros, 1), _UNUSED.sub(r"\1", _resolved(source, macros, 0))]
+    before: list[str] = []
+    while texts != before:
+        before, texts = texts, _without_unused(texts)
+    return _tidy(texts[0]), _tidy(texts[1])
+
+
+def _without_unused(texts: list[str]) -> list[str]:
+    """The texts without static functions and macros that only their own definition names."""
+    uses = _names("".join(texts))
+
+    def kept(one: re.Match[str]) -> str:
+        return one[0] if uses[one[1]] > _names(one[0])[one[1]] else _GAP
+
+    return [_MACRO.sub(kept, _FUNCTION.sub(kept, text)) for text in texts]
+
+
+def _resolved(text: str, macros: dict[str, str], guards: int) -> str:
+    """The text without decided conditionals; ``macros`` gets what it defines in any case."""
+    kept: list[str] = []
+    # Of each conditional around a line: whether it is decided, was true so far, and is true here.
+    around: list[list[bool]] = []
+    for line in text.replace("\\\n", "\x02").splitlines(keepends=True):
+        found = _DIRECTIVE.match(line)
+        if found is None:
+            if all(level[2] for level in around):
+                kept.append(line)
+                macro = _MACRO.match(line)
+                if macro and not macro[2] and sum(not level[0] for level in around) <= guards:
+                    macros[macro[1]] = macro[3].replace("\x02", " ")
+            continue
+        kind, condition = found.groups()
+        holds = _value(condition, macros) if kind in ("if", "elif") else None
+        if kind in ("if", "ifdef", "ifndef"):
+            around.append([holds is not None, bool(holds), holds is not False])
+        elif not around[-1][0]:
+            pass
+        elif kind == "elif" and holds is None and not around[-1][1]:
+            around[-1], line = [False, True, True], line.replace("elif", "if", 1)
+        elif kind != "endif":
+            around[-1][2] = not around[-1][1] and holds is not False
+            around[-1][1] |= around[-1][2]
+        decided = around[-1][0]
+        if kind == "endif":
+            around.pop()
+        if all(level[2] for level in around):
+            kept.append(_GAP if decided else line)
+    return "".join(kept).replace("\x02", "\\\n")
+
+
+def _value(condition: str, macros: dict[str, str]) -> bool | None:
+    """Whether a condition holds; None where it depends on the compiler."""
+
+    def expanded(text: str) -> str:
+        text = _QUIET.sub("", text)
+        return re.sub(r"[A-Za-z_]\w*", lambda one: f"({expanded(macros[one[0]])})", text)
+
+    try:
+        text = expanded(condition)
+    except KeyError:
+        return None
+    if not re.fullmatch(r"[\d\s()!&|=<>+*-]+", text):
+        return None
+    for c, python in (("&&", " and "), ("||", " or "), (r"!(?!=)", " 0 == ")):
+        text = re.sub(c if c[0] == "!" else re.escape(c), python, text)
+    return bool(eval(text, {"__builtins__": {}}))
+
+
+def _names(text: str) -> Counter[str]:
+    """How often each name occurs in code."""
+    return Counter(re.findall(r"[A-Za-z_]\w*", _QUIET.sub(" ", text)))
+
+
+def _tidy(text: str) -> str:
+    """The text without gaps, and without comments on what is not there."""
+    before = ""
+    while text != before:
+        before, text = text, _STALE.sub(_GAP, text)
+    return re.sub(r"\n{3,}", "\n\n", text.replace(_GAP, "")).rstrip() + "\n"

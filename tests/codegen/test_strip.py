@@ -1,0 +1,182 @@
+"""Written C has what its estimator uses, and gives the object code of all of it."""
+
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from qpmhe.codegen import write
+from qpmhe.codegen.library import generated
+from qpmhe.codegen.strip import stripped
+
+from .cases import CASES, case
+
+CC = shutil.which("cc")
+HEADER = """#ifndef A_H
+#define A_H
+#define A_ONE 1 /* used */
+#define A_NONE 0
+#define A_KIND 2
+#define A_SIZE(n) ((n) + A_ONE)
+#ifdef __cplusplus
+extern "C" {
+#endif
+typedef struct {
+    double a[A_SIZE(2)];
+#if A_NONE
+    double b;
+#endif
+} a_type;
+#endif
+"""
+
+
+def source(text):
+    """What is left of a source, beside a header that stays as it is but for what is decided."""
+    header, left = stripped(HEADER, text)
+    assert "double b;" not in header
+    assert "#ifndef A_H\n" in header
+    assert '#ifdef __cplusplus\nextern "C" {\n#endif\n' in header
+    assert "A_ONE 1 /* used */" in header
+    return left
+
+
+@pytest.mark.parametrize(("condition", "holds"), [
+    ("A_ONE", True), ("A_NONE", False), ("!A_NONE", True), ("!A_ONE && B", False),
+    ("A_KIND == 2 /* two */", True), ("A_KIND != 2", False), ("BOTH", False), ("EITHER", True),
+    ("A_KIND & 1", False), ("A_KIND & 2", True), ("!(A_ONE || A_NONE)", False),
+    ("A_KIND > 1", True), ("A_NONE || A_KIND - 2 || A_ONE * A_KIND == 2", True), ("0", False),
+])
+def test_conditions_are_decided_as_the_preprocessor_decides_them(condition, holds):
+    text = (
+        "#define B 3\n#define BOTH (A_ONE && A_NONE)\n#define EITHER (BOTH || A_KIND)\n"
+        f"#if {condition}\nint yes;\n#else\nint no;\n#endif\n"
+    )
+    assert source(text) == f"int {'yes' if holds else 'no'};\n"
+    if CC:
+        done = subprocess.run(
+            [CC, "-E", "-P", "-"], input=HEADER + text, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.endswith(source(text))
+
+
+@pytest.mark.parametrize(("text", "left"), [
+    ("#if A_NONE\nx\n#elif A_ONE\ny\n#elif A_KIND\nz\n#else\nw\n#endif\n", "y\n"),
+    ("#if A_ONE\nx\n#elif defined(C)\ny\n#endif\n", "x\n"),
+    ("#if A_NONE\nx\n#elif defined(C)\ny\n#elif A_ONE\nz\n#endif\n",
+     "#if defined(C)\ny\n#elif A_ONE\nz\n#endif\n"),
+    ("#if defined(C) && A_NONE\nx\n#endif\n", "#if defined(C) && A_NONE\nx\n#endif\n"),
+    ("#ifdef C\n#if A_NONE\nx\n#else\ny\n#endif\n#else\nz\n#endif\n",
+     "#ifdef C\ny\n#else\nz\n#endif\n"),
+    ("#if A_NONE\n#ifdef C\nx\n#else\ny\n#endif\n#endif\nz\n", "z\n"),
+    # What is defined where the compiler decides is not known.
+    ("#ifndef C\n#define C 1\n#endif\n#if C\nx\n#endif\n",
+     "#ifndef C\n#define C 1\n#endif\n#if C\nx\n#endif\n"),
+])
+def test_conditionals_on_the_compiler_stay(text, left):
+    assert source(text) == left
+
+
+def test_what_is_not_used_goes_with_its_comment():
+    assert source("""/* A headline. */
+
+/* Of nothing. */
+#if A_NONE
+int gone;
+#endif
+
+/* Of the first. */
+static int first(void)
+{
+    return 1;
+}
+
+/* Uses the first, but nobody uses it; see "second". */
+static int second(int (*f)(void)) { return first() + f(); }
+
+#define LONG(a) \\
+    (a + \\
+     SHORT)
+#define SHORT 1
+
+/* Another headline. */
+
+/* Of what stays. */
+static int third(void)
+{
+#if A_NONE
+    int a = 1;
+#endif
+    return 3;
+}
+
+int fourth(void) { return third(); }
+
+/* A headline of nothing. */
+
+#if A_NONE
+static int fifth(void) { return 5; }
+#endif
+""") == """/* Another headline. */
+
+/* Of what stays. */
+static int third(void)
+{
+    return 3;
+}
+
+int fourth(void) { return third(); }
+"""
+
+
+COMPILERS = "_H$|__cplusplus|__GNUC__|__FAST_MATH__|__STDC_VERSION__|_WIN32|CASADI|casadi|LINKED"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_written_code_reads_well(name, tmp_path):
+    files = write(case(name).estimator("python"), tmp_path)
+    header, written = (path.read_text() for path in files)
+    conditions = re.findall(r"#\s*(?:el)?if.*", header + written)
+    assert [one for one in conditions if not re.search(COMPILERS, one)] == []
+    for text in (header, written):
+        for pattern in (
+            r"\n\n\n", r"\{\n\n", r"\n\n\s*\}", r"\{\s*\}", r"\*/\n*\Z", r"\*/\n\n/\*.*\*/\n\n",
+            r"#(if|else|elif).*\n#(else|elif|endif)", "\x01", "\x02",
+        ):
+            assert re.search(pattern, text) is None, pattern
+    macros = re.findall(r"^#define (\w+)", header + written, re.M)
+    for macro in macros:
+        assert len(re.findall(rf"\b{macro}\b", header + written)) > 1, macro
+
+
+@pytest.mark.skipif(CC is None, reason="there is no C compiler")
+@pytest.mark.parametrize(("name", "real", "level"), [
+    ("inputs", "double", "-O2"), ("gated in states", "double", "-O1"),
+    ("fewer disturbances in sets", "float", "-O1"), ("held in sets", "double", "-O2"),
+    ("graduated reinitialized", "double", "-O3"), ("unscented prior", "float", "-O2"),
+    ("tank in time", "double", "-O1"), ("matrix expressions", "double", "-O1"),
+    ("angles across the seam", "double", "-O3"),
+])
+def test_the_object_code_is_the_same(name, real, level, tmp_path):
+    mhe = case(name).estimator("python")
+    whole = generated(
+        mhe.system, mhe.observer, mhe.cost, mhe.settings, "mhe", real, mhe.usual
+    )
+    codes = []
+    for folder in (tmp_path / "whole", tmp_path / "stripped"):
+        folder.mkdir()
+        if folder.name == "stripped":
+            write(mhe, folder, real=real)
+        else:
+            for file, text in whole.items():
+                (folder / file).write_text(text)
+        command = [CC, "-std=c99", level, "-shared", "-fPIC", "-s", "-o", "mhe.so", "mhe.c", "-lm"]
+        subprocess.run(command, cwd=folder, check=True)
+        codes.append((folder / "mhe.so").read_bytes())
+    lines = [
+        sum(len(path.read_text().splitlines()) for path in tmp_path.glob(f"{folder}/mhe.[ch]"))
+        for folder in ("whole", "stripped")
+    ]
+    assert codes[0] == codes[1]
+    assert lines[1] < 0.8 * lines[0]
