@@ -142,7 +142,7 @@ def attempt(solve: Callable[[], Any]) -> tuple[Any, list[str], str]:
 
 
 class Raw:
-    """One solver through qpsolvers, with its defaults; bounds are rows where it wants finite ones."""
+    """One solver through qpsolvers, with its defaults; bounds are rows if it wants finite ones."""
 
     def __init__(self, name: str) -> None:
         self.name, self.translation = name, TRANSLATIONS.get(name)
