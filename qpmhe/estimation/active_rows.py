@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidInputError
 from ..model.constraints import ConstraintFunctions
-from .constraints import Rows
+from ..terms.rows import Rows
+from ..terms.soft import Penalties
 from .optimality import OptimalityMatrix
 from .problem import Formulation, Problem, Trial
-from .softened import Penalties
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

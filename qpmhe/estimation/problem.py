@@ -18,13 +18,13 @@ from ..model.functions import contained, raised_along
 from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
+from ..terms.hold import Hold, WindowHold
+from ..terms.prior import PriorWeights
+from ..terms.soft import Penalties, WindowPenalties
 from .conditions import Conditions
 from .constraints import Constraints
 from .estimate import DroppedRow
-from .hold import Hold, WindowHold
 from .limits import FEASIBLE
-from .prior import PriorWeights
-from .softened import Penalties, WindowPenalties
 from .stages import read_only
 from .window import Window
 

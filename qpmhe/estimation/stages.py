@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from .._checks import positive_definite
 from ..observers.projection import ErrorMetric
+from ..terms.linearization import Span, Stage, StageTerms
 from .conditions import Conditions
-from .linearization import Span, Stage, StageTerms
 from .snapshot import check_size, checked_array, mismatch
 
 Array = NDArray[np.float64]

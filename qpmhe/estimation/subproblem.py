@@ -14,11 +14,11 @@ from ..costs import Cost
 from ..model.functions import raised_along
 from ..model.residuals import difference
 from ..model.system import System
-from .constraints import Constraints, Rows
-from .limits import BEYOND
-from .linearization import Span, StageTerms
+from ..terms.linearization import Span, StageTerms
+from ..terms.rows import Rows
+from ..terms.soft import BEYOND, Penalties, Softened
+from .constraints import Constraints
 from .problem import Problem, Trial
-from .softened import Penalties, Softened
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._linalg import cholesky, inverse, solve
-from .observability import prior_units, window_information
+from .information import prior_units, window_information
 
 Array = NDArray[np.float64]
 

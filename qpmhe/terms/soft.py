@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,15 @@ from qpmhe_solvers import QP, Solution, SolveStatus
 
 from .._linalg import inverse, solve, unit_diagonal
 from ..costs import Cost
+from ..model.sets import ConvexSet
 from ..model.system import System
-from .conditions import Conditions
-from .constraints import Rows, function_rows
-from .limits import BEYOND
+from .rows import Rows, function_rows
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+#: A second-order correction is lengthened by this share of itself, to end inside the set.
+BEYOND = 0.1
 
 # As in the banded solver: a root is exact for powers of four alone.
 _COST_UNITS = 0.5, 1.0
@@ -33,6 +35,22 @@ _NEWTON_STEPS = 10
 # Curvature that a slack has at least, as a share of its linear penalty per scale of its row. It
 # holds the slack near its present value, so that it vanishes where the sequence converges.
 _CURVATURE = 1e-2
+
+
+class OwnSets(Protocol):
+    """The sets with other sides of a stage; None where it has the usual ones."""
+
+    @property
+    def states(self) -> ConvexSet | None:
+        """X."""
+
+    @property
+    def disturbances(self) -> ConvexSet | None:
+        """W."""
+
+    @property
+    def noises(self) -> ConvexSet | None:
+        """V."""
 
 
 class _Part(NamedTuple):
@@ -85,22 +103,22 @@ class Penalties:
 
     def of_window(
         self, count: int, observed: Mask | None, discounts: Array | None,
-        conditions: Sequence[Conditions] | None = None,
+        own: Sequence[OwnSets] | None = None,
     ) -> WindowPenalties:
         """The penalties of a window of ``count`` stages; rows on missing outputs do not count.
 
-        ``conditions`` are those of the stages where some have sets with other sides; the newest
-        state has those of the last stage.
+        ``own`` are the stages' own sets, where some have sets with other sides; the newest state
+        has those of the last stage.
         """
-        usual = observed is None and conditions is None
+        usual = observed is None and own is None
         if usual and count in self._windows:
             return self._windows[count]
         lower, upper = np.full((2, count + 1, self.size), np.inf)
         np.negative(lower, out=lower)
         linear, quadratic = np.zeros((2, count + 1, self.size))
         for rows, place, penalties in self.parts:
-            if conditions is not None and rows.name != "constraints":
-                sets = [getattr(own, rows.name) for own in conditions]
+            if own is not None and rows.name != "constraints":
+                sets = [getattr(one, rows.name) for one in own]
                 rows = rows.with_sides([*sets, sets[-1]])
             counts = np.ones((count + 1, len(rows.matrix)), np.bool_)
             if rows.name == "constraints" and self.functions is not None:

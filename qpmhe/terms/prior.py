@@ -2,41 +2,18 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..errors import InvalidInputError, PriorWarning
 from ..model.system import System
 from ..observers import Observer
-from .limits import KNOWN, NO_VARIANCE
 
 Array = NDArray[np.float64]
 
-
-def check_prior(observer: Observer, cost: Cost, *, warns: bool) -> None:
-    """Check that an observer can weigh the prior; warn of a constant weight where it could.
-
-    Without QPs there is nothing to warn of: the estimates do not depend on the weight.
-    """
-    name, has = type(observer).__name__, observer.initial_covariance() is not None
-    if cost.observer_prior is not None and not has:
-        raise InvalidInputError(
-            f"the prior's weight comes from the observer's covariance, but {name} has none; give "
-            "the cost prior=, the covariance (n, n) of this observer's error for from_covariances "
-            "and else its inverse, or take a Kalman-type observer, such as qpmhe.ExtendedKalman."
-        )
-    if cost.observer_prior is None and has and warns:
-        warnings.warn(
-            f"the cost's prior is a constant weight beside {name}, which has a covariance: every "
-            "window counts the data before it only as much as that weight says. Leave prior out, "
-            "and the weight follows the covariance. If the constant weight is meant, ignore "
-            "qpmhe.PriorWarning.",
-            PriorWarning,
-            stacklevel=4,
-        )
+#: A variance of the observer's below the first share of the typical one is none; in the prior's
+#: weight it counts as the second share.
+NO_VARIANCE, KNOWN = 1e-30, 1e-16
 
 
 class PriorWeights:

@@ -1,0 +1,1 @@
+"""The cost J of a window as a sum of terms."""
