@@ -420,7 +420,7 @@ def _filled(
             _fill(record, name, matrix)
     if layout.held:
         basis = directions.constraints_of(system, cost).basis
-        hold = Hold(system.held, inverse(regular), basis, cost.disturbance)
+        hold = Hold(system.held, inverse(regular), basis, cost.disturbance, cost.discount)
         for name in record["hold"].dtype.names or ():
             _fill(record["hold"], name, getattr(hold, name))
     record["inner_lower"], record["inner_upper"] = system.f_jacobian.inner
