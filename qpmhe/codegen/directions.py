@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from .._linalg import inverse
 from ..costs import Cost, lifted
-from ..estimation.constraints import Constraints, Rows
-from ..estimation.prior import PriorWeights
+from ..estimation.constraints import Constraints
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
+from ..terms.prior import PriorWeights
+from ..terms.rows import Rows
 
 Array = NDArray[np.float64]
 

@@ -14,16 +14,17 @@ from .._linalg import inverse
 from ..costs import Cost, LossForm, Subspace
 from ..errors import OptionError
 from ..estimation.conditions import USUAL, Conditions
-from ..estimation.constraints import Constraints, Rows
+from ..estimation.constraints import Constraints
 from ..estimation.estimate import DroppedRow, Status
-from ..estimation.hold import Hold
 from ..estimation.limits import c_definitions
-from ..estimation.prior import PriorWeights
 from ..estimation.settings import Infeasible, Settings
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers.base import covariance_of
+from ..terms.hold import Hold
+from ..terms.prior import PriorWeights
+from ..terms.rows import Rows
 from .directions import Directions
 
 SET_NAMES = ("disturbances", "noises", "states")
@@ -419,7 +420,7 @@ def _filled(
             _fill(record, name, matrix)
     if layout.held:
         basis = directions.constraints_of(system, cost).basis
-        hold = Hold(system.held, inverse(regular), basis, cost.disturbance)
+        hold = Hold(system.held, inverse(regular), basis, cost.disturbance, cost.discount)
         for name in record["hold"].dtype.names or ():
             _fill(record["hold"], name, getattr(hold, name))
     record["inner_lower"], record["inner_upper"] = system.f_jacobian.inner

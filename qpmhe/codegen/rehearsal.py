@@ -27,12 +27,13 @@ from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import check_start
 from ..estimation.limits import FEASIBLE, LARGEST
 from ..estimation.optimizer import Optimizer, Outcome
-from ..estimation.problem import Problem, Trial
+from ..estimation.problem import Problem
 from ..estimation.settings import Settings
 from ..model.evaluation import NAMES, RESIDUALS, Buffers, Evaluator, results_of
 from ..model.functions import Trusted
 from ..model.system import System
 from ..observers import Observer
+from ..terms.base import Trial
 from .comparison import ROUNDING, Interpreter, points
 from .engine import CompiledEngine
 from .library import EstimatorLibrary
@@ -189,7 +190,8 @@ class _Guide:
     ) -> Outcome:
         """C's trajectory, evaluated by the problem."""
         found, outcome = self.found, Outcome(problem.candidate)
-        self.violation, usual, known = 0.0, problem, _magnitude(problem, problem.candidate)
+        self.violation, usual = 0.0, problem
+        known = _magnitude(problem, problem.candidate)
         if Status.IMPROVED in found.status:
             self.improved += 1
             if Status.ROWS_DROPPED in found.status:
@@ -209,11 +211,7 @@ class _Guide:
 
 
 def _magnitude(problem: Problem, trial: Trial) -> float:
-    residuals, offset = abs(trial.residuals), abs(problem.offset(trial.trajectory))
-    weights = abs(problem.stage_weights)
-    weights = np.broadcast_to(weights, (len(residuals), *weights.shape[-2:]))
-    stages = np.einsum("ki,kij,kj->", residuals, weights, residuals)
-    return float(np.nan_to_num(stages + offset @ abs(problem.prior_weight) @ offset))
+    return float(np.nan_to_num(sum(term.magnitude(trial) for term in problem.terms)))
 
 
 class _Follower(PythonEngine):

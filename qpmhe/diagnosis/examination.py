@@ -11,9 +11,10 @@ from scipy.stats import chi2
 from .._linalg import inverse
 from ..costs import RobustCost
 from ..estimation.estimate import Status
-from ..estimation.observability import observability, prior_shares, prior_units
+from ..estimation.observability import observability, prior_shares
 from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
+from ..terms.information import prior_units
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
 from .faults import LEAST_GAIN, SCALED, Fault, search
 from .findings import Finding, Names, listed, number, percent

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidInputError
 from ..model.constraints import ConstraintFunctions
-from .constraints import Rows
+from ..terms.base import Trial
+from ..terms.rows import Rows
 from .optimality import OptimalityMatrix
-from .problem import Formulation, Problem, Trial
-from .softened import Penalties
+from .problem import Formulation, Problem
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -86,7 +86,7 @@ class HeldRows:
         slopes = None
         if functions is not None:
             slopes = np.where(functions.on_state[:, None], functions.linearised(*self._along)[0], 0)
-        sides = _sides(problem, formulation.penalties, trial)
+        sides = _sides(problem, trial)
         parts = [_candidates(one, n, q, functions, slopes) for one in sides]
         found = [one for one in parts if len(one["stage"])]
         none = _nothing(n, q)
@@ -223,7 +223,7 @@ class HeldRows:
         )  # type: ignore[return-value]
 
 
-def _sides(problem: Problem, penalties: Penalties | None, trial: Trial) -> Iterator[_Side]:
+def _sides(problem: Problem, trial: Trial) -> Iterator[_Side]:
     """Both sides of all rows of a problem along a trial, hard and soft."""
     constraints, n = problem.constraints, trial.trajectory.shape[1]
     points = {
@@ -240,19 +240,11 @@ def _sides(problem: Problem, penalties: Penalties | None, trial: Trial) -> Itera
         none = np.zeros(values.shape)
         yield _Side(rows, 1.0, values - rows.upper, none + np.inf, none)
         yield _Side(rows, -1.0, rows.lower - values, none + np.inf, none)
-    if penalties is None or problem.penalties is None:
-        return
-    window = problem.penalties
-    values = penalties.values(trial.trajectory, trial.residuals, trial.values)
-    for rows, place, _ in penalties.parts:
-        count = len(values) - (rows.name in ("disturbances", "noises"))
-        linear, quadratic, above, below = (
-            one[:count, place] for one in (
-                window.linear, window.quadratic, values - window.upper, window.lower - values
-            )
-        )
-        yield _Side(rows, 1.0, above, linear, quadratic)
-        yield _Side(rows, -1.0, below, linear, quadratic)
+    for term in problem.terms:
+        for soft in term.soft_rows(trial):
+            prices = soft.linear, soft.quadratic
+            yield _Side(soft.rows, 1.0, soft.values - soft.upper, *prices)
+            yield _Side(soft.rows, -1.0, soft.lower - soft.values, *prices)
 
 
 def _candidates(

@@ -1,6 +1,8 @@
-"""What users' own observers have to return, checked once at a few points."""
+"""What observers have to return and to weigh, checked once at a few points."""
 
 from __future__ import annotations
+
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +11,7 @@ from .._checks import positive_definite
 from .._linalg import inverse
 from ..costs import Cost, QuadraticCost, RobustCost
 from ..costs.contracts import check_own_cost, numbers_of, spare
-from ..errors import ModelError, QpmheError
+from ..errors import InvalidInputError, ModelError, PriorWarning, QpmheError
 from ..model.functions import EvaluationError
 from ..model.system import System
 from ..observers import Observer, Sample
@@ -130,3 +132,26 @@ def _checked_pair(observer: Observer, answer: object, filtered: object, n: int) 
         numbers_of(f"{name}.filter, as its estimate,", filtered[0], (n,))
         numbers_of(f"{name}.filter, as its covariance,", filtered[1], (n, n))
     return correction
+
+
+def check_prior(observer: Observer, cost: Cost, *, warns: bool) -> None:
+    """Check that an observer can weigh the prior; warn of a constant weight where it could.
+
+    Without QPs there is nothing to warn of: the estimates do not depend on the weight.
+    """
+    name, has = type(observer).__name__, observer.initial_covariance() is not None
+    if cost.observer_prior is not None and not has:
+        raise InvalidInputError(
+            f"the prior's weight comes from the observer's covariance, but {name} has none; give "
+            "the cost prior=, the covariance (n, n) of this observer's error for from_covariances "
+            "and else its inverse, or take a Kalman-type observer, such as qpmhe.ExtendedKalman."
+        )
+    if cost.observer_prior is None and has and warns:
+        warnings.warn(
+            f"the cost's prior is a constant weight beside {name}, which has a covariance: every "
+            "window counts the data before it only as much as that weight says. Leave prior out, "
+            "and the weight follows the covariance. If the constant weight is meant, ignore "
+            "qpmhe.PriorWarning.",
+            PriorWarning,
+            stacklevel=4,
+        )

@@ -23,6 +23,7 @@ from ..model.residuals import difference
 from ..model.system import System
 from ..model.traces import next_check, warn_of
 from ..observers import Observer
+from ..terms.sum import weight_of_first
 from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .estimate import Estimate, Status
@@ -112,7 +113,7 @@ class PythonEngine:
             self._scale_constraints(initial_state)
         self._reader = ConditionReader(system, self._given_cost)
         self._tools = self._tools_for(usual_conditions(settings))
-        penalties = self._tools.formulation.penalties
+        penalties = self._tools.formulation.sum.penalties
         if settings.qp_limit and penalties is not None:
             solver.prepare((settings.horizon + 1) * (system.n + penalties.size))
         self._with_terms = settings.qp_limit > 0
@@ -149,7 +150,7 @@ class PythonEngine:
         system, cost = usual.applied(self._system, self._cost)
         formulation = Formulation(system, self._observer, cost)
         subproblem = Subproblem(
-            system, cost, formulation.constraints, settings.horizon, formulation.penalties
+            system, formulation.constraints, settings.horizon, formulation.sum.penalties
         )
         return Tools(
             usual, system, cost, formulation, subproblem,
@@ -273,7 +274,7 @@ class PythonEngine:
                 offset = difference(
                     self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
                 )
-            if self._watch.note(offset, problem.distance_weight, bool(outcome.dropped)):
+            if self._watch.note(offset, problem.prior.distance_weight, bool(outcome.dropped)):
                 status |= Status.OBSERVER_FAR
         else:
             self._watch.counts = 0, 0
@@ -453,7 +454,7 @@ class PythonEngine:
                 raise InvalidInputError("the model has no finite values along the estimate.")
             return window_covariances(
                 problem.model, trial.trajectory, problem.inputs, trial.weights,
-                problem.first_weight_at(problem.offset(trial.trajectory)),
+                weight_of_first(problem.terms, trial),
                 problem.constraints.basis,
             )
 

@@ -28,12 +28,11 @@ from ..model.system import System
 from ..model.traces import warn_of
 from ..observers import Observer
 from ..observers.projection import NearestPoint
+from ..terms.hold import WindowHold
 from .conditions import ConditionReader, Conditions
-from .contracts import check_correction, check_observer
+from .contracts import check_correction, check_observer, check_prior
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
-from .hold import WindowHold
-from .prior import check_prior
 from .problem import Solved
 from .run import Run, RunSource
 from .sensitivity import Sensitivity

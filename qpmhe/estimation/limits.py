@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from ..observers.base import SAME_COVARIANCE
 from ..observers.innovation import GROWTH, LONGEST, MOST_GROWTH
+from ..terms.prior import KNOWN, NO_VARIANCE
+from ..terms.soft import BEYOND
 
 #: Step lengths, tried in turn after the full step: the first for a step that leaves a set by
 #: the solver's tolerance, the last short enough for any useful direction of descent.
@@ -25,9 +27,6 @@ STALLED = 1e3
 
 #: Largest number of second-order corrections of a step that leaves a curved set.
 CORRECTIONS = 2
-
-#: A second-order correction is lengthened by this share of itself, to end inside the set.
-BEYOND = 0.1
 
 #: A sequence without a cap ends at this many QPs in a row that the solver, at its own cap, has not
 #: solved to its tolerance: further ones cost as much, and approach no minimum.
@@ -53,10 +52,6 @@ IN_RANGE = 1e-12
 
 #: A larger measurement counts as missing: its square would not be finite.
 LARGEST = 1e150
-
-#: A variance of the observer's below the first share of the typical one is none; in the prior's
-#: weight it counts as the second share.
-NO_VARIANCE, KNOWN = 1e-30, 1e-16
 
 _SINGLE = {
     "ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15, "SAME_COVARIANCE": 1e-4,

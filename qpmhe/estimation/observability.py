@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..terms.information import prior_units, window_information
 
 Array = NDArray[np.float64]
 
@@ -64,22 +65,6 @@ def observability(
     return Observability(matrices, np.maximum(values, 0.0), directions)
 
 
-def window_information(
-    transitions: Sequence[Array] | Array, information: Sequence[Array] | Array, disturbance: Array
-) -> Array:
-    """Information of the windows' data on their first states, (..., n, n).
-
-    ``transitions`` and ``information`` are, stage by stage, those of `observability`, (..., n, n).
-    """
-    eye = np.eye(len(disturbance))
-    found = np.zeros_like(information[0])
-    for k in range(len(transitions) - 1, -1, -1):
-        later = np.linalg.solve(eye + found @ disturbance, found)
-        found = information[k] + transitions[k].swapaxes(-1, -2) @ later @ transitions[k]
-        found = 0.5 * (found + found.swapaxes(-1, -2))
-    return found
-
-
 def prior_shares(
     transitions: Array, information: Array, disturbance: Array, prior: Array, longest: int,
     most: int = 100,
@@ -120,14 +105,3 @@ def prior_shares(
         with np.errstate(divide="ignore", invalid="ignore"):
             shares[k + 1] = np.median(np.where(whole > 0.0, from_prior / whole, 0.0), axis=0)
     return shares
-
-
-def prior_units(covariance: Array) -> tuple[Array, Array]:
-    """L with L L^T the covariance, and its inverse, regularised if singular."""
-    units = np.sqrt(covariance.diagonal())
-    units = np.where(units > 0.0, units, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.multiply.outer(units, units))
-    roots = np.sqrt(np.maximum(values, np.finfo(float).eps))
-    root: Array = units[:, None] * ((vectors * roots) @ vectors.T)
-    inverse: Array = ((vectors / roots) @ vectors.T) / units
-    return root, inverse

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from time import perf_counter
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.solver import ContainedSolver
 
+from ..terms.base import Trial
 from .estimate import DroppedRow, Status
 from .limits import (
     ALONG,
@@ -25,7 +26,7 @@ from .limits import (
     ROUNDING,
     STALLED,
 )
-from .problem import Problem, Trial
+from .problem import Problem
 from .settings import Settings
 from .subproblem import Subproblem
 
@@ -239,23 +240,70 @@ class Optimizer:
         outcome.events |= Status.GRADUATED
 
     def _descend(self, problem: Problem, outcome: Outcome, start: Array | None, limit: int) -> None:
-        """Solve at most ``limit`` QPs, each around the best trajectory so far."""
+        """The suboptimal estimator of Definition def:estimator, by at most ``limit`` QPs.
+
+        Any trajectory is an estimate that (i) satisfies the constraints, and (ii) has a cost J no
+        greater than the candidate's (eq:estimator). The candidate itself is the first one. Each QP,
+        built around the best trajectory so far, leads to trials; the true problem gives those that
+        violate (i) an infinite J, and the first trial whose J is lower is the next best.
+        """
+        best = outcome.trial
         if start is not None:
             trial = problem.evaluate(problem.clipped(start.copy()))
-            if trial.cost < _target(outcome.trial):
-                outcome.trial = trial
+            if trial.cost < _target(best):
+                outcome.trial = best = trial
         outcome.unsolved = 0
-        outcome.events &= ~Status.UNCONVERGED
+        if outcome.events:
+            outcome.events &= ~Status.UNCONVERGED
         for _ in range(limit):
             if outcome.time_is_up():
-                break
-            qp = self._subproblem.at(problem, outcome.trial)
+                return
+            qp = self._subproblem.at(problem, best)
             if qp is None:
                 outcome.events |= Status.MODEL_FAILED
                 outcome.message = self._subproblem.failure
-                break
-            if not self._step(problem, qp, outcome):
-                break
+                return
+            solution = self._solution(qp, outcome)
+            if solution is None:
+                return
+            outcome.qps += 1
+            step, solved = solution.d, solution.status is SolveStatus.SOLVED
+            if step is None:
+                outcome.events |= Status.SOLVER_FAILED
+                outcome.message = solution.message
+                return
+            outcome.unsolved = 0 if solved else outcome.unsolved + 1
+            if not solved:
+                outcome.events |= Status.SOLVER_STOPPED
+            # Where J is infinite, no decrease is negligible.
+            negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
+            # The decrease of J that the QP predicts: its objective is J/2.
+            if self._extended:
+                predicted = self._subproblem.predicted(qp, best, step)
+            else:
+                predicted = abs(float(np.vdot(qp.gradient, step)))
+            # At a minimum no step lowers J by more than rounding: it is not shortened.
+            useless, target = solved and predicted <= negligible, _target(best)
+            for trial in self._trials(problem, qp, outcome, step, useless):
+                if trial.cost < target:
+                    break
+            if not trial.cost < target:
+                little = problem.rounding_cost(best) if best.cost < math.inf else -1.0
+                at_minimum = solved and predicted <= max(STALLED * negligible, little)
+                outcome.events |= Status.CONVERGED if at_minimum else Status.NO_DECREASE
+                outcome.message = problem.failure(trial)
+                return
+            outcome.trial, before, best = trial, best, trial
+            if solved and before.cost - best.cost <= negligible:
+                outcome.events |= Status.CONVERGED
+                return
+            if self._patience and outcome.unsolved >= self._patience:
+                outcome.events |= Status.UNCONVERGED
+                outcome.message = (
+                    f"Backend {self._backend!r} did not solve the last {self._patience} QPs to "
+                    f"its tolerance{f': {solution.message}' if solution.message else ''}."
+                )
+                return
 
     def _feasible_near(self, problem: Problem, outcome: Outcome, trial: Trial) -> Trial:
         """A feasible trajectory near an infeasible one, by QPs in the metric of the Hessian.
@@ -280,111 +328,46 @@ class Optimizer:
                 break
         return nearest if nearest.cost < math.inf else trial
 
-    def _step(self, problem: Problem, qp: QP, outcome: Outcome) -> bool:
-        """Solve one QP and take its step; whether another QP is worth solving."""
-        solution = self._solution(qp, outcome)
-        if solution is None:
-            return False
-        outcome.qps += 1
-        if solution.d is None:
-            outcome.events |= Status.SOLVER_FAILED
-            outcome.message = solution.message
-            return False
-        solved = solution.status is SolveStatus.SOLVED
-        outcome.unsolved = 0 if solved else outcome.unsolved + 1
-        if not solved:
-            outcome.events |= Status.SOLVER_STOPPED
-        best = outcome.trial
-        # Where J is infinite, no decrease is negligible.
-        negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
-        # The decrease of J that the QP predicts: its objective is J/2.
-        if self._extended:
-            predicted = self._subproblem.predicted(qp, best, solution.d)
-        else:
-            predicted = abs(float(np.vdot(qp.gradient, solution.d)))
-        useless = solved and predicted <= negligible
-        trial = self._line_search(problem, qp, outcome, solution.d, useless)
-        if trial.cost < _target(best):
-            outcome.trial = trial
-            if solved and best.cost - trial.cost <= negligible:
-                outcome.events |= Status.CONVERGED
-                return False
-            if self._patience and outcome.unsolved >= self._patience:
-                outcome.events |= Status.UNCONVERGED
-                outcome.message = (
-                    f"Backend {self._backend!r} did not solve the last {self._patience} QPs to "
-                    f"its tolerance{f': {solution.message}' if solution.message else ''}."
-                )
-                return False
-            return True
-        at_minimum = solved and predicted <= max(
-            STALLED * negligible, problem.rounding_cost(best) if best.cost < math.inf else -1.0
-        )
-        outcome.events |= Status.CONVERGED if at_minimum else Status.NO_DECREASE
-        outcome.message = problem.failure(trial)
-        return False
-
-    def _line_search(
+    def _trials(
         self, problem: Problem, qp: QP, outcome: Outcome, step: Array, useless: bool
-    ) -> Trial:
-        """The first trial along a step with J below the best so far; the last one if none is.
+    ) -> Iterator[Trial]:
+        """The trials that a step leads to, one after the other until one is accepted.
 
-        A step whose predicted decrease is negligible is ``useless`` and not shortened: at a
-        minimum no step lowers J by more than rounding.
+        First the full step; then, unless it is ``useless``, corrected ones and shorter ones.
         """
-        best, target = outcome.trial, _target(outcome.trial)
-        trial = self._trial(problem, best, step)
-        if trial.cost < target:
-            return trial
-        curved = 0.0 < trial.violation < math.inf and bool(qp.rows)
+        best = outcome.trial
+        full = self._trial(problem, best, step)
+        yield full
+        step = step.copy()  # a correction's solve overwrites it
+        curved = 0.0 < full.violation < math.inf and bool(qp.rows)
+        # A full step along a soft row that is curved: the penalty grows where J would not.
+        bent = not curved and best.penalty < full.penalty < math.inf
         if curved:
-            missed = trial
-            if trial.violation <= NEARLY:
-                trial = self._trial(problem, best, LENGTHS[0] * step)
+            if full.violation <= NEARLY:
+                yield self._trial(problem, best, LENGTHS[0] * step)
             # If the shortened step leaves the set, too, curvature is the reason.
-            if not trial.cost < target and not useless:
-                step = step.copy()  # the correction's solve overwrites it
-                trial = self._correct(problem, qp, outcome, missed)
-                trial = self._feasible_near(problem, outcome, trial)
-            if trial.cost < target:
-                return trial
-        elif best.penalty < trial.penalty < math.inf and not useless:
-            # A full step along a soft row that is curved: the penalty grows where J would not.
-            corrected = self._correct(problem, qp, outcome, trial)
-            if corrected.cost < target:
-                return corrected
+            if not useless:
+                trial = self._correct(problem, qp, outcome, full)
+                yield self._feasible_near(problem, outcome, trial)
+        elif bent and not useless:
+            yield self._correct(problem, qp, outcome, full)
         # From outside, a full step ends as a rule on the boundary of the linearised sets: shorter
         # ones stay outside.
         if useless or best.violation > FEASIBLE:
-            return trial
+            return
         for length in LENGTHS:
-            trial = self._trial(problem, best, length * step)
-            if trial.cost < target:
-                return trial
-        if curved or best.penalty < trial.penalty < math.inf:
-            return self._boundary_search(problem, qp, outcome, step, curved)
-        return trial
-
-    def _boundary_search(
-        self, problem: Problem, qp: QP, outcome: Outcome, step: Array, curved: bool
-    ) -> Trial:
-        """A trial along the boundary of a curved set: back into the set from a shortened step.
-
-        The decrease of J is proportional to the length of a short step, the distance from the set
-        to its square. So the way back costs less than a step gains, if the step is short enough.
-        Where it is no hard set that is ``curved``, a correction leads back to the soft rows.
-        """
-        best, target = outcome.trial, _target(outcome.trial)
-        trial = best
+            yield (trial := self._trial(problem, best, length * step))
+        if not (curved or best.penalty < trial.penalty < math.inf):
+            return
+        # Along the boundary of the curved set: the decrease of J is proportional to the length of a
+        # short step, the distance from the set to its square. So the way back costs less than a
+        # step gains, if the step is short enough.
         for length in ALONG:
             trial = self._trial(problem, best, length * step)
             if curved:
-                trial = self._feasible_near(problem, outcome, trial)
-            else:
-                trial = self._correct(problem, qp, outcome, trial)
-            if trial.cost < target:
-                break
-        return trial
+                yield self._feasible_near(problem, outcome, trial)
+            else:  # no hard set: back to the soft rows
+                yield self._correct(problem, qp, outcome, trial)
 
     def _correct(self, problem: Problem, qp: QP, outcome: Outcome, trial: Trial) -> Trial:
         """Second-order corrections of a trial that curvature takes out of a set."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from .linearization import StageTerms
+from ..terms.linearization import StageTerms
 from .snapshot import mismatch, near
 from .window import Window
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from .._checks import numbers
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.second_derivatives import Curvature, SecondDerivatives
+from ..terms.base import Derivatives
 from .active_rows import HeldRows
 from .limits import FEASIBLE, STALLED
 from .optimality import OptimalityMatrix
@@ -59,9 +60,16 @@ class Gradient:
         self._force = np.einsum("kij,...kj->...ki", at.bent, self._tangent)
         self._force += at.rows.on_residuals(forces)
 
+    def _by(self, name: str) -> Array:
+        """The derivative by data of terms."""
+        at = self._at
+        return np.asarray(-sum(
+            one.by(name, self._adjoint, self._tangent) for one in at.terms if name in one.data
+        ))
+
     @cached_property
     def prior(self) -> Array:  # noqa: D102 - above
-        return np.asarray(self._adjoint[..., 0, :] @ self._at.prior_bent)
+        return self._by("prior")
 
     @cached_property
     def measurements(self) -> Array:  # noqa: D102
@@ -79,15 +87,11 @@ class Gradient:
 
     @cached_property
     def prior_weight(self) -> Array:  # noqa: D102
-        at = self._at
-        found = at.cost.prior_weight_gradient(at.offset, self._adjoint[..., 0, :], at.prior_weight)
-        return np.asarray(-at.factors[0] * found)
+        return self._by("prior_weight")
 
     @cached_property
     def _weights(self) -> Array:
-        at = self._at
-        found = at.cost.stage_weight_gradient(at.residuals, self._tangent, at.weights)
-        return np.asarray(-at.factors[1:, None, None] * found)
+        return self._by("stage_weights")
 
     @cached_property
     def disturbance_weights(self) -> Array:  # noqa: D102
@@ -133,28 +137,21 @@ class _Point:
             problem = problem.without_violated()
             trial = problem.evaluate(solved.trajectory.copy())
         self.problem, self.trial, self.trajectory = problem, trial, trial.trajectory
-        # Copies: the window's arrays go on to the next sample.
-        self.residuals, self.weights = trial.residuals, problem.stage_weights.copy()
+        self.residuals = trial.residuals
         count, self.n = self.trajectory.shape[0] - 1, self.trajectory.shape[1]
         self.p = self.residuals.shape[1] - self.n
         self.known = solved.formulation.system.m - parameter_count
-        factors = problem.discounts
-        self.factors = np.ones(count + 1) if factors is None else factors
         self.usual_w, self.usual_v = (
             np.array([getattr(one, name) is None for one in solved.conditions], np.bool_)
             for name in ("disturbance_weight", "noise_weight")
         )
         self.reductions = _reductions(solved)
         self.jacobian = _jacobian(problem, self.trajectory[:-1])
-        self.prior_weight, self.offset = problem.prior_weight, problem.offset(self.trajectory)
-        prior = 2.0 * problem.prior_weight_at(self.offset)
-        # What is held has its weight and its value before the step: both are data.
-        self.first_force = prior @ self.offset + 2.0 * problem.hold_force(self.trajectory)
-        self.first_majorised = 2.0 * problem.first_weight_at(self.offset)
-        self.first_held = self.first_majorised - prior
-        self.prior_bent = self.factors[0] * self.cost.prior_hessian(self.offset, self.prior_weight)
-        self.majorised = np.broadcast_to(2.0 * trial.weights, (count, *trial.weights.shape[-2:]))
-        self.cost_forces = np.einsum("kij,kj->ki", self.majorised, self.residuals)
+        found = [term.derivative(trial) for term in problem.terms]
+        self.terms = [one for one in found if one is not None]
+        self.sums = sums = Derivatives(count, self.n, self.residuals.shape[1])
+        for term in self.terms:
+            term.add_to(sums)
         self.rows = HeldRows(problem, solved.formulation, trial, self.jacobian)
         self.rows.settle(self.regular, self.gradient)
 
@@ -162,9 +159,8 @@ class _Point:
         """Set the exact second derivatives; return the blocks of the Hessian of L."""
         inputs, forces = self.problem.inputs, self.forces(self.rows.multipliers)
         self.curvature = second.at(self.trajectory[:-1], inputs, forces)
-        bent = self.factors[1:, None, None] * self.cost.stage_hessian(self.residuals, self.weights)
-        self.bent = bent + self.rows.penalty_bent
-        own, below = self._blocks(self.prior_bent + self.first_held, self.bent)
+        self.bent = self.sums.bent_residuals + self.rows.penalty_bent
+        own, below = self._blocks(self.sums.bent_states, self.bent)
         own[:-1] -= self.curvature.own
         own += self.rows.curvature(second.scales)
         if not all(np.isfinite(one).all() for one in (own, below, *self.curvature)):
@@ -175,13 +171,13 @@ class _Point:
 
     def forces(self, multipliers: Array) -> Array:
         """The derivative (K, n + p) of L by the residuals."""
-        found: Array = self.cost_forces + self.rows.penalty_forces
+        found: Array = self.sums.on_residuals + self.rows.penalty_forces
         return found + self.rows.on_residuals(multipliers)
 
     def gradient(self, multipliers: Array) -> Array:
         """The derivative (K + 1, n) of L by the states."""
         found = self.rows.on_states(multipliers) + self.rows.penalty_on_states
-        found[0] += self.first_force
+        found += self.sums.on_states
         return found + self.of_states(self.forces(multipliers))
 
     def of_states(self, forces: Array) -> Array:
@@ -199,26 +195,30 @@ class _Point:
 
     def regular(self) -> tuple[Array, Array]:
         """The blocks of the Gauss-Newton Hessian, which is positive definite."""
-        return self._blocks(self.first_majorised, self.majorised + self.rows.penalty_bent)
+        sums = self.sums
+        return self._blocks(
+            sums.majorised_states, sums.majorised_residuals + self.rows.penalty_bent
+        )
 
-    def _blocks(self, prior: Array, bent: Array) -> tuple[Array, Array]:
+    def _blocks(self, on_states: Array, bent: Array) -> tuple[Array, Array]:
         """Diagonal blocks (K + 1, n, n), and those below them (K, n, n)."""
         n, jacobian = self.n, self.jacobian
         weighted = np.matmul(bent, jacobian)
         own = self.rows.penalty_bent_states.copy()
         own[:-1] += np.matmul(jacobian.transpose(0, 2, 1), weighted)
         own[1:] += bent[:, :n, :n]
-        own[0] += prior
+        own += on_states
         return own, -weighted[:, :n]
 
     @property
     def by_discount(self) -> tuple[Array, Array]:
         """Derivatives by the discount of J's by the states themselves, and by the residuals."""
-        # The prior has the age of the window, the newest state the age of the newest stage.
+        # The newest state has the age of the newest stage.
         ages = np.append(np.arange(len(self.residuals) - 1, -1, -1.0), 0.0) / self.cost.discount
-        states = ages[:, None] * self.rows.penalty_on_states
-        states[0] += len(self.residuals) / self.cost.discount * self.first_force
-        return states, ages[:-1, None] * (self.cost_forces + self.rows.penalty_forces)
+        return (
+            ages[:, None] * self.rows.penalty_on_states + self.sums.aged_states,
+            ages[:-1, None] * self.rows.penalty_forces + self.sums.aged_residuals,
+        )
 
 
 class Sensitivity:
@@ -380,7 +380,7 @@ class Sensitivity:
         """
         at = self._at
         lead, given = self._checked(changes)
-        count, n, p, eye = len(at.residuals), at.n, at.p, np.eye(at.n + at.p)
+        count, n, p = len(at.residuals), at.n, at.p
         # The change of the residuals, of the slopes of J by them, and by the states themselves.
         moved, slopes = np.zeros((*lead, count, n + p)), np.zeros((*lead, count + 1, n))
         moved[..., n:] += given["measurements"]
@@ -388,23 +388,17 @@ class Sensitivity:
         known[..., at.known :] += given["parameters"][..., None, :]
         moved -= np.einsum("kqm,...km->...kq", at.curvature.by_input, known)
         slopes[..., :-1, :] -= np.einsum("knm,...km->...kn", at.curvature.mixed, known)
-        slopes[..., 0, :] -= given["prior"] @ at.prior_bent
-        by_prior = at.cost.prior_weight_gradient(at.offset, np.eye(n), at.prior_weight)
-        slopes[..., 0, :] += at.factors[0] * np.einsum(
-            "iab,...ab->...i", by_prior, given["prior_weight"]
-        )
         forces = np.einsum("kij,...kj->...ki", at.bent, moved)
         w, v = given["disturbance_weights"], given["noise_weights"]
         w += at.usual_w[:, None, None] * given["disturbance_weight"][..., None, :, :]
         v += at.usual_v[:, None, None] * given["noise_weight"][..., None, :, :]
         if at.reductions is not None:
             v = at.reductions @ v @ np.swapaxes(at.reductions, -1, -2)
-        each = np.broadcast_to(eye[:, None], (n + p, count, n + p))
-        by_weight = at.factors[1:, None, None] * at.cost.stage_weight_gradient(
-            at.residuals, each, at.weights
-        )
-        forces += np.einsum("ikab,...kab->...ki", by_weight[..., :-p, :-p], w)
-        forces += np.einsum("ikab,...kab->...ki", by_weight[..., -p:, -p:], v)
+        r = w.shape[-1]
+        weights = np.zeros((*lead, count, r + p, r + p))
+        weights[..., :r, :r], weights[..., r:, r:] = w, v
+        for term in at.terms:
+            term.change({**given, "stage_weights": weights}, slopes, forces)
         by_discount, change = at.by_discount, given["discount"][..., None, None]
         slopes += change * by_discount[0]
         slopes += at.of_states(forces + change * by_discount[1])

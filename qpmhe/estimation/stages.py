@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from .._checks import positive_definite
 from ..observers.projection import ErrorMetric
+from ..terms.base import read_only
+from ..terms.linearization import Span, Stage, StageTerms
 from .conditions import Conditions
-from .linearization import Span, Stage, StageTerms
 from .snapshot import check_size, checked_array, mismatch
 
 Array = NDArray[np.float64]
@@ -38,13 +39,6 @@ class Mark(NamedTuple):
     trusted: Array | None
     metric: tuple[Array, bool] | None
     arrays: dict[str, Array] | None
-
-
-def read_only(array: Array) -> Array:
-    """A view that cannot be written to."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 class Stages:

@@ -8,21 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import QP, Solution
-from qpmhe_solvers.qp import band_of
 
-from ..costs import Cost
 from ..model.functions import raised_along
 from ..model.residuals import difference
 from ..model.system import System
-from .constraints import Constraints, Rows
-from .limits import BEYOND
-from .linearization import Span, StageTerms
-from .problem import Problem, Trial
-from .softened import Penalties, Softened
+from ..terms.base import QuadraticModel, Trial
+from ..terms.linearization import Span, StageTerms
+from ..terms.rows import Rows
+from ..terms.soft import BEYOND, Penalties
+from .constraints import Constraints
+from .problem import Problem
 
 Array = NDArray[np.float64]
-
-_NO_BAND: Array = np.zeros(0)
 
 
 class Subproblem:
@@ -43,15 +40,12 @@ class Subproblem:
     """
 
     def __init__(
-        self, system: System, cost: Cost, constraints: Constraints, horizon: int,
+        self, system: System, constraints: Constraints, horizon: int,
         penalties: Penalties | None = None,
     ) -> None:
         n, p = system.n, system.p
         self._n, self._p = n, p
         self._terms = StageTerms(horizon, n, p)
-        self._scaled = StageTerms(horizon, n, p) if cost.discount < 1.0 else None
-        self._disturbance_band = band_of(cost.disturbance)
-        self._no_offset = np.zeros(n)
         states, w, v = constraints.states, constraints.disturbances, constraints.noises
         # Bounds of states are the QP's own.
         self._x_rows = states.matrix[states.bounds :] if states else np.empty((0, n))
@@ -64,7 +58,7 @@ class Subproblem:
         self._rows = int(ends[-1])
         self._w, self._v, self._x, self._g = (slice(a, b) for a, b in pairwise(ends))
         self._penalties = penalties
-        self._softened = None if penalties is None else Softened(penalties, n)
+        self._softened = None if penalties is None else penalties.softened
         self._functions = system.constraints
         #: Whether there are soft rows or nonlinear constraints.
         self.extended: bool = self._functions is not None or penalties is not None
@@ -73,10 +67,7 @@ class Subproblem:
         self._qp: QP | None = None
         #: Why `at` returned None the last time.
         self.failure = ""
-        # Added to the stages' panels: the band of the prior's weight, then the band of each Q_i.
-        self._added_bands: Array
-        # What these bands hold now: the same Q for all stages or not, and which prior's band.
-        self._uniform, self._prior_band = False, _NO_BAND
+        self._model: QuadraticModel  # of the present QP
 
     def at(self, problem: Problem, trial: Trial) -> QP | None:
         """The QP around a trajectory; None, and why in `failure`, where the Jacobians fail.
@@ -84,12 +75,7 @@ class Subproblem:
         The window holds the candidate's terms already.
         """
         if trial.trajectory is problem.candidate.trajectory:
-            span = problem.span
-            if self._scaled is not None and problem.discounts is not None:
-                count = len(span.panel)
-                self._scaled.copy_scaled(span, problem.discounts[1:])
-                span = Span(self._scaled, 0, count)
-            return self._assemble(problem, trial, span, not problem.prior_moved)
+            return self._assemble(problem, trial, problem.span, True)
         states, terms, n = trial.trajectory[:-1], self._terms, self._n
         count = states.shape[0]
         model, linear = problem.model, terms.linear[:count]
@@ -205,52 +191,23 @@ class Subproblem:
         """Rebuild the QP at its next use, since an interrupt may have left it half written."""
         self._qp = None
 
-    def _assemble(self, problem: Problem, trial: Trial, span: Span, at_prior: bool) -> QP:
-        count = len(span.panel)
-        qp = self._qp
-        if qp is None or qp.stages != count + 1:
-            qp = self._new_qp(count + 1)
-        weights = trial.weights
-        uniform = weights.ndim == 2 or problem.usual_disturbances
-        if not (uniform and self._uniform):
-            n = self._n
-            self._added_bands[1:] = (
-                self._disturbance_band if uniform else band_of(weights[:, :n, :n])
-            )
-            self._uniform = uniform
-        # The candidate starts at the prior as a rule: no offset, and no gradient from it.
-        offset = self._no_offset if at_prior else trial.trajectory[0] - problem.prior
-        if problem.wraps and not at_prior:
-            offset = problem.offset(trial.trajectory)
-        prior_band = problem.first_band_at(offset)
-        if prior_band is not self._prior_band:
-            self._added_bands[0] = self._prior_band = prior_band
-        gradient_first, gradient_rest, gradient_last, band_rest, band_last = self._views
-        np.add(span.panel, self._added_bands[:-1], band_rest)
-        band_last[...] = self._added_bands[-1]
-        np.add(span.gradient_rest, span.next_gradient_rest, gradient_rest)
-        gradient_first[...] = span.gradient_first
-        if not at_prior:
-            gradient_first += problem.prior_weight_at(offset).dot(offset)
-        if problem.hold is not None:
-            gradient_first += problem.hold_force(trial.trajectory)
-        gradient_last[...] = span.next_gradient_last
-        self._minus_jacobian = span.minus_jacobian
-        slopes = None
-        if self._functions is not None:
+    def _assemble(self, problem: Problem, trial: Trial, span: Span, is_candidate: bool) -> QP:
+        stages, qp = len(trial.trajectory), self._qp
+        if qp is None or qp.stages != stages:
+            qp = self._new_qp(stages)
+        self._minus_jacobian, functions, slopes = span.minus_jacobian, self._functions, None
+        if functions is not None:
             along = trial.trajectory, problem.inputs, trial.residuals, span.minus_jacobian
-            if self._forces is not None and len(self._forces) == count + 1:
-                self._add_curvature(qp, *self._functions.curvature(*along, self._forces))
-            slopes = self._functions.linearised(*along)
+            slopes = functions.linearised(*along)
+        model = self._model
+        model.span, model.is_candidate, model.slopes = span, is_candidate, slopes
+        for term in problem.terms:
+            term.add_model(model, trial)
+        forces = self._forces
+        if functions is not None and forces is not None and len(forces) == stages:
+            self._add_curvature(qp, *functions.curvature(*along, forces))
         if problem.constrained:
             self._set_inequalities(qp, problem, trial, slopes)
-        if self._softened is not None and self._penalties is not None:
-            assert problem.penalties is not None
-            self._softened.around(
-                problem.penalties,
-                self._penalties.values(trial.trajectory, trial.residuals, trial.values),
-                self._penalties.linearised(span.minus_jacobian, slopes),
-            )
         return qp
 
     def _add_curvature(self, qp: QP, own: Array, below: Array, following: Array) -> None:
@@ -266,10 +223,7 @@ class Subproblem:
         qp.bounded = False  # until there are bounds
         qp.row_next[:-1, self._w] = self._w_rows
         qp.row_own[:, self._x] = self._x_rows
-        band, gradient = qp.band, qp.gradient
-        self._views = gradient[0], gradient[1:-1], gradient[-1], band[:-1], band[-1]
-        self._added_bands = np.empty_like(band)
-        self._uniform, self._prior_band = False, _NO_BAND
+        self._model = QuadraticModel(qp)
         return qp
 
     def _set_inequalities(

@@ -16,13 +16,14 @@ from ..model.sets import ConvexSet
 from ..model.system import Function, System
 from ..observers import Observer, Sample
 from ..observers.projection import ErrorMetric, NearestPoint
+from ..terms.base import read_only
+from ..terms.hold import WindowHold
+from ..terms.linearization import Stage
 from .conditions import USUAL, Conditions
 from .estimate import Status
-from .hold import WindowHold
 from .limits import LARGEST
-from .linearization import Stage
 from .running import RunningObservers
-from .stages import Stages, StageView, WindowView, read_only
+from .stages import Stages, StageView, WindowView
 
 Array = NDArray[np.float64]
 

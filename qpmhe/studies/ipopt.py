@@ -79,7 +79,7 @@ class IpoptEstimator:
         solve, bounds = self._programs.get(count) or self._build(count)
         candidate = problem.candidate
         start = candidate.trajectory.ravel()
-        parameters = np.concatenate((problem.prior, problem.measurements.ravel()))
+        parameters = np.concatenate((problem.prior.mean, problem.measurements.ravel()))
         solving = perf_counter()
         answer = solve(x0=start, p=parameters, **bounds)
         solve_time = perf_counter() - solving

@@ -10,7 +10,7 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, ObserverWarning, PriorWarning
-from qpmhe.estimation.prior import PriorWeights
+from qpmhe.terms.prior import PriorWeights
 
 A, C = np.array([[1.0, 0.1], [-0.2, 0.9]]), np.array([[1.0, 0.3]])
 P, Q, R = np.array([[1.0, 0.4], [0.4, 2.0]]), np.diag([0.01, 0.02]), np.array([[0.1]])

@@ -1,4 +1,4 @@
-"""Hold parameters at their last trusted values where a window does not excite them."""
+"""The hold: a term that keeps parameters where they were while a window does not excite them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
+from qpmhe_solvers.qp import band_of
+
 from .._linalg import cholesky, inverse, solve
-from .observability import prior_units, window_information
+from .base import FirstStateDerivative, FirstStateTerm, Trial, WindowData, WindowView
+from .information import prior_units, window_information
 
 Array = NDArray[np.float64]
 
@@ -38,11 +41,15 @@ class Hold:
         The directions in which there are disturbances.
     disturbance : (n, n) array
         Weight of the disturbances.
+    discount : float
+        gamma.
     """
 
     def __init__(
-        self, held: Mapping[int, float], prior: Array, basis: Array, disturbance: Array
+        self, held: Mapping[int, float], prior: Array, basis: Array, disturbance: Array,
+        discount: float,
     ) -> None:
+        self.discount = discount
         #: Which states are held.
         self.components = components = np.array(list(held), np.intp)
         self.stiffness: Array = 1.0 / np.array(list(held.values()))
@@ -57,20 +64,13 @@ class Hold:
         spread = basis @ spread / self.deviations[:, None]
         self.spread: Array = spread @ spread.T
 
-    def of_window(self, minus_jacobian: Array, noise: Array, trusted: Array) -> WindowHold:
-        """The hold of a window.
-
-        Parameters
-        ----------
-        minus_jacobian : (K, n + p, n) array
-            Along the candidate, of f and h.
-        noise : (p, p) or (K, p, p) array
-            Weights of the noise, zero for what is missing.
-        trusted : (k,) array
-            The last trusted values.
-        """
+    def of_window(self, window: WindowData, view: WindowView) -> WindowHold | None:
+        """The hold of a window; None where no QP chooses the parameters."""
+        if window.trusted is None or not window.has_terms:
+            return None
         n, count = self.deviations.size, self.components.size
-        jacobian = minus_jacobian * -self.deviations
+        noise = window.stage_weights[..., n:, n:]
+        jacobian = view.span.minus_jacobian * -self.deviations
         a, c = jacobian[:, :n] / self.deviations[:, None], jacobian[:, n:]
         seen = c.transpose(0, 2, 1) @ noise @ c
         values, vectors = np.zeros(count), np.eye(count)  # of numbers beyond all measure
@@ -80,10 +80,11 @@ class Hold:
             if np.isfinite(left).all():
                 left, vectors = np.linalg.eigh(0.5 * (left + left.T))
                 values = (1.0 - left) / np.maximum(left, 0.0)
-        return WindowHold(self, values, vectors, trusted)
+        factor = float(window.discounts[0]) if self.discount < 1.0 else 1.0
+        return WindowHold(self, values, vectors, window.trusted[0], factor)
 
 
-class WindowHold:
+class WindowHold(FirstStateTerm):
     r"""The hold of one window, fixed before its step.
 
     With the singular values s of `Hold`, their directions V and the deviations D, J of every
@@ -117,8 +118,11 @@ class WindowHold:
         H.
     """
 
-    def __init__(self, hold: Hold, values: Array, vectors: Array, target: Array) -> None:
+    def __init__(
+        self, hold: Hold, values: Array, vectors: Array, target: Array, factor: float
+    ) -> None:
         self.components, self.target, self.values = hold.components, target, values
+        self._factor, self._discount = factor, hold.discount
         # Whatever is not a number above 1 is not seen.
         unseen = 1.0 / np.where(values > 1.0, values, 1.0)
         inner, held = ((vectors * one) @ vectors.T for one in (unseen, unseen * unseen))
@@ -127,20 +131,40 @@ class WindowHold:
         self.weight: Array = hold.inverse_units.T @ (stiff * held) @ hold.inverse_units
         self._follow = hold.units @ solve(eye + stiff * inner, eye - inner) @ hold.inverse_units
         n = hold.deviations.size
-        #: H among the weights of all states (n, n).
-        self.whole: Array = np.zeros((n, n))
-        self.whole[np.ix_(self.components, self.components)] = self.weight
+        # H among the weights of all states, discounted.
+        self._whole: Array = np.zeros((n, n))
+        self._whole[np.ix_(self.components, self.components)] = factor * self.weight
+        self.band = band_of(self._whole)
 
-    def cost(self, first: Array) -> float:
-        """The term of a trajectory's first state."""
-        offset = first[self.components] - self.target
-        return float(offset.dot(self.weight).dot(offset))
+    def _offset(self, trial: Trial) -> Array:
+        offset: Array = trial.trajectory[0, self.components] - self.target
+        return offset
 
-    def force(self, first: Array) -> Array:
-        """Half the derivative (n,) of the term."""
-        found = np.zeros(len(self.whole))
-        found[self.components] = self.weight.dot(first[self.components] - self.target)
+    def cost(self, trial: Trial) -> float:
+        """See `Term.cost`."""
+        offset = self._offset(trial)
+        return self._factor * float(offset.dot(self.weight).dot(offset))
+
+    def weight_of_first(self, trial: Trial) -> Array:
+        """See `FirstStateTerm.weight_of_first`."""
+        return self._whole
+
+    def force(self, trial: Trial) -> Array:
+        """See `FirstStateTerm.force`."""
+        found = np.zeros(len(self._whole))
+        found[self.components] = self._factor * self.weight.dot(self._offset(trial))
         return found
+
+    def magnitude(self, trial: Trial) -> float:
+        """See `Term.magnitude`."""
+        offset = abs(self._offset(trial))
+        return float(offset @ abs(self.weight) @ offset)
+
+    def derivative(self, trial: Trial) -> FirstStateDerivative:
+        """Without that of the data: weight and trusted values are fixed before the step."""
+        bent = 2.0 * self.weight_of_first(trial)
+        age = len(trial.residuals) / self._discount
+        return FirstStateDerivative(2.0 * self.force(trial), bent, bent, age)
 
     def followed(self, estimate: Array) -> Array:
         """The trusted values after an estimate (n,) of the next window's first state."""

@@ -143,18 +143,6 @@ class StageTerms:
         costs: Array = flat[:, 0] + flat.dot(self._zeros)
         return costs
 
-    def copy_scaled(self, span: Span, factors: Array) -> None:
-        """Copy the terms of a span to the first stages here, each times a factor of its cost."""
-        count = factors.size
-        self.linear[:count, :, 1:] = span.minus_jacobian
-        np.multiply(span.panel, factors[:, None, None], out=self.panel[:count])
-        np.multiply(span.gradient_first, factors[0], out=self.gradient[0])
-        np.multiply(span.gradient_rest, factors[1:, None], out=self.gradient[1:count])
-        np.multiply(
-            span.next_gradient_rest, factors[:-1, None], out=self.next_gradient[: count - 1]
-        )
-        np.multiply(span.next_gradient_last, factors[-1], out=self.next_gradient[count - 1])
-
     def arrays(self) -> dict[str, Array]:
         """The arrays, each with one entry a stage."""
         return {name: getattr(self, name) for name in self.names}

@@ -1,9 +1,10 @@
-"""Soft sets and soft constraints: their penalty in J, and QPs with slack variables."""
+"""The soft sets' and soft constraints' term of J, and its model: QPs with slack variables."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +15,14 @@ from qpmhe_solvers import QP, Solution, SolveStatus
 from .._linalg import inverse, solve, unit_diagonal
 from ..costs import Cost
 from ..model.system import System
-from .conditions import Conditions
-from .constraints import Rows, function_rows
-from .limits import BEYOND
+from .base import QuadraticModel, SoftRows, Term, Trial, WindowData, WindowView
+from .rows import Rows, function_rows
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+#: A second-order correction is lengthened by this share of itself, to end inside the set.
+BEYOND = 0.1
 
 # As in the banded solver: a root is exact for powers of four alone.
 _COST_UNITS = 0.5, 1.0
@@ -52,7 +55,7 @@ class Penalties:
 
     def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
         self.parts: list[_Part] = []
-        self.size, self._n = 0, system.n
+        self.size, self._n, self._discounted = 0, system.n, cost.discount < 1.0
         for name, covariance in (
             ("states", prior_covariance), ("disturbances", inverse(cost.disturbance)),
             ("noises", inverse(cost.noise)),
@@ -75,6 +78,11 @@ class Penalties:
             self._add(rows, functions.linear[rows.numbers], functions.quadratic[rows.numbers])
         self._windows: dict[int, WindowPenalties] = {}
 
+    @cached_property
+    def softened(self) -> Softened:
+        """The QPs with slack variables; there is one, which each use overwrites."""
+        return Softened(self, self._n)
+
     def _add(self, rows: Rows, linear: Array, quadratic: Array) -> None:
         place = slice(self.size, self.size + len(rows.matrix))
         self.parts.append(_Part(rows, place, (linear, quadratic)))
@@ -83,24 +91,26 @@ class Penalties:
     def __bool__(self) -> bool:
         return self.size > 0
 
-    def of_window(
-        self, count: int, observed: Mask | None, discounts: Array | None,
-        conditions: Sequence[Conditions] | None = None,
-    ) -> WindowPenalties:
-        """The penalties of a window of ``count`` stages; rows on missing outputs do not count.
+    def of_window(self, window: WindowData, view: WindowView) -> Penalty:
+        """The soft rows of a window."""
+        return Penalty(self, self._rows_of(window, len(view.candidate) - 1))
 
-        ``conditions`` are those of the stages where some have sets with other sides; the newest
-        state has those of the last stage.
+    def _rows_of(self, window: WindowData, count: int) -> WindowPenalties:
+        """Sides and penalties of a window; rows on missing outputs do not count.
+
+        The newest state has the sets of the last stage.
         """
-        usual = observed is None and conditions is None
+        observed = window.observed if window.has_special_weights else None
+        own = window.conditions if window.has_own_bounds else None
+        usual = observed is None and own is None
         if usual and count in self._windows:
             return self._windows[count]
         lower, upper = np.full((2, count + 1, self.size), np.inf)
         np.negative(lower, out=lower)
         linear, quadratic = np.zeros((2, count + 1, self.size))
         for rows, place, penalties in self.parts:
-            if conditions is not None and rows.name != "constraints":
-                sets = [getattr(own, rows.name) for own in conditions]
+            if own is not None and rows.name != "constraints":
+                sets = [getattr(one, rows.name) for one in own]
                 rows = rows.with_sides([*sets, sets[-1]])
             counts = np.ones((count + 1, len(rows.matrix)), np.bool_)
             if rows.name == "constraints" and self.functions is not None:
@@ -112,8 +122,8 @@ class Penalties:
             lower[:, place] = np.where(counts, rows.lower, -np.inf)
             upper[:, place] = np.where(counts, rows.upper, np.inf)
             linear[:, place], quadratic[:, place] = penalties
-        if discounts is not None:
-            factors = np.append(discounts[1:], 1.0)[:, None]
+        if self._discounted:
+            factors = np.append(window.discounts[1:], 1.0)[:, None]
             linear, quadratic = factors * linear, factors * quadratic
         made = WindowPenalties(lower, upper, linear, quadratic)
         if usual:
@@ -175,6 +185,43 @@ class WindowPenalties(NamedTuple):
         """The penalty of these misses; infinity where one is not finite."""
         cost = float((misses * (self.linear + self.quadratic * misses)).sum())
         return math.inf if math.isnan(cost) else cost
+
+
+class Penalty(Term):
+    """What the soft rows of one window add to J.
+
+    Attributes
+    ----------
+    window : WindowPenalties
+        Their sides and penalties.
+    """
+
+    def __init__(self, penalties: Penalties, window: WindowPenalties) -> None:
+        self._penalties, self.window = penalties, window
+
+    def _values(self, trial: Trial) -> Array:
+        return self._penalties.values(trial.trajectory, trial.residuals, trial.values)
+
+    def cost(self, trial: Trial) -> float:
+        """See `Term.cost`; sets the penalty of the trial."""
+        trial.penalty = penalty = self.window.cost(self.window.misses(self._values(trial)))
+        return penalty
+
+    def add_model(self, model: QuadraticModel, trial: Trial) -> None:
+        """Nothing, as most soft rows are not violated: `Softened` takes them around the trial."""
+        slopes = self._penalties.linearised(model.span.minus_jacobian, model.slopes)
+        self._penalties.softened.around(self.window, self._values(trial), slopes)
+
+    def magnitude(self, trial: Trial) -> float:
+        """0, as nothing cancels."""
+        return 0.0
+
+    def soft_rows(self, trial: Trial) -> Iterator[SoftRows]:
+        """See `Term.soft_rows`."""
+        values, window = self._values(trial), self.window
+        for rows, place, _ in self._penalties.parts:
+            count = len(values) - (rows.name in ("disturbances", "noises"))
+            yield SoftRows(rows, *(one[:count, place] for one in (values, *window)))
 
 
 class Softened:
