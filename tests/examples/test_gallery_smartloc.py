@@ -106,6 +106,7 @@ def test_the_model_at_the_truth_leaves_no_residuals(parts, tmp_path):
         parts["record"].read(tmp_path / "smartloc_made")
 
 
+@pytest.mark.slow
 def test_the_least_cost_is_found_from_far_away_and_the_command_runs(parts, tmp_path):
     """A third of the signals is reflected: filters are off by more, and a far start is no harm."""
     car, record = parts["car"], parts["record"]

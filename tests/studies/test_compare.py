@@ -144,6 +144,7 @@ def here(tmp_path, monkeypatch):
     return record
 
 
+@pytest.mark.slow
 def test_a_record_is_compared_by_its_costs_and_where_truth_is_known_by_errors(here):
     text = command("compare", *GRID, "--store", "s.sqlite", "--keep-failing", "failing")
     assert "Fastest within 1 % of the best J / converged J: daqp" in text
@@ -210,6 +211,7 @@ def test_noise_levels_scale_what_is_simulated():
         np.testing.assert_allclose(loud, 2.0 * usual, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_latex_tables_have_means_with_standard_errors_and_say_so(tmp_path):
     study = Study(backends=["daqp", "osqp"], qps=[0, 2], solver_iterations=[2, None],
                   horizons=[10], seeds=3, steps=40)
@@ -233,6 +235,7 @@ def test_latex_tables_have_means_with_standard_errors_and_say_so(tmp_path):
     assert escaped("a_b%c\\d") == r"a\_b\%c\textbackslash{}d"
 
 
+@pytest.mark.slow
 def test_figures_against_horizon_noise_and_qps_come_in_one_call(tmp_path):
     study = Study(backends=["banded"], qps=[0, 1, 2], solver_iterations=[None], horizons=[3, 6],
                   noise_levels=[1, 2], seeds=2, steps=20, measure="accuracy")

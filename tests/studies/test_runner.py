@@ -259,6 +259,7 @@ def cluster(workers):
             process.stdin.close()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # What Dask and its own dependencies warn of is theirs.
 def test_results_of_a_cluster_are_those_of_this_machine(path, tmp_path):
     with cluster(2) as (_, address):
