@@ -43,6 +43,15 @@ _all = np.logical_and.reduce
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
 
+class Nearby:
+    """Whether rows of a Jacobian were taken nearby since ``used`` was last set to False."""
+
+    __slots__ = ("used",)
+
+    def __init__(self) -> None:
+        self.used = False
+
+
 class Jacobian:
     """The Jacobian with respect to x of a `BatchedFunction` with vector values.
 
@@ -60,6 +69,9 @@ class Jacobian:
         Bounds a small step inside those of X, infinite where X has none.
     aside : (n,) array
         The step beside a point without derivative.
+    nearby : Nearby
+        Whether rows were taken inside the bounds or beside the point: one for all that evaluate
+        this Jacobian for one estimator.
     remedy : str
         Remedy for a wrong given Jacobian.
     """
@@ -83,6 +95,7 @@ class Jacobian:
         self.aside: Array = np.zeros(n)
         self._outputs: Array = np.zeros(function.shape)
         self._scales: Array | None = None
+        self.nearby = Nearby()
         self._set_scales(np.ones(n))
         self.method = "finite differences"
         self.batch: Callable[[Array, Array], Array] = self._differences
@@ -164,6 +177,8 @@ class Jacobian:
                 break
             with suppress(Exception):  # it raises there, too: what is missing stays so
                 found = np.where(finite, found, given(place, u))
+                filled = np.all(np.isfinite(found), axis=(-2, -1)) & ~np.all(finite, axis=(-2, -1))
+                self.nearby.used |= bool(np.any(filled))
         if np.isnan(found).all():  # with the error of the place itself
             return np.asarray(given(x, u), np.float64)
         return found
@@ -333,7 +348,7 @@ class Jacobian:
     def copy(self, function: BatchedFunction) -> Jacobian:
         """The same Jacobian, of a copy of its function; its method can change independently."""
         other = copy(self)
-        other.function = function
+        other.function, other.nearby = function, Nearby()
         if self._given is None:
             other.use(self.method)
         else:
@@ -353,6 +368,7 @@ class Jacobian:
 
     def follow(self, other: Jacobian) -> None:
         """Compute as another Jacobian of the same function does, if it computes."""
+        self.nearby = other.nearby
         if other._given is None:
             self.use(other.method)
             self._undecided = False
