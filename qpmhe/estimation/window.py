@@ -353,8 +353,10 @@ class Window(Stages):
                     return f"{name} is {value.tolist()}"
             if self._with_jacobians:
                 for name, jacobian in (("f", model.f_jacobian), ("h", model.h_jacobian)):
-                    if not np.isfinite(jacobian(view.z, u)).all():
+                    if not np.isfinite(slope := np.asarray(jacobian(view.z, u))).all():
                         return f"the Jacobian of {name} is not finite"
+                    if not np.isfinite(np.square(slope)).all():
+                        return f"the Jacobian of {name} has {np.abs(slope).max():.0e} in it"
             if not np.isfinite(view.terms.disturbance).all():
                 return "the observer's correction is not finite"
             if not np.isfinite(view.z_next).all():
@@ -467,7 +469,8 @@ class Window(Stages):
             view.z_next[...], output, jacobian = kernel.stage(view.z, u)
             np.subtract(view.y, output, terms.noise)
             np.negative(jacobian, terms.linear[:, 1:])
-            if not np.logical_and.reduce(np.isfinite(jacobian), None):  # in one call
+            flat = jacobian.ravel()
+            if not math.isfinite(flat.dot(flat)):
                 self._differentiate(terms, (model.f_jacobian, model.h_jacobian), (view.z, u))
         if self._output_residual is not None:
             self._evaluating = "output_residual"

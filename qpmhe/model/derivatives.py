@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -37,10 +38,21 @@ _INWARD, _MOST_INWARD = 2.0**-10, 0.25
 # How far beside a point where it is still not finite: shares of the magnitudes, of changing sign
 # and size, since functions without a derivative at 0 have none along axes and diagonals, either.
 _ASIDE, _GOLDEN = 2.0**-24, 0.6180339887498949
-# One call, where the method takes three.
-_all = np.logical_and.reduce
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
+
+
+def _has_squares(array: Array) -> bool:
+    """Whether all numbers have finite squares: no covariance is finite without."""
+    flat = array.ravel()
+    return math.isfinite(flat.dot(flat))
+
+
+def _finite_rows(array: Array) -> NDArray[np.bool_]:
+    """Which rows (..., d, 1) have finite squares."""
+    with np.errstate(over="ignore"):
+        finite: NDArray[np.bool_] = np.isfinite(np.square(array).sum(axis=-1, keepdims=True))
+    return finite
 
 
 class Nearby:
@@ -115,7 +127,7 @@ class Jacobian:
             try:
                 found: Array = self._given(x, u)
                 # Of a trace, it is no number.
-                if found.dtype != np.float64 or _all(np.isfinite(found), None):
+                if found.dtype != np.float64 or _has_squares(found):
                     return found
             except Exception:
                 found = np.full((*self.function.shape, x.size), np.nan)
@@ -160,7 +172,7 @@ class Jacobian:
         assert self._given is not None
         try:
             found: Array = self._given.batch(x, u)
-            if found.dtype != np.float64 or _all(np.isfinite(found), None):
+            if found.dtype != np.float64 or _has_squares(found):
                 return found
         except Exception:
             found = np.full((*x.shape[:-1], *self.function.shape, x.shape[-1]), np.nan)
@@ -172,13 +184,13 @@ class Jacobian:
         """Rows that are missing, from inside the bounds or, where it has none, from beside x."""
         places = [np.clip(x, *self.inner), np.clip(x + self.aside, *self.inner)]
         for place in places if np.isfinite(self.inner).any() else places[1:]:
-            finite = np.isfinite(found).all(axis=-1, keepdims=True)
+            finite = _finite_rows(found)
             if finite.all():
                 break
             with suppress(Exception):  # it raises there, too: what is missing stays so
                 found = np.where(finite, found, given(place, u))
-                filled = np.all(np.isfinite(found), axis=(-2, -1)) & ~np.all(finite, axis=(-2, -1))
-                self.nearby.used |= bool(np.any(filled))
+                filled = _finite_rows(found).all(axis=-2) & ~finite.all(axis=-2)
+                self.nearby.used |= bool(filled.any())
         if np.isnan(found).all():  # with the error of the place itself
             return np.asarray(given(x, u), np.float64)
         return found

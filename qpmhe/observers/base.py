@@ -294,9 +294,9 @@ class KalmanType(Observer):
         return self._innovation.judge(prediction, noise, v, observed, rejections)
 
     def _is_vague(self, spread: Array, noise: Array, sample: Sample) -> bool:
-        """Whether S, of several outputs, hides what the noise has in it: the gain is then lost."""
+        """Whether S hides what the noise has in it: of several outputs, the gain is then lost."""
         if len(noise) < 2:
-            return False
+            return len(noise) == 1 and VAGUE * spread.item() > noise.item()
         share = self._share if sample.noise_weight is None else least_share(noise)
         # In one call, where `any` takes three.
         return bool(_or(VAGUE * spread.diagonal() > share * noise.diagonal()))

@@ -118,13 +118,12 @@ static void mhe_rows_of(const mhe_seen *seen, const real *C, real *rows)
 #endif
 
 #if MHE_ROOTS
-/* Whether S, of several outputs, hides what the noise has in it: the gain is then lost. */
+/* Whether S hides what the noise has in it: of several outputs, the gain is then lost. */
 static int mhe_is_hidden(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
                          const real *S)
 {
     const int q = seen->count;
     real share = s->covariances.noise_share;
-    if (q < 2) return 0;
     if (stage->has_own_noise) {
         real scratch[NY * NY], inverse[NY * NY], most = 0;
         memcpy(scratch, seen->noise, sizeof(real) * (size_t)(q * q));
