@@ -119,11 +119,13 @@ _TEXTS = {
     ),
     Status.OBSERVER_RESET: (
         "The observer's covariance was lost: it was not finite, or not positive semidefinite. The "
-        "observer predicted without the sample, and its covariance is the initial one again. "
+        "observer predicted without the sample (a constant gain corrected), and its covariance is the "
+        "initial one again. "
         "Bound the states, or scale the model, so that no derivative is huge."
     ),
     Status.DERIVATIVE_NEARBY: (
-        "A derivative of the model is not finite where it was needed; its row was taken nearby, "
+        "A derivative of the model, or its square, is not finite where it was needed; its row was "
+        "taken nearby, "
         "inside the bounds or a tiny step aside. If this happens often, write the function so "
         "that its derivative is finite there, as sqrt(x**2 + small**2) for abs(x), or bound the "
         "states."

@@ -71,7 +71,7 @@ class Jacobian:
     Jacobian is compared with differences only from then on. Rows that are not finite on a bound of
     X (a square root's at 0, for example) are taken a small step inside, and rows that are not
     finite there either (a range's at its beacon) a tiny step beside the point: one sensor without a
-    derivative does not stop the others.
+    derivative does not stop the others. A row is finite here if its square is.
 
     Attributes
     ----------

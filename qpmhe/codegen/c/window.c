@@ -207,6 +207,7 @@ static int mhe_enter(mhe_estimator *e, int i, const mhe_x_set *onto)
     real *next = mhe_next_state(e, i), *following = mhe_next_covariance(e, i);
     int32_t *rejections = mhe_next_rejections(e, i);
     int events = 0;
+    (void)following; (void)rejections; /* an observer may have neither */
     stage->cost = mhe_advance(e, i, derived, next, onto, &events);
     const int held = !isfinite(stage->cost);
     if (held) {
