@@ -1,4 +1,4 @@
-"""Kalman observers beside priors of up to 1e10 noise deviations, both engines, against 60 digits."""
+"""Kalman observers beside priors of up to 1e10 noise deviations, against 60 digits."""
 
 import numpy as np
 import pytest

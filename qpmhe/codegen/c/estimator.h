@@ -70,10 +70,11 @@ $limits
 #define MHE_EXTENDED 1
 #define MHE_UNSCENTED 2
 #define MHE_FUNCTION 3 /* of its state and the fitting error */
-/* Whether the covariance is propagated by its root where it has lost digits. */
-#define MHE_ROOTS (MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED)
 #define MHE_GATED 1
 #define MHE_WEIGHTED 2
+
+/* Whether the covariance is propagated by its root where it has lost digits. */
+#define MHE_ROOTS (MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED)
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
