@@ -120,7 +120,7 @@ _TEXTS = {
     Status.OBSERVER_RESET: (
         "The observer's covariance was lost: it was not finite, or not positive semidefinite. The "
         "observer predicted without the sample (a constant gain corrected), and its covariance is "
-        "the initial one again. Bound the states, or scale the model, so that no derivative is huge."
+        "the initial one again. Bound the states, or scale the model: no derivative is huge then."
     ),
     Status.DERIVATIVE_NEARBY: (
         "A derivative of the model, or its square, is not finite where it was needed; its row was "
