@@ -7,6 +7,7 @@ digit of a result.
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 
 import numpy as np
@@ -40,19 +41,22 @@ def inverse(matrix: Array) -> Array:
     return result
 
 
-def is_covariance(matrix: Array) -> bool:
-    """Whether a symmetric matrix is finite and, up to rounding, positive semidefinite."""
+def least_pivot(matrix: Array) -> float:
+    """The least variance of a component given those before it, as a share of its variance.
+
+    Negative for what is no covariance: not finite or, beyond rounding, not positive semidefinite.
+    """
     variances = matrix.diagonal()
     if not (np.isfinite(matrix).all() and variances.min() >= 0.0):
-        return False
+        return -1.0
     deviations = np.sqrt(np.where(variances > 0.0, variances, 1.0))
     correlations = matrix / deviations / deviations[:, None]
-    np.fill_diagonal(correlations, 1.0 + _INDEFINITE)
+    correlations.ravel()[:: deviations.size + 1] = 1.0 + _INDEFINITE
     try:
-        np.linalg.cholesky(correlations)
+        pivot = np.linalg.cholesky(correlations).diagonal().min().item()
     except np.linalg.LinAlgError:
-        return False
-    return True
+        return -1.0
+    return pivot * pivot if math.isfinite(pivot) else -1.0
 
 
 def solve(matrix: Array, side: Array) -> Array:

@@ -23,6 +23,7 @@ from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..estimation.snapshot import (
     check_description,
+    check_root,
     checked_array,
     described,
     mismatch,
@@ -518,6 +519,14 @@ class CompiledEngine:
         ))
         if not (np.isfinite(found).all() and np.isfinite(record["last_good_covariance"]).all()):
             raise ValueError("a covariance is not finite")
+        if self._library.layout.roots:
+            ends = (record["root_end"][None], record["is_vague_end"][None])
+            parts = (record["stages"][name][places] for name in ("root", "is_vague"))
+            roots, vague = (np.concatenate(pair) for pair in zip(parts, ends, strict=True))
+            if not (np.isin(vague, (0, 1)).all() and np.isfinite(roots[vague > 0]).all()):
+                raise ValueError("a root of a covariance is impossible")
+            for root, covariance in zip(roots[vague > 0], found[vague > 0], strict=True):
+                check_root(root, covariance)
         return found
 
     def _check_covariance(self, following: Array, reached: Array) -> None:

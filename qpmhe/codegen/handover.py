@@ -35,6 +35,9 @@ def hand_over(record: Any, directions: Directions, usual: Conditions, engine: Py
     covariance = None
     if "covariance_end" in names:
         covariance = (first["covariance"] if length else record["covariance_end"]).copy()
+    root = None
+    if "root_end" in names and (first["is_vague"] if length else record["is_vague_end"]):
+        root = (first["root"] if length else record["root_end"]).copy()
     rejections = None
     if "rejections_end" in names:
         rejections = (first["rejections"] if length else record["rejections_end"]).copy()
@@ -42,7 +45,7 @@ def hand_over(record: Any, directions: Directions, usual: Conditions, engine: Py
     history = [record["history"][(newest - k) % (horizon + 1)].copy() for k in range(count)][::-1]
     engine.take_over(
         usual, time - length, (first["z"] if length else record["z_end"]).copy(),
-        covariance, rejections, samples_of(record, directions),
+        covariance, root, rejections, samples_of(record, directions),
         record["trajectory"][: length + 1].copy() if record["has_trajectory"] else None,
         history, (int(record["far"]), int(record["dropped"])),
         record["smoothed"].copy() if record["has_smoothed"] else None,

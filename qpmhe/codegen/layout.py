@@ -22,6 +22,7 @@ from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers.base import covariance_of
+from ..observers.roots import least_share
 from ..terms.hold import Hold
 from ..terms.prior import PriorWeights
 from ..terms.rows import Rows
@@ -176,7 +177,7 @@ class Layout:
                 ("initial", r, n * n), ("disturbance", r, n * n), ("noise", r, p * p),
                 ("f_jacobian", r, n * n), ("h_jacobian", r, p * n),
                 *(bounds if self.observer_prior else []),
-                ("least", r), ("spread", r), ("typical", r, n),
+                ("least", r), ("spread", r), ("noise_share", r), ("typical", r, n),
             ])))
         if k := self.held:
             fields.append(("hold", _struct([
@@ -298,7 +299,8 @@ class Layout:
             ),
             ("cost", r), *((flag, np.int32) for flag in STAGE_FLAGS), ("is_observed", np.uint8, p),
             ("is_sampled", np.uint8, p), *self._if_covariance("covariance"),
-            *self._if_sensors(np.int32, "rejections"), ("terms", terms),
+            *self._if_roots("root", "is_vague"), *self._if_sensors(np.int32, "rejections"),
+            ("terms", terms),
         ])
         return _struct([
             ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
@@ -308,6 +310,7 @@ class Layout:
             ("smoothed", r, n), *([("trusted", r, (2, self.held))] if self.held else []),
             ("last_good", r, n), ("z_end", r, n),
             *self._if_covariance("last_good_covariance", "covariance_end"),
+            *self._if_roots("root_end", "is_vague_end"),
             *self._if_sensors(np.int32, "rejections_end"),
             ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
             ("places", np.int8, self.rows), ("stages", stage, count),
@@ -315,6 +318,14 @@ class Layout:
 
     def _if_sensors(self, kind: Any, name: str) -> list[Any]:
         return [(name, kind, (self.sensors,))] if self.sensors else []
+
+    @property
+    def roots(self) -> bool:
+        """Whether the covariance is propagated by its root where it has lost digits."""
+        return _OBSERVERS[self.observer] in ("extended", "unscented")
+
+    def _if_roots(self, root: str, flag: str) -> list[Any]:
+        return [(root, self.number, (self.nx, self.nx)), (flag, np.int32)] if self.roots else []
 
     def _if_covariance(self, *names: str) -> list[Any]:
         n = self.nx
@@ -371,6 +382,7 @@ def _filled(
         ):
             _fill(part, name, matrix)
         part["spread"] = own.spread
+        part["noise_share"] = least_share(covariance_of(usual.noise_weight, own.noise))
         part["least"] = _LEAST_SINGLE if single else SINGULAR
         if layout.observer_prior:
             _fill(part, "added", prior_weights.added)

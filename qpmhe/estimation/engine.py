@@ -122,6 +122,7 @@ class PythonEngine:
         self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
         self._known_modes = system.call_modes()  # as found at construction
+        self._nearby = system.f_jacobian.nearby, system.h_jacobian.nearby
         # The time of the next comparison of the trace with the functions that it stands for.
         self._next_check: float = 0 if system.is_traced else math.inf
         self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
@@ -254,6 +255,9 @@ class PythonEngine:
             status |= outcome.events
         if window.events:
             status |= Status(window.events)
+        one, other = self._nearby
+        if one.used or other.used:
+            status |= Status.DERIVATIVE_NEARBY
         if window.failure:
             message = f"{window.failure} {message}".strip()
         if candidate.values is not None and (text := problem.constraint_failure(candidate)):
@@ -348,6 +352,8 @@ class PythonEngine:
 
     def _set_undo_point(self, whole: bool) -> None:
         """Save what `undo` needs; all stages where some will be rewritten."""
+        one, other = self._nearby
+        one.used = other.used = False
         mark = self._window.mark(whole)
         self._undo_point = mark, self._trajectory, self._watch.counts, tuple(self._history)
 
@@ -369,6 +375,8 @@ class PythonEngine:
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
         """Change the conditions of all samples in the window and of later ones."""
         began, before = perf_counter(), self.memory
+        for one in self._nearby:
+            one.used = False
         usual = changes.over(before.tools.usual)
         if parameters is not None:
             usual = usual._replace(parameters=parameters)
@@ -415,21 +423,25 @@ class PythonEngine:
 
     def take_over(
         self, usual: Conditions, time: int, state: Array, covariance: Array | None,
-        rejections: NDArray[np.integer[Any]] | None, samples: Sequence[Taken],
+        root: Array | None, rejections: NDArray[np.integer[Any]] | None,
+        samples: Sequence[Taken],
         trajectory: Array | None, history: list[Array],
         watched: tuple[int, int], smoothed: Array | None, trusted: Array | None,
     ) -> None:
         """Continue from another engine, whose window starts at a time and state.
 
-        With the observer's covariance and its sensors' failures there if it has any, the samples
-        since then, the last estimate's trajectory, the last states that were estimated, the
-        smoothed prior, and the trusted values of held parameters.
+        With the observer's covariance, its root where only that has all digits, and its sensors'
+        failures there if it has any, the samples since then, the last estimate's trajectory, the
+        last states that were estimated, the smoothed prior, and the trusted values of held
+        parameters.
         """
         tools = self._tools if usual is self._tools.usual else self._tools_for(usual)
         window = self._fresh_window(state, tools)
         window.time, window.smoothed_prior = time, smoothed
         if window._covariances is not None and covariance is not None:
             window._covariances[0] = covariance
+        if window._roots is not None and root is not None:
+            window._roots[0], window._vague[0] = root, True
         if window._rejections is not None and rejections is not None:
             window._rejections[0] = rejections
         with np.errstate(all="ignore"):

@@ -39,6 +39,8 @@ class Status(enum.Flag):
     SENSORS_REJECTED = enum.auto()
     ALL_REJECTED = enum.auto()
     UNCONVERGED = enum.auto()
+    OBSERVER_RESET = enum.auto()
+    DERIVATIVE_NEARBY = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what to do about it, in sentences."""
@@ -114,6 +116,18 @@ _TEXTS = {
         "With max_qps=None, the sequence of QPs ended before it converged: at 100 QPs, or where "
         "several in a row were not solved to the solver's tolerance. Use another backend, such as "
         "'auto'; or in place of a loss with a kink, as Power(1), a Huber loss."
+    ),
+    Status.OBSERVER_RESET: (
+        "The observer's covariance was lost: it was not finite, or not positive semidefinite. The "
+        "observer predicted without the sample (a constant gain corrected), and its covariance is "
+        "the initial one again. Bound the states, or scale the model: no derivative is huge then."
+    ),
+    Status.DERIVATIVE_NEARBY: (
+        "A derivative of the model, or its square, is not finite where it was needed; its row was "
+        "taken nearby, "
+        "inside the bounds or a tiny step aside. If this happens often, write the function so "
+        "that its derivative is finite there, as sqrt(x**2 + small**2) for abs(x), or bound the "
+        "states."
     ),
 }
 

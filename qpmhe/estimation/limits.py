@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..observers.base import SAME_COVARIANCE
 from ..observers.innovation import GROWTH, LONGEST, MOST_GROWTH
+from ..observers.roots import VAGUE
 from ..terms.prior import KNOWN, NO_VARIANCE
 from ..terms.soft import BEYOND
 
@@ -55,7 +56,7 @@ LARGEST = 1e150
 
 _SINGLE = {
     "ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15, "SAME_COVARIANCE": 1e-4,
-    "IN_RANGE": 1e-4,
+    "IN_RANGE": 1e-4, "VAGUE": 2.0**-11,
 }
 
 
@@ -65,7 +66,7 @@ def c_definitions(prefix: str, real: str) -> str:
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
         "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR, "NEARER": NEARER,
         "NO_VARIANCE": NO_VARIANCE, "KNOWN": KNOWN, "SAME_COVARIANCE": SAME_COVARIANCE,
-        "IN_RANGE": IN_RANGE, "GROWTH": GROWTH,
+        "IN_RANGE": IN_RANGE, "GROWTH": GROWTH, "VAGUE": VAGUE,
     }
     if real == "float":
         values |= _SINGLE

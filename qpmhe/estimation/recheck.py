@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..terms.linearization import StageTerms
-from .snapshot import mismatch, near
+from .snapshot import check_root, mismatch, near
 from .window import Window
 
 Array = NDArray[np.float64]
@@ -23,6 +23,7 @@ def check_stages(window: Window, loaded: Window, terms: bool) -> None:
     """
     count, first = window.end, window.time - window.end
     with np.errstate(all="ignore"):
+        _check_roots(loaded)
         for k in range(count):
             window._set_weight(k, first + k)
             what = _difference(window, k, first + k, loaded, terms)
@@ -38,8 +39,19 @@ def check_stages(window: Window, loaded: Window, terms: bool) -> None:
             window._z[k + 1] = loaded._z[k + 1]
             if window._covariances is not None and loaded._covariances is not None:
                 window._covariances[k + 1] = loaded._covariances[k + 1]
+            if window._roots is not None and loaded._roots is not None:
+                window._roots[k + 1] = loaded._roots[k + 1]
+                window._vague[k + 1] = loaded._vague[k + 1]
             if window._rejections is not None and loaded._rejections is not None:
                 window._rejections[k + 1] = loaded._rejections[k + 1]
+
+
+def _check_roots(loaded: Window) -> None:
+    """Raise if a root is not that of its covariance."""
+    if loaded._roots is None or loaded._covariances is None:
+        return
+    for k in np.flatnonzero(loaded._vague[: loaded.end + 1]):
+        check_root(loaded._roots[k], loaded._covariances[k])
 
 
 def _difference(window: Window, k: int, time: int, loaded: Window, terms: bool) -> str:

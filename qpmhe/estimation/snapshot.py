@@ -190,6 +190,14 @@ def near(found: Array | float, expected: Array | float, size: Array | float) -> 
     return bool((~finite | close).all())
 
 
+def check_root(root: Array, covariance: Array) -> None:
+    """Raise if a root of the observer's covariance is not its upper triangular one."""
+    deviations = np.sqrt(np.abs(covariance.diagonal()))
+    size = np.multiply.outer(deviations, deviations)
+    if np.tril(root, -1).any() or not near(root.T @ root, covariance, size):
+        raise mismatch("observer")
+
+
 class _MisfitError(InvalidInputError):
     """The state is of another estimator, or not whole."""
 

@@ -64,6 +64,7 @@ class Stages:
         quadratic: bool,
         step: float,
         sensors: int = 0,
+        with_roots: bool = False,
     ) -> None:
         self.horizon, self._step = horizon, step
         room = horizon + max(horizon // 4, 32)
@@ -88,6 +89,9 @@ class Stages:
         self._stage_costs = np.zeros(room)
         self.terms = StageTerms(room, n, p)
         self._covariances = None if covariance is None else np.zeros((room + 1, n, n))  # of z
+        # Roots of those that have lost digits, and which have.
+        self._roots = np.zeros((room + 1, n, n)) if with_roots else None
+        self._vague = np.zeros(room + 1, np.bool_)
         # How often in a row each of the observer's sensors has failed, before each stage.
         self._rejections = np.zeros((room + 1, sensors), np.int64) if sensors else None
         # For observers and losses: a user's code cannot write into the window.
@@ -186,6 +190,8 @@ class Stages:
             found["majorising_weights"] = self._majorising_weights
         if self._covariances is not None:
             found["covariance"] = self._covariances
+        if self._roots is not None:
+            found["root"], found["vague"] = self._roots, self._vague
         if self._rejections is not None:
             found["rejections"] = self._rejections
         return found
@@ -288,7 +294,8 @@ class Stages:
         time = check_size("time", state["time"], lambda found: found >= 0)
         length, arrays = min(time, self.horizon), self._arrays()
         for name, what in (
-            ("covariance", "observer"), ("rejections", "observer"), ("majorising_weights", "cost"),
+            ("covariance", "observer"), ("root", "observer"), ("vague", "observer"),
+            ("rejections", "observer"), ("majorising_weights", "cost"),
         ):
             if (name in arrays) != (name in state):
                 raise mismatch(what)

@@ -90,7 +90,7 @@ class Subproblem:
                 problem.inputs,
             )
             return None
-        if not np.isfinite(linear).all():
+        if not np.isfinite(np.square(linear[:, :, 1:]).sum()):
             self.failure = "the Jacobian of f or h is not finite along the trajectory."
             return None
         linear[:, :, 0] = trial.residuals

@@ -9,13 +9,14 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
-from .._linalg import inverse, is_covariance
+from .._linalg import cholesky, inverse, least_pivot
 from ..costs import Cost
 from ..model.functions import contained, raised
 from ..model.sets import ConvexSet
 from ..model.system import Function, System
 from ..observers import Observer, Sample
 from ..observers.projection import ErrorMetric, NearestPoint
+from ..observers.roots import VAGUE
 from ..terms.base import read_only
 from ..terms.hold import WindowHold
 from ..terms.linearization import Stage
@@ -33,6 +34,7 @@ _PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
     Status.OBSERVER_PROJECTED.value, Status.PREDICTION_OUTSIDE.value, Status.METRIC_SINGULAR.value
 )
 _SENSORS_REJECTED, _ALL_REJECTED = Status.SENSORS_REJECTED.value, Status.ALL_REJECTED.value
+_OBSERVER_RESET = Status.OBSERVER_RESET.value
 _OF_PROJECTION = _PROJECTED | _PREDICTION_OUTSIDE | _METRIC_SINGULAR
 # Observers run side by side if they hold at most this many numbers; otherwise `replay` does it.
 _MOST_RUNNING = 2**23
@@ -71,8 +73,11 @@ class Window(Stages):
         self._with_jacobians = with_terms or observer.needs_jacobians
         super().__init__(
             n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
-            cost.quadratic, system.dt or 0.0, len(observer.sensors),
+            cost.quadratic, system.dt or 0.0, len(observer.sensors), observer.propagates_roots,
         )
+        # What the covariance restarts at where it is lost; C finds such a loss as no number.
+        self._first_covariance = observer.initial_covariance()
+        self._raises_lost = self._first_covariance is not None and observer.c_form is not None
         self._held = list(system.held)
         self.trust_start()
         self._sample = Sample(system, np.zeros(m))
@@ -230,6 +235,8 @@ class Window(Stages):
             self._u[:length, m - parameters.size : m] = parameters
         if self._covariances is not None:
             self._covariances[0] = kept["covariance"][0]
+        if self._roots is not None:
+            self._roots[0], self._vague[0] = kept["root"][0], kept["vague"][0]
         if self._rejections is not None:
             self._rejections[0] = kept["rejections"][0]
         self._earlier_state, self._earlier_covariance = other._last_good(other.start)
@@ -324,6 +331,7 @@ class Window(Stages):
             what = self._not_finite(k, time, observed)
             self.failure = f"{what} at x = {self._stage_views[k].z.tolist()}."
         if model_failed:
+            self.events &= ~_OBSERVER_RESET
             self._fill_failed(k)
         self._stage_costs[k] = cost
         if observed is not None and self._is_missing(time, observed):
@@ -345,8 +353,10 @@ class Window(Stages):
                     return f"{name} is {value.tolist()}"
             if self._with_jacobians:
                 for name, jacobian in (("f", model.f_jacobian), ("h", model.h_jacobian)):
-                    if not np.isfinite(jacobian(view.z, u)).all():
+                    if not np.isfinite(slope := np.asarray(jacobian(view.z, u))).all():
                         return f"the Jacobian of {name} is not finite"
+                    if not np.isfinite(np.square(slope)).all():
+                        return f"the Jacobian of {name} has {np.abs(slope).max():.0e} in it"
             if not np.isfinite(view.terms.disturbance).all():
                 return "the observer's correction is not finite"
             if not np.isfinite(view.z_next).all():
@@ -459,7 +469,8 @@ class Window(Stages):
             view.z_next[...], output, jacobian = kernel.stage(view.z, u)
             np.subtract(view.y, output, terms.noise)
             np.negative(jacobian, terms.linear[:, 1:])
-            if not np.logical_and.reduce(np.isfinite(jacobian), None):  # in one call
+            flat = jacobian.ravel()
+            if not math.isfinite(flat.dot(flat)):
                 self._differentiate(terms, (model.f_jacobian, model.h_jacobian), (view.z, u))
         if self._output_residual is not None:
             self._evaluating = "output_residual"
@@ -495,7 +506,10 @@ class Window(Stages):
         if rejections is not None:
             rejections[k + 1] = rejections[k]
             sample.rejections, sample.next_rejections = rejections[k], rejections[k + 1]
-        correction, posterior = self._correct(view.arguments[0], view.error, sample)
+        sample.root = sample.next_root = None
+        if self._roots is not None and self._vague[k]:
+            sample.root = self._roots[k]
+        correction, posterior = self._corrected(k, view)
         terms.disturbance[...] = correction
         predicted = z_next.copy() if self._nearest is not None else None
         z_next += correction
@@ -506,8 +520,7 @@ class Window(Stages):
                 z_next[...] = self._turns(z_next)
                 predicted = None if predicted is None else self._turns(predicted)
         if self._covariances is not None:
-            # What is lost to rounding would make a weight of the prior below which J is negative.
-            if posterior is None or not is_covariance(posterior):
+            if posterior is None:
                 return False
             self._covariances[k + 1] = posterior
         if not math.isfinite(z_next.dot(z_next)):
@@ -515,6 +528,41 @@ class Window(Stages):
         if predicted is not None:
             self._project(view, predicted, posterior)
         return True
+
+    def _corrected(self, k: int, view: StageView) -> tuple[Array, Array | None]:
+        """The correction and the next covariance: the first one without a correction where lost."""
+        sample, arguments = self._sample, (view.arguments[0], view.error)
+        roots, found = self._roots, 0.0
+        try:
+            correction, posterior = self._correct(*arguments, sample)
+            if self._covariances is None or posterior is None:
+                return correction, posterior
+            found = least_pivot(posterior)
+            if found < VAGUE and roots is not None and sample.next_root is None:
+                # Digits that matter may be lost: the same from a root of what has them all.
+                roots[k], self._vague[k] = cholesky(self._covariances[k]).T, True
+                sample.root = roots[k]
+                correction, posterior = self._correct(*arguments, sample)
+                found = least_pivot(posterior)
+        except Exception as raising:
+            if not self._raises_lost:
+                raise
+            self.failure = raised(self._evaluating, raising, view.z)
+            found = -1.0
+        if found < 0.0:
+            # As the prior's weight, what is no covariance would make J negative.
+            self.events |= _OBSERVER_RESET
+            posterior = self._first_covariance
+            if self._rejections is not None:
+                self._rejections[k + 1] = 0
+            if self._observer.constant_gain is None:
+                correction = np.zeros_like(view.z)
+        if roots is not None:
+            following = sample.next_root if 0.0 <= found < VAGUE else None
+            self._vague[k + 1] = following is not None
+            if following is not None:
+                roots[k + 1] = following
+        return correction, posterior
 
     def _project(self, view: StageView, predicted: Array, covariance: Array | None) -> None:
         """Settle the metric if need be, and keep z(t+1) in X."""
@@ -617,6 +665,7 @@ class Window(Stages):
         self._z[k + 1], covariance = self._last_good(k)
         if self._covariances is not None:
             self._covariances[k + 1] = covariance
+            self._vague[k + 1] = False
         if self._rejections is not None:
             self._rejections[k + 1] = self._rejections[k]
         stage = self._stage_views[k].terms

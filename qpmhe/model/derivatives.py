@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -37,10 +38,30 @@ _INWARD, _MOST_INWARD = 2.0**-10, 0.25
 # How far beside a point where it is still not finite: shares of the magnitudes, of changing sign
 # and size, since functions without a derivative at 0 have none along axes and diagonals, either.
 _ASIDE, _GOLDEN = 2.0**-24, 0.6180339887498949
-# One call, where the method takes three.
-_all = np.logical_and.reduce
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
+
+
+def _has_squares(array: Array) -> bool:
+    """Whether all numbers have finite squares: no covariance is finite without."""
+    flat = array.ravel()
+    return math.isfinite(flat.dot(flat))
+
+
+def _finite_rows(array: Array) -> NDArray[np.bool_]:
+    """Which rows (..., d, 1) have finite squares."""
+    with np.errstate(over="ignore"):
+        finite: NDArray[np.bool_] = np.isfinite(np.square(array).sum(axis=-1, keepdims=True))
+    return finite
+
+
+class Nearby:
+    """Whether rows of a Jacobian were taken nearby since ``used`` was last set to False."""
+
+    __slots__ = ("used",)
+
+    def __init__(self) -> None:
+        self.used = False
 
 
 class Jacobian:
@@ -50,7 +71,7 @@ class Jacobian:
     Jacobian is compared with differences only from then on. Rows that are not finite on a bound of
     X (a square root's at 0, for example) are taken a small step inside, and rows that are not
     finite there either (a range's at its beacon) a tiny step beside the point: one sensor without a
-    derivative does not stop the others.
+    derivative does not stop the others. A row is finite here if its square is.
 
     Attributes
     ----------
@@ -60,6 +81,9 @@ class Jacobian:
         Bounds a small step inside those of X, infinite where X has none.
     aside : (n,) array
         The step beside a point without derivative.
+    nearby : Nearby
+        Whether rows were taken inside the bounds or beside the point: one for all that evaluate
+        this Jacobian for one estimator.
     remedy : str
         Remedy for a wrong given Jacobian.
     """
@@ -83,6 +107,7 @@ class Jacobian:
         self.aside: Array = np.zeros(n)
         self._outputs: Array = np.zeros(function.shape)
         self._scales: Array | None = None
+        self.nearby = Nearby()
         self._set_scales(np.ones(n))
         self.method = "finite differences"
         self.batch: Callable[[Array, Array], Array] = self._differences
@@ -102,7 +127,7 @@ class Jacobian:
             try:
                 found: Array = self._given(x, u)
                 # Of a trace, it is no number.
-                if found.dtype != np.float64 or _all(np.isfinite(found), None):
+                if found.dtype != np.float64 or _has_squares(found):
                     return found
             except Exception:
                 found = np.full((*self.function.shape, x.size), np.nan)
@@ -147,7 +172,7 @@ class Jacobian:
         assert self._given is not None
         try:
             found: Array = self._given.batch(x, u)
-            if found.dtype != np.float64 or _all(np.isfinite(found), None):
+            if found.dtype != np.float64 or _has_squares(found):
                 return found
         except Exception:
             found = np.full((*x.shape[:-1], *self.function.shape, x.shape[-1]), np.nan)
@@ -159,11 +184,13 @@ class Jacobian:
         """Rows that are missing, from inside the bounds or, where it has none, from beside x."""
         places = [np.clip(x, *self.inner), np.clip(x + self.aside, *self.inner)]
         for place in places if np.isfinite(self.inner).any() else places[1:]:
-            finite = np.isfinite(found).all(axis=-1, keepdims=True)
+            finite = _finite_rows(found)
             if finite.all():
                 break
             with suppress(Exception):  # it raises there, too: what is missing stays so
                 found = np.where(finite, found, given(place, u))
+                filled = _finite_rows(found).all(axis=-2) & ~finite.all(axis=-2)
+                self.nearby.used |= bool(filled.any())
         if np.isnan(found).all():  # with the error of the place itself
             return np.asarray(given(x, u), np.float64)
         return found
@@ -333,7 +360,7 @@ class Jacobian:
     def copy(self, function: BatchedFunction) -> Jacobian:
         """The same Jacobian, of a copy of its function; its method can change independently."""
         other = copy(self)
-        other.function = function
+        other.function, other.nearby = function, Nearby()
         if self._given is None:
             other.use(self.method)
         else:
@@ -353,6 +380,7 @@ class Jacobian:
 
     def follow(self, other: Jacobian) -> None:
         """Compute as another Jacobian of the same function does, if it computes."""
+        self.nearby = other.nearby
         if other._given is None:
             self.use(other.method)
             self._undecided = False

@@ -19,9 +19,12 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.tracing import Traced
 from .innovation import Counts, Innovation, Mask, Prediction, Verdict
+from .roots import VAGUE, grown, least_share
 
 #: Two inversions of a covariance change its correlations by no more.
 SAME_COVARIANCE = 1e-9
+
+_or = np.logical_or.reduce
 
 
 @dataclass(slots=True)
@@ -46,6 +49,9 @@ class Sample:
     rejections, next_rejections : (s,) int array or None
         Consecutive failures of each of the `Observer.sensors` before this sample, and an array into
         which `Observer.correct` writes the counts after it.
+    root, next_root : (n, n) array or None
+        An upper triangular U with U'U the covariance, where only U has all digits that matter, and
+        where `Observer.correct` leaves the one of the next step.
     """
 
     system: System
@@ -59,6 +65,8 @@ class Sample:
     states: ConvexSet | None = None
     rejections: Counts | None = None
     next_rejections: Counts | None = None
+    root: Array | None = None
+    next_root: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +164,11 @@ class Observer(ABC):
         return False
 
     @property
+    def propagates_roots(self) -> bool:
+        """Whether `correct` continues from `Sample.root` where there is one."""
+        return False
+
+    @property
     def innovation_limit(self) -> float | None:
         """The largest fully weighted innovation of one output, in standard deviations."""
         return None
@@ -220,6 +233,7 @@ class KalmanType(Observer):
         self._prior, _ = positive_semidefinite("prior covariance", prior)
         self._disturbance, _ = positive_semidefinite("disturbance covariance", disturbance)
         self._noise = positive_definite("noise covariance", noise)
+        self._share = least_share(self._noise)
         if not isinstance(innovation, (Innovation, NoneType)):
             raise OptionError(
                 f"innovation is {shown(innovation)}; expected qpmhe.Gate(...), "
@@ -278,6 +292,23 @@ class KalmanType(Observer):
         if rejections is None:
             rejections = np.zeros(len(self._sensors), np.int64)
         return self._innovation.judge(prediction, noise, v, observed, rejections)
+
+    def _is_vague(self, spread: Array, noise: Array, sample: Sample) -> bool:
+        """Whether S hides what the noise has in it: of several outputs, the gain is then lost."""
+        if len(noise) < 2:
+            return len(noise) == 1 and VAGUE * spread.item() > noise.item()
+        share = self._share if sample.noise_weight is None else least_share(noise)
+        # In one call, where `any` takes three.
+        return bool(_or(VAGUE * spread.diagonal() > share * noise.diagonal()))
+
+    @staticmethod
+    def _used(sample: Sample, larger: Array | None) -> tuple[Array, Array | None]:
+        """The covariance, or a larger one in its place, and its root where there is one."""
+        covariance, root = sample.covariance, sample.root
+        assert covariance is not None
+        if larger is None:
+            return covariance, root
+        return larger, None if root is None else grown(root, covariance, larger)
 
     def _remember(self, verdict: Verdict, sample: Sample) -> None:
         """Write the counts behind this sample."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from .._checks import Array
-from .._linalg import solve
+from .._linalg import cholesky, solve
 from .base import KalmanType, ObserverForm, Sample
 from .innovation import UNJUDGED, Prediction, Verdict
+from .roots import grown, updated
 
 
 class ExtendedKalman(KalmanType):
@@ -23,6 +24,11 @@ class ExtendedKalman(KalmanType):
     On a linear system it is the Kalman filter. Its covariance can weight the prior, see
     `qpmhe.ObserverPrior`. It is robustly stable only where the Kalman filter of the linearisation
     is, and the estimator inherits this.
+
+    Where rounding would take digits from :math:`P^+` that matter, as after a prior that is vague
+    beside the noise, a QR factorisation gives K and a root of :math:`P^+`, and the next step
+    continues from the root. If P is lost all the same, since it is not finite or not positive
+    semidefinite, the observer only predicts, from P(0) on, with `qpmhe.Status.OBSERVER_RESET`.
 
     Parameters
     ----------
@@ -54,33 +60,49 @@ class ExtendedKalman(KalmanType):
         """The covariances, unless a derived class may compute otherwise."""
         return self._form("extended") if type(self) is ExtendedKalman else None
 
+    @property
+    def propagates_roots(self) -> bool:
+        """Unless a derived class may compute otherwise; see `Observer.propagates_roots`."""
+        return type(self) is ExtendedKalman
+
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
         a, c, covariance = _given(sample)
         c, r, v, verdict = self._seen(c, v, covariance, sample)
-        if verdict.covariance is not None:
-            covariance = verdict.covariance
+        covariance, root = self._used(sample, verdict.covariance)
         self._remember(verdict, sample)
-        cross = a @ covariance @ c.T
-        gain = solve(c @ covariance @ c.T + r, cross.T).T if v.size else cross
-        # Joseph's form: symmetric, and positive semidefinite by construction.
-        closed = a - gain @ c
-        following = closed @ covariance @ closed.T + gain @ r @ gain.T
-        following += self._disturbance_of(sample)
-        return gain @ v, 0.5 * (following + following.T)
+        if root is None:
+            cross = a @ covariance @ c.T
+            spread = c @ covariance @ c.T + r
+            if not self._is_vague(spread, r, sample):
+                gain = solve(spread, cross.T).T if v.size else cross
+                # Joseph's form: symmetric, and positive semidefinite by construction.
+                closed = a - gain @ c
+                following = closed @ covariance @ closed.T + gain @ r @ gain.T
+                following += self._disturbance_of(sample)
+                return gain @ v, 0.5 * (following + following.T)
+            root = cholesky(covariance).T
+        gain, following = updated(root @ c.T, root @ a.T, r, self._disturbance_of(sample))
+        sample.next_root = following
+        return gain @ v, following.T @ following
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """The filter's measurement update; see `Observer.filter`."""
         _, c, covariance = _given(sample)
         c, r, v, verdict = self._seen(c, v, covariance, sample)
-        if verdict.covariance is not None:
-            covariance = verdict.covariance
+        covariance, root = self._used(sample, verdict.covariance)
         if not v.size:
             return z, covariance
-        cross = covariance @ c.T
-        gain = solve(c @ cross + r, cross.T).T
-        closed = np.eye(z.size) - gain @ c
-        return z + gain @ v, closed @ covariance @ closed.T + gain @ r @ gain.T
+        if root is None:
+            cross = covariance @ c.T
+            spread = c @ cross + r
+            if not self._is_vague(spread, r, sample):
+                gain = solve(spread, cross.T).T
+                closed = np.eye(z.size) - gain @ c
+                return z + gain @ v, closed @ covariance @ closed.T + gain @ r @ gain.T
+            root = cholesky(covariance).T
+        gain, left = updated(root @ c.T, root, r)
+        return z + gain @ v, left.T @ left
 
     def _seen(
         self, c: Array, v: Array, covariance: Array, sample: Sample
@@ -91,14 +113,29 @@ class ExtendedKalman(KalmanType):
             c, r, v = c[there], r[np.ix_(there, there)], v[there]
         if self._innovation is None:
             return c, r, v, UNJUDGED
-        cross = covariance @ c.T
-        prediction = Prediction(covariance, cross, c @ cross, lambda larger: c @ larger @ c.T)
+        root = sample.root
+        if root is None:
+            cross = covariance @ c.T
+            prediction = Prediction(covariance, cross, c @ cross, lambda larger: c @ larger @ c.T)
+        else:
+            prediction = _predicted(root, c, covariance)
         verdict = self._judge(prediction, r, v, sample)
         kept = verdict.kept
         r = r if verdict.noise is None else verdict.noise
         if kept is None:
             return c, r, v, verdict
         return c[kept], r[np.ix_(kept, kept)], v[kept], verdict
+
+
+def _predicted(root: Array, c: Array, covariance: Array) -> Prediction:
+    """The prediction from a root of the covariance."""
+    seen: Array = root @ c.T
+
+    def spread_of(larger: Array) -> Array:
+        outputs: Array = grown(root, covariance, larger) @ c.T
+        return np.asarray(outputs.T @ outputs)
+
+    return Prediction(covariance, root.T @ seen, seen.T @ seen, spread_of)
 
 
 def _given(sample: Sample) -> tuple[Array, Array, Array]:

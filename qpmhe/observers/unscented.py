@@ -15,6 +15,7 @@ from ..model.residuals import difference
 from ..model.sets import ConvexSet
 from .base import KalmanType, ObserverForm, Sample
 from .innovation import UNJUDGED, Innovation, Prediction, Verdict
+from .roots import updated
 
 # A sigma point is drawn back into the state set, but not closer to z than this share.
 _CLOSEST = 1e-3
@@ -49,9 +50,13 @@ class UnscentedKalman(KalmanType):
     The correction is linear in v, so (eq:kappa) holds with the largest :math:`|K(t)|` that occurs.
     The model is evaluated at 2n + 1 states per step. If X has bounds, the two sigma points of a
     direction move towards z, with a larger weight, until they satisfy the bounds, but at most to a
-    thousandth of their distance; if z is on a bound, both lie inside it. If f or h cannot be
-    evaluated at a sigma point, the stage fails as if they could not be evaluated at z. Steps of
-    unusual length and missing outputs are supported.
+    thousandth of their distance; if z is on a bound, both lie inside it. Steps of unusual length
+    and missing outputs are supported.
+
+    Where rounding would take digits from :math:`P^+` that matter, a QR factorisation gives K and a
+    root of :math:`P^+` as for `ExtendedKalman`; the sigma points come from this root. If
+    :math:`P^+` is lost all the same, or f or h cannot be evaluated at a sigma point, the observer
+    only predicts, from P(0) on, with `qpmhe.Status.OBSERVER_RESET`.
 
     Parameters
     ----------
@@ -93,15 +98,25 @@ class UnscentedKalman(KalmanType):
             return None
         return replace(self._form("unscented"), spread=self._spread)
 
+    @property
+    def propagates_roots(self) -> bool:
+        """Unless a derived class may compute otherwise; see `Observer.propagates_roots`."""
+        return type(self) is UnscentedKalman
+
     def correct(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array]:
         """K v and the next covariance; see `Observer.correct`."""
         sigma, seen, r, v, verdict = self._seen(z, v, sample)
         self._remember(verdict, sample)
         f = sample.system.f.batch(sigma.points, sigma.inputs)
         ahead: Array = difference(sample.system.state_residual, f[1:], f[0]) * sigma.roots
-        if v.size == 0:
+        if v.size == 0 and sample.root is None:
             return np.zeros_like(z), ahead.T @ ahead + self._disturbance_of(sample)
-        gain = solve(seen.T @ seen + r, seen.T @ ahead).T
+        spread = seen.T @ seen + r
+        if sample.root is not None or self._is_vague(spread, r, sample):
+            gain, following = updated(seen, ahead, r, self._disturbance_of(sample))
+            sample.next_root = following
+            return gain @ v, following.T @ following
+        gain = solve(spread, seen.T @ ahead).T
         left = ahead - seen @ gain.T
         following = left.T @ left + gain @ r @ gain.T + self._disturbance_of(sample)
         return gain @ v, 0.5 * (following + following.T)
@@ -112,13 +127,20 @@ class UnscentedKalman(KalmanType):
         around: Array = sigma.moves * sigma.roots
         if v.size == 0:
             return z, around.T @ around
-        gain = solve(seen.T @ seen + r, seen.T @ around).T
+        spread = seen.T @ seen + r
+        if sample.root is not None or self._is_vague(spread, r, sample):
+            gain, left = updated(seen, around, r)
+            return z + gain @ v, left.T @ left
+        gain = solve(spread, seen.T @ around).T
         left = around - seen @ gain.T
         return z + gain @ v, left.T @ left + gain @ r @ gain.T
 
-    def _sigma(self, z: Array, covariance: Array, sample: Sample) -> _Sigma:
-        """The sigma points of a covariance."""
-        ahead = self._spread * cholesky(covariance).T
+    def _sigma(self, z: Array, larger: Array | None, sample: Sample) -> _Sigma:
+        """The sigma points of the sample's covariance, or of one with larger variances."""
+        covariance, root = self._used(sample, larger)
+        if root is None:
+            root = cholesky(covariance).T
+        ahead = self._spread * root
         moves, share = np.concatenate((ahead, -ahead)), np.ones(2 * z.size)
         states = sample.system.states if sample.states is None else sample.states
         if states is not None:
@@ -136,7 +158,7 @@ class UnscentedKalman(KalmanType):
         covariance, r, there = sample.covariance, self._noise_of(sample), sample.observed
         if covariance is None:
             raise ValueError("the unscented Kalman observer needs a covariance")
-        sigma = self._sigma(z, covariance, sample)
+        sigma = self._sigma(z, None, sample)
         seen = self._outputs(sigma, sample)
         if there is not None:
             r, v = r[np.ix_(there, there)], v[there]

@@ -121,7 +121,7 @@ def test_a_start_without_derivative_ends_as_one_beside_it(name, engine):
     ys, p = clean + sigma * rng.normal(size=clean.shape), clean.shape[1]
     system = qpmhe.System(f, h, n=n, p=p)
     given = {"disturbance": 0.05 * np.eye(n), "noise": sigma**2 * np.eye(p)}
-    found = []
+    found, flag = [], qpmhe.Status.DERIVATIVE_NEARBY
     for begin in (np.zeros(n), 1e-9 * np.arange(1, n + 1)):
         mhe = qpmhe.MovingHorizonEstimator(
             system, qpmhe.ExtendedKalman(prior=np.eye(n), **given),
@@ -132,7 +132,10 @@ def test_a_start_without_derivative_ends_as_one_beside_it(name, engine):
         assert mhe.engine == engine
         assert not any(qpmhe.Status.MODEL_FAILED in one for one in run.statuses)
         assert (run.costs >= 0.0).all()
+        # Only the first step asks for a derivative where there is none, and says so.
+        assert [flag in one for one in run.statuses] == [not begin.any()] + 39 * [False]
         found.append(run.filtered)
+    assert "nearby" in flag.explain()
     assert np.abs(found[0][35:] - found[1][35:]).max() < 0.1
     assert np.abs(found[0][20:, :2] - path[20:-1, :2]).max() < 0.6
 

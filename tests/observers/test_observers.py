@@ -91,7 +91,8 @@ def test_sigma_points_stay_within_the_bounds():
     for states, fails in ((qpmhe.Box([1.0], [np.inf]), False), (None, True)):
         system = qpmhe.System(f, lambda x: x, n=1, p=1, states=states)
         run = observer_alone(system, observer, [1.1]).run(Y)
-        assert (run.share(Status.MODEL_FAILED) > 0) == fails
+        assert (run.share(Status.OBSERVER_RESET) > 0) == fails
+
 # Designed gains
 
 

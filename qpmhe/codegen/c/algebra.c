@@ -57,6 +57,14 @@ void mhe_set_lapack(void *const *functions)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #endif
 
+/* Whether all are finite, of numbers whose squares may overflow. */
+static int mhe_each_finite(int n, const real *a)
+{
+    real sum = 0;
+    for (int i = 0; i < n; i++) sum += 0 * a[i];
+    return sum == 0;
+}
+
 /* out = A B for A (m, k) and B (k, n). */
 static void mhe_multiply(int m, int k, int n, const real *A, const real *B, real *out)
 {

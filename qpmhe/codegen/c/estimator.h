@@ -73,6 +73,9 @@ $limits
 #define MHE_GATED 1
 #define MHE_WEIGHTED 2
 
+/* Whether the covariance is propagated by its root where it has lost digits. */
+#define MHE_ROOTS (MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED)
+
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
     (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS) + \
@@ -157,6 +160,7 @@ typedef struct {
 #endif
     mhe_real least;           /* eigenvalue of the correlations that are inverted */
     mhe_real spread;          /* of sigma points, in standard deviations */
+    mhe_real noise_share;     /* least variance of an output's noise given the others', over its own */
     mhe_real typical[MHE_NX]; /* variances where states may be known exactly, else 0 */
 } mhe_covariances;
 #endif
@@ -276,6 +280,10 @@ typedef struct {
 #if MHE_COVARIANCE
     mhe_real covariance[MHE_NX * MHE_NX]; /* of the observer's error at z */
 #endif
+#if MHE_ROOTS
+    mhe_real root[MHE_NX * MHE_NX]; /* upper triangular U, U'U the covariance, if that is vague */
+    int32_t is_vague;
+#endif
 #if MHE_SENSORS
     int32_t rejections[MHE_SENSORS]; /* how often in a row each has failed before */
 #endif
@@ -299,6 +307,10 @@ typedef struct {
     mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
 #if MHE_COVARIANCE
     mhe_real last_good_covariance[MHE_NX * MHE_NX], covariance_end[MHE_NX * MHE_NX];
+#endif
+#if MHE_ROOTS
+    mhe_real root_end[MHE_NX * MHE_NX];
+    int32_t is_vague_end;
 #endif
 #if MHE_SENSORS
     int32_t rejections_end[MHE_SENSORS];

@@ -53,21 +53,29 @@ static void mhe_add_noise(const mhe_seen *seen, const real *gain, real *P)
     mhe_add_product(seen->count, NX, NX, gain, weighted, P);
 }
 
-/* Add Q to a covariance. */
-static void mhe_add_disturbance(const mhe_settings *s, const mhe_stage *stage, real *P)
+/* Q: the usual one, or a sample's own in `own`. */
+static const real *mhe_disturbance_of(const mhe_settings *s, const mhe_stage *stage, real *own)
 {
-    const real *Q = s->covariances.disturbance;
-    real own[NX * NX], scratch[NX * NX];
+    real scratch[NX * NX];
     if (stage->has_own_disturbance) {
-        mhe_covariance_of(NX, stage->own_disturbance_weight, Q, scratch, own);
+        mhe_covariance_of(NX, stage->own_disturbance_weight, s->covariances.disturbance, scratch,
+                          own);
 #if MHE_QUIET
         mhe_multiply(NX, NX, NX, s->candidate_keep, own, scratch);
         for (int i = 0; i < NX; i++)
             for (int j = 0; j < NX; j++)
                 own[i * NX + j] = mhe_dot(NX, scratch + i * NX, s->candidate_keep + j * NX);
 #endif
-        Q = own;
+        return own;
     }
+    return s->covariances.disturbance;
+}
+
+/* Add Q to a covariance. */
+static void mhe_add_disturbance(const mhe_settings *s, const mhe_stage *stage, real *P)
+{
+    real own[NX * NX];
+    const real *Q = mhe_disturbance_of(s, stage, own);
     for (int i = 0; i < NX * NX; i++) P[i] += Q[i];
     mhe_symmetrise(NX, P);
 }
@@ -109,16 +117,139 @@ static void mhe_rows_of(const mhe_seen *seen, const real *C, real *rows)
 }
 #endif
 
+#if MHE_ROOTS
+/* Whether S hides what the noise has in it: of several outputs, the gain is then lost. */
+static int mhe_is_hidden(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                         const real *S)
+{
+    const int q = seen->count;
+    real share = s->covariances.noise_share;
+    if (stage->has_own_noise) {
+        real scratch[NY * NY], inverse[NY * NY], most = 0;
+        memcpy(scratch, seen->noise, sizeof(real) * (size_t)(q * q));
+        if (!mhe_invert(q, scratch, inverse)) return 0;
+        for (int i = 0; i < q; i++)
+            most = mhe_max(inverse[i * q + i] * seen->noise[i * q + i], most);
+        share = 1 / most;
+    }
+    for (int i = 0; i < q; i++)
+        if (MHE_VAGUE * S[i * q + i] > share * seen->noise[i * q + i]) return 1;
+    return 0;
+}
+
+#define DEVIATIONS (MHE_OBSERVER == MHE_UNSCENTED ? 2 * NX : NX)
+#define LINES (NY + DEVIATIONS + NX)
+#define WIDE (NY + NX)
+
+/* The order of rows by their longest entry, in the lengths of the columns. */
+static void mhe_order_rows(int count, int width, const real *rows, int *order)
+{
+    real lengths[WIDE], longest[LINES];
+    for (int j = 0; j < width; j++) {
+        lengths[j] = 0;
+        for (int i = 0; i < count; i++) lengths[j] = mhe_max(fabs(rows[i * WIDE + j]), lengths[j]);
+    }
+    for (int i = 0; i < count; i++) {
+        int at = i;
+        longest[i] = 0;
+        for (int j = 0; j < width; j++)
+            if (lengths[j] > 0)
+                longest[i] = mhe_max(fabs(rows[i * WIDE + j]) / lengths[j], longest[i]);
+        for (; at > 0 && longest[order[at - 1]] < longest[i]; at--) order[at] = order[at - 1];
+        order[at] = i;
+    }
+}
+
+/* Turn rows, no fewer than columns, to an upper triangle by Householder's reflections. */
+static void mhe_triangle(int count, int width, real *rows)
+{
+    for (int j = 0; j < width; j++) {
+        real *corner = rows + j * WIDE + j, square = 0;
+        for (int i = j; i < count; i++) square += rows[i * WIDE + j] * rows[i * WIDE + j];
+        if (square == 0) continue;
+        const real length = sqrt(square), end = *corner > 0 ? -length : length;
+        const real scale = 1 / (length * (length + fabs(*corner)));
+        *corner -= end;
+        for (int c = j + 1; c < width; c++) {
+            real sum = 0;
+            for (int i = j; i < count; i++) sum += rows[i * WIDE + j] * rows[i * WIDE + c];
+            sum *= scale;
+            for (int i = j; i < count; i++) rows[i * WIDE + c] -= sum * rows[i * WIDE + j];
+        }
+        *corner = end;
+    }
+}
+
+/* The columns of the gain of least mean square error as rows, and a root of the covariance that it
+ * leaves, by one factorisation of [root of R, 0; deviations of outputs and of states; 0, root of Q];
+ * no Q in a measurement update. */
+static void mhe_update_root(const mhe_seen *seen, const real *outputs, const real *states,
+                            const real *Q, real *gain, real *root)
+{
+    const int q = seen->count, width = q + NX, count = q + DEVIATIONS + (Q ? NX : 0);
+    real given[LINES * WIDE] = {0}, rows[LINES * WIDE], factor[NX * NX], noise[NY * NY];
+    int order[LINES];
+    mhe_root(q, seen->noise, noise);
+    for (int i = 0; i < q; i++)
+        memcpy(given + i * WIDE, noise + i * q, sizeof(real) * (size_t)q);
+    for (int i = 0; i < DEVIATIONS; i++) {
+        real *to = given + (q + i) * WIDE;
+        memcpy(to, outputs + i * q, sizeof(real) * (size_t)q);
+        memcpy(to + q, states + i * NX, sizeof(real) * NX);
+    }
+    if (Q) {
+        mhe_root(NX, Q, factor);
+        for (int i = 0; i < NX; i++)
+            memcpy(given + (q + DEVIATIONS + i) * WIDE + q, factor + i * NX, sizeof(real) * NX);
+    }
+    mhe_order_rows(count, width, given, order);
+    for (int i = 0; i < count; i++)
+        memcpy(rows + i * WIDE, given + order[i] * WIDE, sizeof(real) * (size_t)width);
+    mhe_triangle(count, width, rows);
+    for (int i = q - 1; i >= 0; i--)
+        for (int j = 0; j < NX; j++) {
+            real sum = rows[i * WIDE + q + j];
+            for (int l = i + 1; l < q; l++) sum -= rows[i * WIDE + l] * gain[l * NX + j];
+            gain[i * NX + j] = sum / rows[i * WIDE + i];
+        }
+    for (int i = 0; i < NX; i++) {
+        const real *row = rows + (q + i) * WIDE + q, sign = row[i] < 0 ? -1 : 1;
+        for (int j = 0; j < NX; j++) root[i * NX + j] = j < i ? 0 : sign * row[j];
+    }
+}
+
+/* The covariance of a root. */
+static void mhe_square(const real *root, real *P)
+{
+    for (int i = 0; i < NX * NX; i++) P[i] = 0;
+    mhe_add_product(NX, NX, NX, root, root, P);
+}
+#endif
+
 #if MHE_OBSERVER == MHE_EXTENDED
+/* Deviations along a root, as rows: of the outputs with these rows of C, and of the states ahead;
+ * of the states themselves where there is no A. */
+static void mhe_deviations(const real *root, const mhe_seen *seen, const real *A, const real *C,
+                           real *outputs, real *states)
+{
+    mhe_multiply_transposed(NX, NX, seen->count, root, C, outputs);
+    if (A)
+        mhe_multiply_transposed(NX, NX, NX, root, A, states);
+    else
+        memcpy(states, root, sizeof(real) * NX * NX);
+}
+
 /* The columns of K = A P C' (C P C' + R)^-1 as rows, or of the measurement update's P C' (...)^-1
- * where there is no A; NaN where there is no gain. C: rows of the outputs that are there. */
-static void mhe_kalman_gain(const real *P, const mhe_seen *seen, const real *A, const real *C,
-                            real *gain)
+ * where there is no A; NaN where there is no gain. C: rows of the outputs that are there. Whether S
+ * has the digits for it. */
+static int mhe_kalman_gain(const mhe_settings *s, const mhe_stage *stage, const real *P,
+                           const mhe_seen *seen, const real *A, const real *C, real *gain)
 {
     real cross[NY * NX] = {0}, innovation[NY * NY] = {0}; /* compilers cannot tell */
     mhe_multiply(seen->count, NX, NX, C, P, cross);
     mhe_multiply_transposed(seen->count, NX, seen->count, cross, C, innovation);
     for (int i = 0; i < seen->count * seen->count; i++) innovation[i] += seen->noise[i];
+    if (mhe_is_hidden(s, stage, seen, innovation)) return 0;
     if (A)
         mhe_multiply_transposed(seen->count, NX, NX, cross, A, gain);
     else
@@ -127,6 +258,7 @@ static void mhe_kalman_gain(const real *P, const mhe_seen *seen, const real *A, 
         mhe_solve_for(seen->count, innovation, NX, gain);
     else
         for (int i = 0; i < seen->count * NX; i++) gain[i] = NAN;
+    return 1;
 }
 #endif
 
@@ -174,10 +306,13 @@ static real mhe_draw_inside(const mhe_x_set *set, const real *z, real *one, real
 #endif
 
 static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, const real *P,
-                             mhe_sigma *sigma)
+                             const real *root, mhe_sigma *sigma)
 {
     real *moves = sigma->moves;
-    mhe_root(NX, P, moves);
+    if (root)
+        memcpy(moves, root, sizeof(real) * NX * NX);
+    else
+        mhe_root(NX, P, moves);
     for (int i = 0; i < NX * NX; i++) {
         moves[i] *= s->covariances.spread;
         moves[NX * NX + i] = -moves[i];
@@ -211,12 +346,15 @@ static void mhe_sigma_outputs(const mhe_settings *s, const mhe_stage *stage,
 }
 
 /* The columns of the gain of least mean square error as rows, from deviations of the outputs and of
- * what is estimated; what it leaves of the latter takes their place. */
-static void mhe_sigma_gain(const mhe_seen *seen, const real *rows, real *ahead, real *gain)
+ * what is estimated; what it leaves of the latter takes their place. Whether S has the digits for it:
+ * else nothing has changed. */
+static int mhe_sigma_gain(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                          const real *rows, real *ahead, real *gain)
 {
     real innovation[NY * NY];
     memcpy(innovation, seen->noise, sizeof(real) * (size_t)(seen->count * seen->count));
     mhe_add_product(POINTS, seen->count, seen->count, rows, rows, innovation);
+    if (stage->is_vague || mhe_is_hidden(s, stage, seen, innovation)) return 0;
     for (int i = 0; i < seen->count * NX; i++) gain[i] = 0;
     mhe_add_product(POINTS, seen->count, NX, rows, ahead, gain);
     if (mhe_decompose(seen->count, innovation))
@@ -227,24 +365,35 @@ static void mhe_sigma_gain(const mhe_seen *seen, const real *rows, real *ahead, 
         for (int i = 0; i < seen->count; i++)
             for (int j = 0; j < NX; j++)
                 ahead[k * NX + j] -= rows[k * seen->count + i] * gain[i * NX + j];
+    return 1;
 }
 #endif
 
 #if MHE_INNOVATION
-/* P C' as rows of C P, and C P C', of the outputs that are there. */
+/* P C' as rows of C P, and C P C', of the outputs that are there; from a root of P if there is one. */
 static void mhe_predict_outputs(const mhe_settings *s, const mhe_stage *stage,
-                                const mhe_seen *seen, const real *P, real *cross, real *spread)
+                                const mhe_seen *seen, const real *P, const real *root,
+                                real *cross, real *spread)
 {
 #if MHE_OBSERVER == MHE_EXTENDED
     real rows[NY * NX];
     mhe_rows_of(seen, stage->terms.h_jacobian, rows);
+    if (root) {
+        real outputs[NX * NY];
+        mhe_multiply_transposed(NX, NX, seen->count, root, rows, outputs);
+        for (int i = 0; i < seen->count * NX; i++) cross[i] = 0;
+        for (int i = 0; i < seen->count * seen->count; i++) spread[i] = 0;
+        mhe_add_product(NX, seen->count, NX, outputs, root, cross);
+        mhe_add_product(NX, seen->count, seen->count, outputs, outputs, spread);
+        return;
+    }
     mhe_multiply(seen->count, NX, NX, rows, P, cross);
     mhe_multiply_transposed(seen->count, NX, seen->count, cross, rows, spread);
     (void)s;
 #else
     mhe_sigma sigma;
     real rows[POINTS * NY];
-    mhe_sigma_points(s, stage, P, &sigma);
+    mhe_sigma_points(s, stage, P, root, &sigma);
     mhe_sigma_outputs(s, stage, seen, &sigma, rows);
     for (int i = 0; i < POINTS * NX; i++) sigma.moves[i] *= sigma.roots[i / NX % NX];
     for (int i = 0; i < seen->count * NX; i++) cross[i] = 0;
@@ -310,29 +459,34 @@ static void mhe_find_shares(const mhe_seen *seen, int count, const int *at, cons
     for (int j = 0; j < NX; j++) shares[j] = most > 0 ? shares[j] / most : 0;
 }
 
-/* out = P whose variances have grown by these factors. */
-static void mhe_grow(const real *P, const real *growth, real *out)
+/* out = P whose variances have grown by these factors, and its root if there is one. */
+static void mhe_grow(const real *P, const real *root, const real *growth, real *out,
+                     real *out_root)
 {
     real scale[NX];
     for (int j = 0; j < NX; j++) scale[j] = sqrt(growth[j]);
     for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) out[i * NX + j] = scale[i] * P[i * NX + j] * scale[j];
+        for (int j = 0; j < NX; j++) {
+            out[i * NX + j] = scale[i] * P[i * NX + j] * scale[j];
+            if (root) out_root[i * NX + j] = root[i * NX + j] * scale[j];
+        }
 }
 
 /* C P C' with a P that has grown by a factor. */
 static void mhe_spread_grown(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
-                             const real *P, const real *shares, real factor, real *spread)
+                             const real *P, const real *root, const real *shares, real factor,
+                             real *spread)
 {
-    real growth[NX], larger[NX * NX], cross[NY * NX];
+    real growth[NX], larger[NX * NX], larger_root[NX * NX], cross[NY * NX];
     for (int j = 0; j < NX; j++) growth[j] = 1 + (factor - 1) * shares[j];
-    mhe_grow(P, growth, larger);
-    mhe_predict_outputs(s, stage, seen, larger, cross, spread);
+    mhe_grow(P, root, growth, larger, larger_root);
+    mhe_predict_outputs(s, stage, seen, larger, root ? larger_root : 0, cross, spread);
 }
 
 /* Let P grow so that a sensor passes; whether it does, given others. */
 static int mhe_explain(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
-                       mhe_sensors *sensors, const real *P, const real *cross, const real *spread,
-                       int known_count, int k)
+                       mhe_sensors *sensors, const real *P, const real *root, const real *cross,
+                       const real *spread, int known_count, int k)
 {
     const int size = sensors->size[k], *part = sensors->at[k];
     real shares[NX], larger[NY * NY], factor = 1;
@@ -340,7 +494,7 @@ static int mhe_explain(const mhe_settings *s, const mhe_stage *stage, const mhe_
     mhe_find_shares(seen, size, part, P, cross, spread, shares);
     for (int i = 0; !alone && i < MHE_MOST_GROWTH; i++) {
         factor *= MHE_GROWTH;
-        mhe_spread_grown(s, stage, seen, P, shares, factor, larger);
+        mhe_spread_grown(s, stage, seen, P, root, shares, factor, larger);
         alone = 1;
         for (int l = 0; l < size; l++) {
             const int at = part[l] * seen->count + part[l];
@@ -350,7 +504,7 @@ static int mhe_explain(const mhe_settings *s, const mhe_stage *stage, const mhe_
     }
     if (!alone) return 0;
     factor *= MHE_GROWTH;
-    mhe_spread_grown(s, stage, seen, P, shares, factor, larger);
+    mhe_spread_grown(s, stage, seen, P, root, shares, factor, larger);
     if (!(mhe_distance(seen, larger, known_count, sensors->known, size, part) <=
           s->innovation.limits[size - 1]))
         return 0;
@@ -363,8 +517,8 @@ static int mhe_explain(const mhe_settings *s, const mhe_stage *stage, const mhe_
 /* Test each sensor against the innovation's covariance spread + R, and find those that are due and
  * how P would have to grow; how many. */
 static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
-                    const real *P, const real *cross, const real *spread, mhe_sensors *sensors,
-                    int32_t *next)
+                    const real *P, const real *root, const real *cross, const real *spread,
+                    mhe_sensors *sensors, int32_t *next)
 {
     const int32_t reopen = s->innovation.reopen;
     int late = 0, doubted = 0, due = 0;
@@ -391,7 +545,7 @@ static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_see
     for (int k = 0; k < MHE_SENSORS; k++) {
         const int32_t before = stage->rejections[k];
         if (sensors->passes[k] || before < reopen) continue;
-        sensors->due[k] = mhe_explain(s, stage, seen, sensors, P, cross, spread,
+        sensors->due[k] = mhe_explain(s, stage, seen, sensors, P, root, cross, spread,
                                       before / MHE_LONGEST >= reopen ? 0 : known, k);
         due += sensors->due[k];
     }
@@ -401,20 +555,21 @@ static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_see
 /* Let the outputs count as the rule for innovations says, and P grow where it must; the sensors'
  * counts behind this sample. */
 static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen,
-                              real *P, int32_t *next)
+                              real *P, real *root, int32_t *next)
 {
     real cross[NY * NX], spread[NY * NY];
     mhe_sensors sensors;
-    mhe_predict_outputs(s, stage, seen, P, cross, spread);
-    const int due = mhe_test(s, stage, seen, P, cross, spread, &sensors, next);
+    mhe_predict_outputs(s, stage, seen, P, root, cross, spread);
+    const int due = mhe_test(s, stage, seen, P, root, cross, spread, &sensors, next);
+    if (due) {
+        real larger[NX * NX], larger_root[NX * NX];
+        mhe_grow(P, root, sensors.growth, larger, larger_root);
+        memcpy(P, larger, sizeof larger);
+        if (root) memcpy(root, larger_root, sizeof larger_root);
+    }
 #if MHE_INNOVATION == MHE_GATED
     const int count = seen->count;
     real noise[NY * NY];
-    if (due) {
-        real larger[NX * NX];
-        mhe_grow(P, sensors.growth, larger);
-        memcpy(P, larger, sizeof larger);
-    }
     memcpy(noise, seen->noise, sizeof(real) * (size_t)(count * count));
     int kept = 0, from[NY];
     for (int i = 0; i < count; i++) {
@@ -429,12 +584,7 @@ static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe
         for (int j = 0; j < kept; j++) seen->noise[i * kept + j] = noise[from[i] * count + from[j]];
     }
 #else
-    if (due) {
-        real larger[NX * NX];
-        mhe_grow(P, sensors.growth, larger);
-        memcpy(P, larger, sizeof larger);
-        mhe_predict_outputs(s, stage, seen, P, cross, spread);
-    }
+    if (due) mhe_predict_outputs(s, stage, seen, P, root, cross, spread);
     for (int i = 0; i < seen->count; i++) {
         real *own = seen->noise + i * seen->count + i;
         const real variance = spread[i * seen->count + i] + *own;
@@ -446,16 +596,18 @@ static void mhe_judge_outputs(const mhe_settings *s, const mhe_stage *stage, mhe
 }
 #endif
 
-/* What corrects, by the rule for innovations if there is one; P is the stage's, or larger. */
-#if MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED
+/* What corrects, by the rule for innovations if there is one; P is the stage's, or larger, and its
+ * root belongs to it where the stage is vague. */
+#if MHE_ROOTS
 static void mhe_see_judged(const mhe_settings *s, const mhe_stage *stage, mhe_seen *seen, real *P,
-                           int32_t *next)
+                           real *root, int32_t *next)
 {
     mhe_see(s, stage, seen);
     memcpy(P, stage->covariance, sizeof stage->covariance);
+    if (stage->is_vague) memcpy(root, stage->root, sizeof stage->root);
 #if MHE_INNOVATION
     int32_t unused[MHE_SENSORS];
-    mhe_judge_outputs(s, stage, seen, P, next ? next : unused);
+    mhe_judge_outputs(s, stage, seen, P, stage->is_vague ? root : 0, next ? next : unused);
 #else
     (void)next;
 #endif
@@ -463,27 +615,36 @@ static void mhe_see_judged(const mhe_settings *s, const mhe_stage *stage, mhe_se
 #endif
 
 /* L(z, v) of a stage, from its residual v, the covariance of the next step, and how often in a row
- * each sensor has failed then. */
-static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *out,
-                           real *following, int32_t *next)
+ * each sensor has failed then. Whether there is a root of the covariance, in `next_root`. */
+static int mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *out,
+                          real *following, real *next_root, int32_t *next)
 {
 #if MHE_OBSERVER == MHE_EXTENDED
     const mhe_terms *t = &stage->terms;
     mhe_seen seen;
-    real gain[NY * NX], rows[NY * NX], P[NX * NX];
-    mhe_see_judged(s, stage, &seen, P, next);
+    real gain[NY * NX], rows[NY * NX], P[NX * NX], root[NX * NX];
+    mhe_see_judged(s, stage, &seen, P, root, next);
     mhe_rows_of(&seen, t->h_jacobian, rows);
-    mhe_kalman_gain(P, &seen, t->f_jacobian, rows, gain);
+    if (!stage->is_vague && mhe_kalman_gain(s, stage, P, &seen, t->f_jacobian, rows, gain)) {
+        mhe_gained(&seen, gain, out);
+        mhe_propagate(P, &seen, t->f_jacobian, rows, gain, following);
+        mhe_add_disturbance(s, stage, following);
+        return 0;
+    }
+    real outputs[NX * NY], states[NX * NX], own[NX * NX];
+    if (!stage->is_vague) mhe_root(NX, P, root);
+    mhe_deviations(root, &seen, t->f_jacobian, rows, outputs, states);
+    mhe_update_root(&seen, outputs, states, mhe_disturbance_of(s, stage, own), gain, next_root);
     mhe_gained(&seen, gain, out);
-    mhe_propagate(P, &seen, t->f_jacobian, rows, gain, following);
-    mhe_add_disturbance(s, stage, following);
+    mhe_square(next_root, following);
+    return 1;
 #elif MHE_OBSERVER == MHE_UNSCENTED
     mhe_seen seen;
     mhe_sigma sigma;
     real gain[NY * NX], ahead[POINTS * NX], rows[POINTS * NY];
-    real at[NX], middle[NX], state[NX], P[NX * NX];
-    mhe_see_judged(s, stage, &seen, P, next);
-    mhe_sigma_points(s, stage, P, &sigma);
+    real at[NX], middle[NX], state[NX], P[NX * NX], root[NX * NX];
+    mhe_see_judged(s, stage, &seen, P, root, next);
+    mhe_sigma_points(s, stage, P, stage->is_vague ? root : 0, &sigma);
     mhe_f(stage->z, stage->u, stage->step, middle);
     for (int k = 0; k < POINTS; k++) {
         real *change = ahead + k * NX;
@@ -494,18 +655,26 @@ static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *
         for (int j = 0; j < NX; j++) change[j] *= sigma.roots[k % NX];
     }
     mhe_sigma_outputs(s, stage, &seen, &sigma, rows);
-    mhe_sigma_gain(&seen, rows, ahead, gain);
+    if (!mhe_sigma_gain(s, stage, &seen, rows, ahead, gain)) {
+        real own[NX * NX];
+        mhe_update_root(&seen, rows, ahead, mhe_disturbance_of(s, stage, own), gain, next_root);
+        mhe_gained(&seen, gain, out);
+        mhe_square(next_root, following);
+        return 1;
+    }
     mhe_gained(&seen, gain, out);
     for (int i = 0; i < NX * NX; i++) following[i] = 0;
     mhe_add_product(POINTS, NX, NX, ahead, ahead, following);
     mhe_add_noise(&seen, gain, following);
     mhe_add_disturbance(s, stage, following);
+    return 0;
 #elif MHE_OBSERVER == MHE_FUNCTION
     mhe_call_correction(stage->z, stage->v, out);
-    (void)s; (void)following; (void)next;
+    (void)s; (void)following; (void)next_root; (void)next;
+    return 0;
 #else
     for (int j = 0; j < NX; j++) out[j] = mhe_dot(NY, s->gain + j * NY, stage->v);
-    (void)next;
+    (void)next_root; (void)next;
 #if MHE_COVARIANCE
     mhe_seen seen;
     real gain[NY * NX], rows[NY * NX];
@@ -518,29 +687,39 @@ static void mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *
 #else
     (void)following;
 #endif
+    return 0;
 #endif
 }
 
 /* The observer's estimate of x(t) that has used y(t), and its covariance if asked for. */
 static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out, real *covariance)
 {
-#if MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED
+#if MHE_ROOTS
     mhe_seen seen;
-    real gain[NY * NX], P[NX * NX];
-    mhe_see_judged(s, stage, &seen, P, 0);
+    real gain[NY * NX], P[NX * NX], root[NX * NX], left[NX * NX];
+    mhe_see_judged(s, stage, &seen, P, root, 0);
 #if MHE_OBSERVER == MHE_EXTENDED
     real rows[NY * NX];
     mhe_rows_of(&seen, stage->terms.h_jacobian, rows);
-    mhe_kalman_gain(P, &seen, 0, rows, gain);
-    if (covariance) mhe_propagate(P, &seen, 0, rows, gain, covariance);
+    if (!stage->is_vague && mhe_kalman_gain(s, stage, P, &seen, 0, rows, gain)) {
+        if (covariance) mhe_propagate(P, &seen, 0, rows, gain, covariance);
+    } else {
+        real outputs[NX * NY], states[NX * NX];
+        if (!stage->is_vague) mhe_root(NX, P, root);
+        mhe_deviations(root, &seen, 0, rows, outputs, states);
+        mhe_update_root(&seen, outputs, states, 0, gain, left);
+        if (covariance) mhe_square(left, covariance);
+    }
 #else
     mhe_sigma sigma;
     real rows[POINTS * NY];
-    mhe_sigma_points(s, stage, P, &sigma);
+    mhe_sigma_points(s, stage, P, stage->is_vague ? root : 0, &sigma);
     mhe_sigma_outputs(s, stage, &seen, &sigma, rows);
     for (int i = 0; i < POINTS * NX; i++) sigma.moves[i] *= sigma.roots[i / NX % NX];
-    mhe_sigma_gain(&seen, rows, sigma.moves, gain);
-    if (covariance) {
+    if (!mhe_sigma_gain(s, stage, &seen, rows, sigma.moves, gain)) {
+        mhe_update_root(&seen, rows, sigma.moves, 0, gain, left);
+        if (covariance) mhe_square(left, covariance);
+    } else if (covariance) {
         for (int i = 0; i < NX * NX; i++) covariance[i] = 0;
         mhe_add_product(POINTS, NX, NX, sigma.moves, sigma.moves, covariance);
         mhe_add_noise(&seen, gain, covariance);

@@ -88,7 +88,7 @@ static void mhe_take(mhe_workspace *k, mhe_outcome *o)
 
 /* Terms and limits of the QP around a trial, where the candidate's terms are known; whether the
  * model has finite Jacobians there. */
-static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o,
+static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
                          const mhe_trial *around)
 {
     for (int i = 0; i < e->length; i++) {
@@ -97,7 +97,7 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *
         real next[NX], output[NY];
         k->at[i] = around == o->candidate ? &stage->terms : t;
         if (around == o->candidate) continue;
-        mhe_linear(e->settings, around->x + i * NX, stage, next, output, t);
+        o->events |= mhe_linear(e->settings, around->x + i * NX, stage, next, output, t);
         if (!mhe_all_finite(NX * NX, t->f_jacobian) || !mhe_all_finite(NY * NX, t->h_jacobian))
             return 0;
         mhe_set_terms(e->settings, k, stage, around->w + i * NX, around->v + i * NY, t);

@@ -86,7 +86,7 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
         int at = e->newest - (e->length - 1);
         if (at < 0) at += MHE_HORIZON + 1;
         memcpy(mhe_stage_at(e, 0)->z, e->history + at * NX, sizeof(real) * NX);
-        events = mhe_replay(e, 0);
+        events = (events & MHE_DERIVATIVE_NEARBY) | mhe_replay(e, 0);
     }
     mhe_estimate_now(e, k, o, events, before);
     mhe_remember(e, o->best->x + e->length * NX);
@@ -318,7 +318,18 @@ void mhe_recompute(mhe_estimator *e, real *reached, real *covariances)
         real *following = mhe_next_covariance(e, i), kept_covariance[NX * NX];
         memcpy(kept_covariance, following, sizeof kept_covariance);
 #endif
+#if MHE_ROOTS
+        mhe_stage *behind = i + 1 < e->length ? mhe_stage_at(e, i + 1) : 0;
+        real *root = behind ? behind->root : e->root_end, kept_root[NX * NX];
+        int32_t *is_vague = behind ? &behind->is_vague : &e->is_vague_end;
+        const int32_t was_vague = *is_vague;
+        memcpy(kept_root, root, sizeof kept_root);
+#endif
         mhe_enter(e, i, 0);
+#if MHE_ROOTS
+        memcpy(root, kept_root, sizeof kept_root);
+        *is_vague = was_vague;
+#endif
         memcpy(reached + i * NX, next, sizeof kept);
         memcpy(next, kept, sizeof kept);
 #if MHE_COVARIANCE

@@ -47,25 +47,28 @@ static int mhe_rejection(const mhe_settings *s, const mhe_stage *stage, const in
 }
 #endif
 
-/* Take the rows that are not finite from another Jacobian. */
-static void mhe_fill_rows(int count, real *jacobian, const real *other)
+/* Take the rows that are not finite from another Jacobian; whether it is finite then. */
+static int mhe_fill_rows(int count, real *jacobian, const real *other)
 {
     for (int r = 0; r < count; r++)
         if (!mhe_all_finite(NX, jacobian + r * NX))
             memcpy(jacobian + r * NX, other + r * NX, sizeof(real) * NX);
+    return mhe_all_finite(count * NX, jacobian);
 }
 
 /* f and h at a state, and their Jacobians: rows that are not finite from a small step inside the
- * bounds of X, and rows that are not finite there from a tiny step aside. */
-static void mhe_linear(const mhe_settings *s, const real *x, const mhe_stage *stage, real *next,
+ * bounds of X, and rows that are not finite there from a tiny step aside; a bit of the status where
+ * that helps. */
+static int mhe_linear(const mhe_settings *s, const real *x, const mhe_stage *stage, real *next,
                        real *output, mhe_terms *t)
 {
     mhe_f_jacobian(x, stage->u, stage->step, next, t->f_jacobian);
     mhe_h_jacobian(x, stage->u, output, t->h_jacobian);
+    int helped = 0;
     for (int aside = !MHE_X_SET; aside < 2; aside++) {
         const int f = mhe_all_finite(NX * NX, t->f_jacobian);
         const int h = mhe_all_finite(NY * NX, t->h_jacobian);
-        if (f && h) return;
+        if (f && h) break;
         real at[NX], unused[NX + NY], f_there[NX * NX], h_there[NY * NX];
         for (int j = 0; j < NX; j++) {
             const real moved = aside ? x[j] + s->aside[j] : x[j];
@@ -74,25 +77,27 @@ static void mhe_linear(const mhe_settings *s, const real *x, const mhe_stage *st
         }
         if (!f) {
             mhe_f_jacobian(at, stage->u, stage->step, unused, f_there);
-            mhe_fill_rows(NX, t->f_jacobian, f_there);
+            helped |= mhe_fill_rows(NX, t->f_jacobian, f_there);
         }
         if (!h) {
             mhe_h_jacobian(at, stage->u, unused, h_there);
-            mhe_fill_rows(NY, t->h_jacobian, h_there);
+            helped |= mhe_fill_rows(NY, t->h_jacobian, h_there);
         }
     }
+    return helped ? MHE_DERIVATIVE_NEARBY : 0;
 }
 
 #if MHE_COVARIANCE
-/* Whether a matrix is finite and, up to rounding of its correlations, positive semidefinite. */
-static int mhe_is_covariance(const real *P)
+/* The least variance of a component given those before it, as a share of its variance; negative for
+ * what is no covariance: not finite or, beyond rounding, not positive semidefinite. */
+static real mhe_least_pivot(const real *P)
 {
     const real least = sizeof(real) == 8 ? (real)1e-9 : (real)1e-4;
-    real deviation[NX], root[NX * NX];
-    if (!mhe_all_finite(NX * NX, P)) return 0;
+    real deviation[NX], root[NX * NX], found = INFINITY;
+    if (!mhe_each_finite(NX * NX, P)) return -1;
     for (int j = 0; j < NX; j++) {
         const real variance = P[j * NX + j];
-        if (!(variance >= 0)) return 0;
+        if (!(variance >= 0)) return -1;
         deviation[j] = variance > 0 ? sqrt(variance) : 1;
     }
     for (int j = 0; j < NX; j++)
@@ -100,28 +105,72 @@ static int mhe_is_covariance(const real *P)
             real sum = i == j ? 1 + least : P[j * NX + i] / deviation[i] / deviation[j];
             for (int k = 0; k < j; k++) sum -= root[k * NX + j] * root[k * NX + i];
             if (i == j) {
-                if (!(sum > 0)) return 0;
+                if (!(sum > 0)) return -1;
+                if (sum < found) found = sum;
                 root[j * NX + j] = sqrt(sum);
             } else
                 root[j * NX + i] = sum / root[j * NX + j];
         }
-    return 1;
+    return found;
 }
 #endif
 
-/* Evaluate the stage at its z and step the observer to `next`, its covariance to `following` and its
- * sensors' counts to `rejections`, in X or, if there is one, `onto`; the cost, or infinity. `events`
- * gets bits of the status. */
-static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *next,
-                        real *following, int32_t *rejections, const mhe_x_set *onto, int *events)
+/* L(z, v) of a stage, and the observer's covariance behind it with its root and its sensors' counts. A
+ * covariance that has lost digits is computed again by roots. Where it is lost all the same, the first one
+ * takes its place, without a correction by it; a bit of the status says so. */
+static int mhe_correct_observer(mhe_estimator *e, int i, real *out)
 {
     const mhe_settings *s = e->settings;
+    mhe_stage *stage = mhe_stage_at(e, i);
+    real *following = mhe_next_covariance(e, i);
+    int32_t *rejections = mhe_next_rejections(e, i);
+#if MHE_ROOTS
+    const int last = i + 1 == e->length;
+    mhe_stage *behind = last ? 0 : mhe_stage_at(e, i + 1);
+    real *next_root = last ? e->root_end : behind->root;
+    int has_root = mhe_correction(s, stage, out, following, next_root, rejections);
+    real found = mhe_least_pivot(following);
+    if (found < MHE_VAGUE && !has_root) {
+        mhe_root(NX, stage->covariance, stage->root);
+        stage->is_vague = 1;
+        has_root = mhe_correction(s, stage, out, following, next_root, rejections);
+        found = mhe_least_pivot(following);
+    }
+    *(last ? &e->is_vague_end : &behind->is_vague) = has_root && found >= 0 && found < MHE_VAGUE;
+#else
+    mhe_correction(s, stage, out, following, 0, rejections);
+#endif
+#if MHE_COVARIANCE
+#if !MHE_ROOTS
+    const real found = mhe_least_pivot(following);
+#endif
+    if (!(found < 0)) return 0;
+    memcpy(following, s->covariances.initial, sizeof s->covariances.initial);
+#if MHE_SENSORS
+    memset(rejections, 0, sizeof stage->rejections);
+#endif
+#if MHE_OBSERVER != MHE_GAIN
+    for (int j = 0; j < NX; j++) out[j] = 0;
+#endif
+    return MHE_OBSERVER_RESET;
+#else
+    return 0;
+#endif
+}
+
+/* Evaluate stage i at its z and step the observer to `next`, with all that goes with it, in X or, if
+ * there is one, `onto`; the cost, or infinity. `events` gets bits of the status. */
+static real mhe_advance(mhe_estimator *e, int i, int linear, real *next, const mhe_x_set *onto,
+                        int *events)
+{
+    const mhe_settings *s = e->settings;
+    mhe_stage *stage = mhe_stage_at(e, i);
     real *v = stage->v, *w = stage->w, predicted[NX], output[NY];
 #if MHE_X_SET
     if (s->project && !e->metric_settled) linear = 1;
 #endif
     if (linear) {
-        mhe_linear(s, stage->z, stage, predicted, output, &stage->terms);
+        *events |= mhe_linear(s, stage->z, stage, predicted, output, &stage->terms);
     } else {
         mhe_f(stage->z, stage->u, stage->step, predicted);
         mhe_h(stage->z, stage->u, output);
@@ -130,19 +179,17 @@ static real mhe_advance(mhe_estimator *e, mhe_stage *stage, int linear, real *ne
     mhe_wrap_output(s, stage->y, v);
     for (int j = 0; j < NY; j++)
         if (!stage->is_observed[j]) v[j] = 0;
-    mhe_correction(s, stage, w, following, rejections);
+    *events |= mhe_correct_observer(e, i, w);
     for (int j = 0; j < NX; j++) next[j] = predicted[j] + w[j];
     mhe_wrap_state(s, next, w);
     mhe_enter_turn(s, next);
     mhe_enter_turn(s, predicted);
     if (!mhe_all_finite(NX, next)) return INFINITY;
-#if MHE_COVARIANCE
-    if (!mhe_is_covariance(following)) return INFINITY;
-#endif
 #if MHE_X_SET
-    if (s->project) *events = mhe_stay_inside(e, stage, onto, predicted, next, following);
+    if (s->project) *events |= mhe_stay_inside(e, stage, onto, predicted, next,
+                                               mhe_next_covariance(e, i));
 #else
-    (void)events; (void)onto;
+    (void)onto;
 #endif
     const real cost = mhe_stage_cost(s, 0, stage, w, v);
     return isfinite(cost) ? cost : INFINITY;
@@ -160,9 +207,11 @@ static int mhe_enter(mhe_estimator *e, int i, const mhe_x_set *onto)
     real *next = mhe_next_state(e, i), *following = mhe_next_covariance(e, i);
     int32_t *rejections = mhe_next_rejections(e, i);
     int events = 0;
-    stage->cost = mhe_advance(e, stage, derived, next, following, rejections, onto, &events);
+    (void)following; (void)rejections; /* an observer may have neither */
+    stage->cost = mhe_advance(e, i, derived, next, onto, &events);
     const int held = !isfinite(stage->cost);
     if (held) {
+        events &= ~MHE_OBSERVER_RESET;
         /* z(i) is where the model does not work: go on where it last did. */
         int good = i - 1;
         while (good >= 0 && !isfinite(mhe_stage_at(e, good)->cost)) good--;
@@ -171,6 +220,9 @@ static int mhe_enter(mhe_estimator *e, int i, const mhe_x_set *onto)
 #if MHE_COVARIANCE
         memcpy(following, good >= 0 ? mhe_stage_at(e, good)->covariance : e->last_good_covariance,
                sizeof e->last_good_covariance);
+#endif
+#if MHE_ROOTS
+        *(i + 1 < e->length ? &mhe_stage_at(e, i + 1)->is_vague : &e->is_vague_end) = 0;
 #endif
 #if MHE_SENSORS
         memcpy(rejections, stage->rejections, sizeof stage->rejections);
@@ -193,12 +245,13 @@ static int mhe_enter(mhe_estimator *e, int i, const mhe_x_set *onto)
     return held || !finite ? events | MHE_MODEL_FAILED : events;
 }
 
-/* Redo all stages from i on. */
+/* Redo all stages from i on; bits of the status: of the last one, and whether a derivative of any was
+ * taken nearby. */
 static int mhe_replay(mhe_estimator *e, int i)
 {
-    int outcome = 0;
-    for (; i < e->length; i++) outcome = mhe_enter(e, i, 0);
-    return outcome;
+    int events = 0;
+    for (; i < e->length; i++) events = (events & MHE_DERIVATIVE_NEARBY) | mhe_enter(e, i, 0);
+    return events;
 }
 
 #if MHE_X_SET
@@ -218,7 +271,8 @@ static int mhe_move_state(mhe_estimator *e, const mhe_sample *sample)
         return 0;
     }
     const int events = mhe_enter(e, e->length - 1, &set);
-    return events & (MHE_OBSERVER_PROJECTED | MHE_PREDICTION_OUTSIDE | MHE_METRIC_SINGULAR);
+    return events & (MHE_OBSERVER_PROJECTED | MHE_PREDICTION_OUTSIDE | MHE_METRIC_SINGULAR |
+                     MHE_DERIVATIVE_NEARBY);
 }
 #endif
 
@@ -246,6 +300,10 @@ static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
     memcpy(stage->z, e->z_end, sizeof stage->z);
 #if MHE_COVARIANCE
     memcpy(stage->covariance, e->covariance_end, sizeof stage->covariance);
+#endif
+#if MHE_ROOTS
+    if (e->is_vague_end) memcpy(stage->root, e->root_end, sizeof stage->root);
+    stage->is_vague = e->is_vague_end;
 #endif
 #if MHE_SENSORS
     memcpy(stage->rejections, e->rejections_end, sizeof stage->rejections);
