@@ -29,12 +29,10 @@ from .costs import (
     RobustCost,
 )
 from .errors import ModelWarning, ObserverWarning, PriorWarning, QpmheError
-from .estimation.active_rows import ActiveRow
 from .estimation.engines import Engine, register_engine
 from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
-from .estimation.sensitivity import Gradient, Sensitivity
 from .estimation.settings import Settings
 from .model.constraints import Constraint
 from .model.noisy_inputs import noisy_inputs
@@ -55,6 +53,7 @@ from .observers import (
     UnscentedKalman,
     design_luenberger,
 )
+from .sensitivity import ActiveRow, Gradient, Sensitivity
 
 if TYPE_CHECKING:
     from . import certificates, diagnosis, plots, records, studies, tuning
@@ -73,6 +72,7 @@ def _compiled_engine(
 
 
 register_engine("compiled", _compiled_engine)
+MovingHorizonEstimator.differentiate = Sensitivity
 
 
 def _page(run: Run) -> str:

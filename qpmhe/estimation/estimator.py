@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from time import perf_counter
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,11 +35,13 @@ from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .problem import Solved
 from .run import Run, RunSource
-from .sensitivity import Sensitivity
 from .settings import Settings
 from .snapshot import read, written
 from .step_length import step_error, warn_of_step
 from .time_index import paired_record
+
+if TYPE_CHECKING:
+    from ..sensitivity import Sensitivity
 
 Array = NDArray[np.float64]
 
@@ -152,6 +154,9 @@ class MovingHorizonEstimator:
     >>> estimate.improved
     True
     """
+
+    #: Differentiates a solved problem; `qpmhe.sensitivity`, which stands on this room, has it.
+    differentiate: ClassVar[type[Sensitivity]]
 
     def __init__(
         self,
@@ -674,7 +679,7 @@ class MovingHorizonEstimator:
         if second is None or second.system is not system or second.traced != system.is_traced:
             self._second = second = SecondDerivatives(system)
         with np.errstate(all="ignore"):
-            return Sensitivity(
+            return self.differentiate(
                 solved, second, self.settings.tolerance, len(self.settings.parameters)
             )
 

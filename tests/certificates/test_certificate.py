@@ -193,7 +193,7 @@ def test_a_prior_by_the_observer_has_the_constants_of_its_bounds(certificate, ka
     )
     for y in 4.0 + np.random.default_rng(0).standard_normal(30):
         mhe.update([y])
-        values = np.linalg.eigvalsh(mhe._engine.solved().problem.prior_weight)
+        values = np.linalg.eigvalsh(mhe._engine.solved().problem.prior.weight)
         assert low <= values[0] <= values[-1] <= high
     own = replace(
         found.of(), cost=CostConstants(

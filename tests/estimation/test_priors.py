@@ -148,7 +148,7 @@ def test_both_engines_snapshots_batches_and_derivatives_have_the_bounds():
         text = r"cost\.prior\.kappa"
         with pytest.raises(InvalidInputError, match=text):
             estimator(engine=mhe.engine).load_state_dict(mhe.state_dict())
-    weight = python._engine.solved().problem.prior_weight
+    weight = python._engine.solved().problem.prior.weight
     for mhe in (python, compiled):
         # What the window knows of its first state is this weight and its measurements.
         known = np.linalg.inv(mhe.covariances()[0]) - weight

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import qpmhe
-from qpmhe.estimation.sensitivity import NAMES
+from qpmhe.sensitivity.sensitivity import NAMES
 from tests.estimation.untraced import untraced
 
 from .derivatives import (

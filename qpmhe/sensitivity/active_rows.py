@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidInputError
+from ..estimation.problem import Formulation, Problem
 from ..model.constraints import ConstraintFunctions
 from ..terms.base import Trial
 from ..terms.rows import Rows
 from .optimality import OptimalityMatrix
-from .problem import Formulation, Problem
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

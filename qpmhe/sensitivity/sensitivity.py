@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import numbers
 from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimation.limits import FEASIBLE, STALLED
+from ..estimation.problem import Problem, Solved
 from ..model.second_derivatives import Curvature, SecondDerivatives
 from ..terms.base import Derivatives
 from .active_rows import HeldRows
-from .limits import FEASIBLE, STALLED
 from .optimality import OptimalityMatrix
-from .problem import Problem, Solved
 
 Array = NDArray[np.float64]
 
