@@ -75,12 +75,9 @@ class Interval:
         """Where both ends are finite."""
         return np.isfinite(self.low) & np.isfinite(self.high)
 
-    def hull(self, other: Interval, where: Any = True) -> Interval:
-        """The smallest interval that holds both; the first alone elsewhere."""
-        return Interval(
-            np.where(where, np.minimum(self.low, other.low), self.low),
-            np.where(where, np.maximum(self.high, other.high), self.high),
-        )
+    def hull(self, other: Interval) -> Interval:
+        """The smallest interval that holds both."""
+        return Interval(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def where(self, holds: Any) -> Interval:
         """The same, and NaN where this does not hold."""

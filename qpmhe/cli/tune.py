@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -15,6 +15,10 @@ from ..errors import OptionError
 from ..models.loading import ModelSource, find
 from . import options
 from .values import arguments_of, named_as_options, read_state, with_arguments
+
+if TYPE_CHECKING:
+    from ..records.record_model import RecordModel
+    from ..tuning import Tuning, TuningRecord
 
 
 @options.reads_record()
@@ -66,9 +70,7 @@ def tune(
 ) -> None:
     """Choose the weights of an estimator from records; if stopped, the same command resumes."""
     from ..plots import save
-    from ..records.arrays import read_record
     from ..records.record_model import load_record_model
-    from ..tuning import TuningRecord
     from ..tuning import tune as run
     from ..tuning.weights import covariances_of
 
@@ -86,12 +88,7 @@ def tune(
         with_arguments(source.name, started),
         **{name: value for name, value in given.items() if value is not None},
     )
-    mhe = loaded.estimator
-    read = [read_record(path, loaded, **reading, report=_note) for path in record]
-    records = [
-        TuningRecord(each.measurements, each.inputs, each.states, each.lengths, name=path)
-        for path, each in zip(record, read, strict=True)
-    ]
+    mhe, records = loaded.estimator, _records(record, loaded, reading)
     try:
         with named_as_options(
             "held_out", "initial_state", "structure", "objective", "threshold", "horizon",
@@ -111,20 +108,35 @@ def tune(
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted; the same command resumes.", highlight=False)
         raise
+    _print(tuning, wanted)
+    tuning.save(out)
+    if picture is not None:
+        save(tuning.plot()[0].figure, picture)
+    Console().print(
+        f"{sum(tuning.seconds.values()):.1f} s; wrote {escape(str(out))}. Use it: qpmhe estimate "
+        f"{escape(model)} RECORD --weights {escape(str(out))}", highlight=False, soft_wrap=True,
+    )
+
+
+def _records(paths: list[str], model: RecordModel, reading: dict[str, Any]) -> list[TuningRecord]:
+    from ..records.arrays import read_record
+    from ..tuning import TuningRecord
+
+    found = []
+    for path in paths:
+        y, u, lengths, _, states = read_record(path, model, **reading, report=_note)
+        found.append(TuningRecord(y, u, states, lengths, name=path))
+    return found
+
+
+def _print(tuning: Tuning, horizons: list[int]) -> None:
     console = Console()
     console.print(str(tuning), highlight=False, markup=False, soft_wrap=True)
-    for row in tuning.horizons(wanted) if wanted else ():
+    for row in tuning.horizons(horizons) if horizons else ():
         console.print(
             f"N = {row.horizon:<4d} prior by the {row.arrival + ':':<10s} score {row.score:.4g}, "
             f"{1e6 * row.seconds:.0f} us a sample", highlight=False,
         )
-    tuning.save(out)
-    if picture is not None:
-        save(tuning.plot()[0].figure, picture)
-    console.print(
-        f"{sum(tuning.seconds.values()):.1f} s; wrote {escape(str(out))}. Use it: qpmhe estimate "
-        f"{escape(model)} RECORD --weights {escape(str(out))}", highlight=False, soft_wrap=True,
-    )
 
 
 def _note(text: str) -> None:

@@ -34,6 +34,7 @@ _MOST = 8
 LEAST_GAIN, _GAIN_EACH, _MOST_EACH = 12.0, 0.035, 3.0
 # A further fault must gain this share of what the first did: what that has left may be its shadow.
 _BESIDE = 0.05
+_MOST_FAULTS = 3
 # Factors of covariances are searched together until the logarithms' steps are this small, in so
 # many runs at most. Where this factor more costs less than that in log likelihood, a factor has no
 # upper end.
@@ -181,7 +182,7 @@ class Fault:
 
 
 def search(
-    bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array] = (), most: int = 3
+    bank: FilterBank, base: Hypothesis, null: Filtered, starts: Sequence[Array]
 ) -> tuple[list[Fault], Hypothesis]:
     """Faults, the one that explains most first, each given those before it.
 
@@ -189,7 +190,7 @@ def search(
     those of the estimator are useless, as with wrong units.
     """
     found: list[Fault] = []
-    for _ in range(most):
+    for _ in range(_MOST_FAULTS):
         best = _best(bank, base, null, starts)
         if best is None or (found and best.gain < _BESIDE * found[0].gain):
             break

@@ -203,12 +203,7 @@ def estimate_record(
             loaded.estimator.system, usual=loaded.dt if dt is None else dt, scale=time_scale,
             equal=equal_steps, max_gap=MAX_GAP if max_gap is None else max_gap,
         )
-        bounds, asked = None, {}
-        if bound:
-            from .bounds import BoundOptions, RowBounds
-
-            given = BoundOptions() if bound is True else bound
-            bounds, asked = RowBounds(loaded, given, report), {"bound": given.identity()}
+        bounds, asked = _bounds(bound, loaded, report)
         rows = RowFormat(loaded.states, covariances, step_time, bounds)
         reader = RecordReader(
             str(record), ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs),
@@ -227,6 +222,18 @@ def estimate_record(
             seconds=checkpoint_seconds, report=report, progress=progress, keep=keep_run,
         )
         return session.run(found)
+
+
+def _bounds(
+    bound: BoundOptions | bool, model: RecordModel, report: Callable[[str], None] | None
+) -> tuple[RowBounds | None, dict[str, Any]]:
+    """The bounds of each row, if they are wanted, and what a checkpoint must say of them."""
+    if not bound:
+        return None, {}
+    from .bounds import BoundOptions, RowBounds
+
+    given = BoundOptions() if bound is True else bound
+    return RowBounds(model, given, report), {"bound": given.identity()}
 
 
 def _check_files(record: str, output: Output) -> None:

@@ -25,7 +25,7 @@ from ..models import Record
 from . import metrics
 from .environment import environment
 from .experiment import Source, experiment
-from .row import Cell, Row
+from .row import Cell, StudyRow
 
 #: Engine of all cells: only the Python step calls the backends that a study compares.
 ENGINE = "python"
@@ -65,7 +65,7 @@ class OutOfTimeError(Exception):
     """The cell's time is up."""
 
 
-def compute(task: Task) -> Row:
+def compute(task: Task) -> StudyRow:
     """Run a cell; an exception in it becomes a row."""
     began = perf_counter()
     with _ended_after(task.hard_limit):
@@ -79,9 +79,9 @@ def compute(task: Task) -> Row:
             return failure(task, f"{type(error).__name__}: {error}")
 
 
-def failure(task: Task, reason: str) -> Row:
+def failure(task: Task, reason: str) -> StudyRow:
     """The row of a cell that failed."""
-    return Row(**_fields(task), outcome="failed", reason=" ".join(reason.split())[:500])
+    return StudyRow(**_fields(task), outcome="failed", reason=" ".join(reason.split())[:500])
 
 
 @contextmanager
@@ -102,7 +102,7 @@ def _fields(task: Task) -> dict[str, Any]:
     }
 
 
-def _measured(task: Task, limit: float) -> Row:
+def _measured(task: Task, limit: float) -> StudyRow:
     cell, found = task.cell, experiment(task.source)
     if task.registered is not None:
         _register(task.registered)
@@ -140,7 +140,7 @@ def _measured(task: Task, limit: float) -> Row:
             _keep_failing(task, task.failing, record, limit)
         except (InvalidInputError, OutOfTimeError) as error:
             measured["reason"] = f"not all failing QPs were kept: {error}"
-    return Row(**_fields(task), **measured, outcome="done")
+    return StudyRow(**_fields(task), **measured, outcome="done")
 
 
 def _keep_failing(task: Task, folder: Path, record: Record, limit: float) -> None:

@@ -92,7 +92,7 @@ def _metric(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row(Cell):
+class StudyRow(Cell):
     """A cell, how it ended, and what was measured in it; NaN or None where it was not.
 
     Attributes
@@ -174,12 +174,14 @@ class Row(Cell):
 #: What distinguishes configurations.
 CONFIGURATION = tuple(one.name for one in fields(Cell) if one.name != "seed")
 #: What is averaged over seeds.
-METRICS = {one.name: one.metadata["column"] for one in fields(Row) if "column" in one.metadata}
+METRICS = {
+    one.name: one.metadata["column"] for one in fields(StudyRow) if "column" in one.metadata
+}
 
 
 def _shown() -> dict[str, Column]:
     found = {"failures": Column("failed runs", "count", rank=6)}
-    for one in fields(Row):
+    for one in fields(StudyRow):
         if "column" in one.metadata:
             found[one.name] = one.metadata["column"]
             if one.metadata["half"] is not None:

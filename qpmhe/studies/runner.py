@@ -24,7 +24,7 @@ from ..errors import OptionError
 from .cell import ENGINE, OBSERVER, Task, compute, failure
 from .environment import environment, revision
 from .grid import Study, StudyError
-from .row import Row
+from .row import StudyRow
 from .store import Store
 
 if TYPE_CHECKING:
@@ -132,10 +132,10 @@ class _Processes:
         self.jobs = jobs
         self._executor: Any = None
 
-    def submit(self, task: Task) -> Future[Row]:
+    def submit(self, task: Task) -> Future[StudyRow]:
         if self._executor is None:
             self._executor = self._make()
-        future: Future[Row] = self._executor.submit(compute, task)
+        future: Future[StudyRow] = self._executor.submit(compute, task)
         return future
 
     def ready(self) -> bool:
@@ -183,8 +183,8 @@ class _Cluster:
             "tcp://10.0.0.1:8786."
         )
 
-    def submit(self, task: Task) -> Future[Row]:
-        future: Future[Row] = self._executor.submit(compute, task)
+    def submit(self, task: Task) -> Future[StudyRow]:
+        future: Future[StudyRow] = self._executor.submit(compute, task)
         return future
 
     def ready(self) -> bool:
@@ -226,11 +226,11 @@ def _identity(distributed: Any, address: str, seconds: float) -> dict[str, Any]:
     return answer if isinstance(answer, dict) else {}
 
 
-def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[Row]:
+def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[StudyRow]:
     """The row of each task, in the order in which they end."""
     waiting, suspects = deque(tasks), deque[Task]()
-    sent: dict[Future[Row], Task] = {}
-    began: dict[Future[Row], float] = {}
+    sent: dict[Future[StudyRow], Task] = {}
+    began: dict[Future[StudyRow], float] = {}
     broken = False
     while waiting or sent or suspects:
         # No worker waits for us; but after a death nothing new starts until its cause is found.
@@ -247,7 +247,7 @@ def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[
         for future in ended:
             task, start = sent.pop(future), began.pop(future, None)
             answer = _answer(workers, task, future, start)
-            if isinstance(answer, Row):
+            if isinstance(answer, StudyRow):
                 yield answer
             elif start is None:
                 waiting.appendleft(task)
@@ -268,8 +268,8 @@ def _results(workers: _Processes | _Cluster, tasks: Iterable[Task]) -> Iterator[
 
 
 def _answer(
-    workers: _Processes | _Cluster, task: Task, future: Future[Row], start: float | None
-) -> Row | Exception:
+    workers: _Processes | _Cluster, task: Task, future: Future[StudyRow], start: float | None
+) -> StudyRow | Exception:
     """The row of a task that ended, or the error where the process died that may have run it."""
     try:
         return future.result()
@@ -285,7 +285,7 @@ def _answer(
         return error
 
 
-def _again(workers: _Processes | _Cluster, task: Task) -> Row:
+def _again(workers: _Processes | _Cluster, task: Task) -> StudyRow:
     """Run a cell alone at which a process may have died, at last with its solver isolated."""
     words = ""
     for isolated in (False, True) if task.cell.backend != OBSERVER else (False,):
@@ -297,7 +297,7 @@ def _again(workers: _Processes | _Cluster, task: Task) -> Row:
             future.cancel()
             return failure(task, _HUNG)
         answer = _answer(workers, task, future, start)
-        if isinstance(answer, Row):
+        if isinstance(answer, StudyRow):
             if isolated and answer.outcome == "done":
                 return replace(answer, reason=(
                     "the backend ran in a separate process, since the cell's process died "

@@ -18,7 +18,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import checked_path, need
 from ..errors import InvalidInputError, QpmheError
-from .row import Row
+from .row import StudyRow
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -34,7 +34,7 @@ _SQL = {"int": "INTEGER", "int | None": "INTEGER", "bool": "INTEGER", "float": "
         "Array | None": "BLOB"}
 _PANDAS = {"int": "int64", "int | None": "Int64", "bool": "bool", "float": "float64"}
 _STORED = {
-    one.name: str(one.type) for one in fields(Row) if one.metadata.get("stored", True)
+    one.name: str(one.type) for one in fields(StudyRow) if one.metadata.get("stored", True)
 } | {"environment": "int"}  # its number
 #: Type in SQLite of each column, in the order of the data frame; lists and dicts are JSON texts.
 COLUMNS = {
@@ -94,10 +94,10 @@ class Store:
     def frame(self) -> DataFrame:
         """All cells as a pandas.DataFrame, one row each, in the order of their keys' first storing.
 
-        Its columns are ``key`` and the attributes of `qpmhe.studies.row.Row`, without those that
-        are not stored; ``environment`` is the index into ``meta()["environments"]``, and ``late``
-        follows from the times and the last study's deadline. NA in ``qps`` is a sequence to
-        convergence, in ``solver_iterations`` no cap.
+        Its columns are ``key`` and the stored attributes of `qpmhe.studies.row.StudyRow`;
+        ``environment`` is the index into ``meta()["environments"]``, and ``late`` follows from the
+        times and the last study's deadline. NA in ``qps`` is a sequence to convergence, in
+        ``solver_iterations`` no cap.
         """
         pandas = need("pandas", "a data frame of results")
         with _reading(self.path) as connection:
@@ -218,7 +218,7 @@ class Writer:
             rows = self._connection.execute(f"SELECT key, parts FROM cells {where}").fetchall()
             return {key: frozenset(parts.split(",")) for key, parts in rows}
 
-    def put(self, result: Row) -> None:
+    def put(self, result: StudyRow) -> None:
         """Store what `qpmhe.studies.cell.compute` gives, in place of an earlier result."""
         connection = self._connection
         row: dict[str, Any] = {name: getattr(result, name) for name in COLUMNS}

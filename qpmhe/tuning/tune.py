@@ -12,7 +12,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from qpmhe_solvers.values import shown
 
@@ -21,7 +21,7 @@ from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
 from ..model.system import System
 from ..observers import ExtendedKalman, Observer
 from .answer import Tuning
-from .data import check_enough, checked_data, constant_inputs, hold_out
+from .data import Data, check_enough, checked_data, constant_inputs, hold_out
 from .likelihood import Likelihood
 from .score import Score
 from .search import Checkpoint, identity_of, polish, refine, search_all
@@ -163,12 +163,7 @@ def tune(
     kept_in = None if checkpoint is None else checked_path("checkpoint", checkpoint)
     started = _mapping("parameters", parameters, "{'mass': 0.5}")
     make, remade, first = _maker(system, started)
-    inputs = first.m if remade else first.m - len(started)
-    if inputs < 0:
-        raise InvalidInputError(
-            f"parameters names {len(started)}, and the system has {first.m} inputs, the last of "
-            "which are the parameters; give a function make(**parameters) as system instead."
-        )
+    inputs = _measured_inputs(first, remade, started)
     start = checked_start(
         {"prior": first.n, "disturbance": first.r, "noise": first.p}, prior, disturbance, noise,
         discount, threshold, started, horizon=horizon, arrival=arrival,
@@ -180,23 +175,10 @@ def tune(
     plan = Structure(start, structure, labels)
     noises = [j for j, one in enumerate(labels["noise"]) if f"noise {one}" in plan.names]
     check_enough(data, plan.names, noises)
-    constant = constant_inputs(data, bool(started))
-    has_truth = all(one.truth is not None for one in data)
-    if objective == "truth" and not has_truth:
-        raise InvalidInputError(
-            "objective is 'truth', and not all records have true states; give (Y, U, X)."
-        )
-    if objective == "auto":
-        objective = "truth" if has_truth else "prediction"
+    constant, objective = constant_inputs(data, bool(started)), _aim(objective, data)
     options = {"max_qps": 2, **options}
     likelihood = Likelihood(plan, data, make, remade, judged)
-    at_start = likelihood.value(plan.start)
-    if not np.isfinite(at_start):
-        raise ModelError(
-            "the likelihood is not finite at the start: "
-            f"{likelihood.failure or 'the filter diverges'}. Start from larger covariances, "
-            "another initial_state or other parameters, or bound the states by System(states=...)."
-        )
+    at_start = _likelihood_at_start(likelihood)
     score = Score(
         data, make, observer, start, ahead=ahead, truth=objective == "truth",
         begins=any(name.startswith("prior ") for name in plan.names), options=options,
@@ -208,10 +190,7 @@ def tune(
     kept = Checkpoint(kept_in, identity_of(
         likelihood, at_start, (objective, ahead, seed, starts, sorted(options.items(), key=str))
     ))
-    spread = _SPREAD * np.random.default_rng(seed).standard_normal(
-        (starts - 1, len(plan.start))
-    )
-    beginnings = [plan.start, *map(plan.bounded, plan.start + spread)]
+    beginnings = _beginnings(plan, starts, seed)
     with _interruptible(), _shown(progress) as advance:
         found = search_all(likelihood, beginnings, kept, jobs, advance)
         found, hessian = polish(likelihood, found)
@@ -249,6 +228,46 @@ def _maker(
             f"the function given as system returned {shown(made)}; expected a qpmhe.System."
         )
     return lambda at: system(**at), bool(parameters), made
+
+
+def _measured_inputs(first: System, remade: bool, parameters: dict[str, float]) -> int:
+    """How many inputs records have: the parameters to be tuned may be the last ones."""
+    inputs = first.m if remade else first.m - len(parameters)
+    if inputs < 0:
+        raise InvalidInputError(
+            f"parameters names {len(parameters)}, and the system has {first.m} inputs, the last of "
+            "which are the parameters; give a function make(**parameters) as system instead."
+        )
+    return inputs
+
+
+def _aim(objective: str, data: Sequence[Data]) -> str:
+    """What the second search lowers; "auto" depends on what the records have."""
+    has_truth = all(one.truth is not None for one in data)
+    if objective == "truth" and not has_truth:
+        raise InvalidInputError(
+            "objective is 'truth', and not all records have true states; give (Y, U, X)."
+        )
+    if objective != "auto":
+        return objective
+    return "truth" if has_truth else "prediction"
+
+
+def _likelihood_at_start(likelihood: Likelihood) -> float:
+    value = likelihood.value(likelihood.structure.start)
+    if not np.isfinite(value):
+        raise ModelError(
+            "the likelihood is not finite at the start: "
+            f"{likelihood.failure or 'the filter diverges'}. Start from larger covariances, "
+            "another initial_state or other parameters, or bound the states by System(states=...)."
+        )
+    return value
+
+
+def _beginnings(plan: Structure, starts: int, seed: int) -> list[NDArray[np.float64]]:
+    """Where the searches begin: the start, and points around it."""
+    spread = _SPREAD * np.random.default_rng(seed).standard_normal((starts - 1, len(plan.start)))
+    return [plan.start, *map(plan.bounded, plan.start + spread)]
 
 
 def _made_observer(kind: Any, start: Weights) -> Observer:

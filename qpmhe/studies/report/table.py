@@ -24,8 +24,8 @@ _WHY = {
 
 
 @dataclass(frozen=True)
-class Cell:
-    """What a cell shows, and by what its column is sorted; texts stand at the left."""
+class Entry:
+    """What an entry shows, and by what its column is sorted; texts stand at the left."""
 
     text: str
     rank: str = ""
@@ -33,14 +33,14 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Table:
+class PageTable:
     """Headings, whether their columns are texts, and rows with the key of their case."""
 
     headings: list[tuple[str, bool]]
-    rows: list[tuple[str, list[Cell]]]
+    rows: list[tuple[str, list[Entry]]]
 
 
-def table(cases: list[Case]) -> Table:
+def table(cases: list[Case]) -> PageTable:
     """The configurations of all cases, the fastest first."""
     import pandas as pd
 
@@ -51,40 +51,40 @@ def table(cases: list[Case]) -> Table:
     for name, one in sorted(SHOWN.items(), key=lambda item: item[1].rank):
         if summary[name].notna().any():
             columns[one.title] = [_number(value, one) for value in summary[name]]
-    columns["RMSE by state"] = [Cell(_numbers(one), left=True) for one in summary["rmse_states"]]
-    columns["why a sequence ended"] = [Cell(_why(one), left=True) for one in summary["reasons"]]
-    return Table(
+    columns["RMSE by state"] = [Entry(_numbers(one), left=True) for one in summary["rmse_states"]]
+    columns["why a sequence ended"] = [Entry(_why(one), left=True) for one in summary["reasons"]]
+    return PageTable(
         [(heading, cells[0].left) for heading, cells in columns.items()],
         [*zip(summary["case"], map(list, zip(*columns.values(), strict=True)), strict=True)],
     )
 
 
-def _named(summary: DataFrame) -> dict[str, list[Cell]]:
+def _named(summary: DataFrame) -> dict[str, list[Entry]]:
     """The columns that name a configuration, without those in which all agree."""
-    columns = {"backend": [Cell(str(one), left=True) for one in summary["backend"]]}
+    columns = {"backend": [Entry(str(one), left=True) for one in summary["backend"]]}
     horizons = ["usual" if missing(one) else str(int(one)) for one in summary["horizon"]]
     for heading, words in (
         ("model", summary["model"].astype(str)), ("N", horizons),
         ("start", summary["start"].astype(str)),
     ):
         if len(set(words)) > 1:
-            columns[heading] = [Cell(one, left=heading != "N") for one in words]
+            columns[heading] = [Entry(one, left=heading != "N") for one in words]
     for heading, words in (
         ("QPs", [qps_words(one) for one in summary["qps"]]),
         ("cap", [cap_words(one) for one in summary["solver_iterations"]]),
     ):
         places = {word: str(place) for place, word in enumerate(ranked(words))}
-        columns[heading] = [Cell(one, places[one]) for one in words]
-    columns["front"] = [Cell("front" if one else "", left=True) for one in summary["pareto"]]
+        columns[heading] = [Entry(one, places[one]) for one in words]
+    columns["front"] = [Entry("front" if one else "", left=True) for one in summary["pareto"]]
     return columns
 
 
-def _number(value: Any, column: Column) -> Cell:
+def _number(value: Any, column: Column) -> Entry:
     """A count, or a number with three digits in the column's unit; unknown ones are last."""
     if missing(value):
-        return Cell(number(value), "Infinity")
+        return Entry(number(value), "Infinity")
     words = str(int(value)) if column.kind == "count" else number(column.scale * value)
-    return Cell(words, repr(float(value)))
+    return Entry(words, repr(float(value)))
 
 
 def _numbers(values: Any) -> str:
