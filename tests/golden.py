@@ -25,6 +25,7 @@ import time
 import warnings
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Flag
 from fnmatch import fnmatch
@@ -251,9 +252,12 @@ class Server:
 
     def ask(self, name, *given):
         """The answer to a request; raises what it raised."""
-        pickle.dump((name, given), self._process.stdin)
-        self._process.stdin.flush()
-        answer, error = pickle.load(self._process.stdout)
+        try:
+            pickle.dump((name, given), self._process.stdin)
+            self._process.stdin.flush()
+            answer, error = pickle.load(self._process.stdout)
+        except (EOFError, BrokenPipeError):
+            answer, error = None, f"its process ended ({self._process.wait()})"
         if error:
             raise RuntimeError(error)
         return answer
@@ -262,7 +266,8 @@ class Server:
         return self
 
     def __exit__(self, *_):
-        self._process.stdin.close()
+        with suppress(BrokenPipeError):
+            self._process.stdin.close()
         self._process.wait()
         self._process.stdout.close()
 

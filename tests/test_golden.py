@@ -80,6 +80,14 @@ def test_a_field_of_one_tree_is_named_and_an_error_of_one_counts():
     assert total.bad_flips == 1
 
 
+def test_a_process_that_ends_is_an_error():
+    with Server(HERE) as tree:
+        tree._process.kill()
+        for _ in range(2):
+            with pytest.raises(RuntimeError, match="its process ended"):
+                tree.ask("names")
+
+
 @pytest.mark.parametrize("mode", ["free", "resync"])
 def test_a_change_planted_in_a_tree_is_seen(tmp_path, mode):
     """The smallest change of J, in a copy of the package."""

@@ -46,7 +46,7 @@ class Scales:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class ConicSolution:
     """What a program returned."""
 
     status: str  # ``solved``, ``infeasible``, or what stopped the solver
@@ -72,7 +72,7 @@ def expected_seconds(n: int, p: int, kind: Kind) -> float:
     return _SECONDS * (size * (size + 1) / 2) ** 3
 
 
-class Program:
+class SemidefiniteProgram:
     r"""Minimise the limit of an error over the unknowns of a `Form`, at some Jacobians.
 
     .. math::
@@ -146,7 +146,7 @@ class Program:
         self._forms = (True, False) if observes else (not triangle,)
         self._problem = lru_cache(None)(problem)
 
-    def solve(self, rate: float, margin: float, seconds: float = math.inf) -> Answer:
+    def solve(self, rate: float, margin: float, seconds: float = math.inf) -> ConicSolution:
         """Solve for a rate; the measure is the length of the error's components in the limit."""
         for squares in self._forms:
             answer = self._answer(squares, rate, margin, seconds)
@@ -158,16 +158,16 @@ class Program:
         square = max(float(self._problem(squares).value), 0.0) * growth
         return replace(answer, objective=math.sqrt(square))
 
-    def of_gain(self, gain: Array) -> Program:
+    def of_gain(self, gain: Array) -> SemidefiniteProgram:
         """The program for an observer with this gain."""
-        return Program("observer", *self._all, self._G, gain)
+        return SemidefiniteProgram("observer", *self._all, self._G, gain)
 
     def _definite(self, rows: list[list[Any]]) -> Any:
         """The constraint that blocks form a matrix that is positive semidefinite."""
         matrix = self._cp.bmat(rows)
         return 0.5 * (matrix + matrix.T) >> 0
 
-    def _answer(self, squares: bool, rate: float, margin: float, seconds: float) -> Answer:
+    def _answer(self, squares: bool, rate: float, margin: float, seconds: float) -> ConicSolution:
         """Solve one of the problems, and fill its form in; without its measure."""
         problem = self._problem(squares)
         self._margin.value, self._rest.value = margin, max(rate * rate - margin, 0.0)
@@ -177,22 +177,22 @@ class Program:
                 warnings.simplefilter("ignore")
                 problem.solve(solver="CLARABEL", **limit)
         except Exception as error:  # a solver may raise anything
-            return Answer(f"the solver raised {type(error).__name__}")
+            return ConicSolution(f"the solver raised {type(error).__name__}")
         status = str(problem.status)
         if status in ("infeasible", "infeasible_inaccurate"):
-            return Answer("infeasible")
+            return ConicSolution("infeasible")
         if any(each.value is None or not np.isfinite(each.value).all()
                for each in problem.variables()):
-            return Answer(status)
+            return ConicSolution(status)
         try:
             form = self._form(rate, squares)
         except np.linalg.LinAlgError:
-            return Answer(status)
+            return ConicSolution(status)
         if status == "optimal":
-            return Answer("solved", form=form)
+            return ConicSolution("solved", form=form)
         # A solver that stopped early may have returned anything.
         usable = form.holds_always() and definite(form.matrices(self._jacobians)).all()
-        return Answer(status, form=form if usable else None)
+        return ConicSolution(status, form=form if usable else None)
 
     def _form(self, rate: float, squares: bool) -> Form:
         """The unknowns in the units of the system."""

@@ -18,7 +18,7 @@ from .enclosures import SmoothModel, evaluated
 from .evidence import CertificateError, Evidence, NotCertifiedError, OutOfTimeError
 from .inequalities import Form, Matrices, definite
 from .regions import Region
-from .sdp import Answer, Kind, NoiseSizes, Program, Scales, expected_seconds
+from .sdp import ConicSolution, Kind, NoiseSizes, Scales, SemidefiniteProgram, expected_seconds
 from .theorem import checked_rate
 
 _PAIRS, _SEED = 2000, 20210829
@@ -62,7 +62,8 @@ class Search:
 
     ``kind=None`` takes the form of detectability that the output allows. The sizes are those of
     disturbance and noise; for detectability, of disturbance and output. With ``growth``, as of
-    `Program`, detectability has the sum of squares, and disturbances act through their matrix.
+    `SemidefiniteProgram`, detectability has the sum of squares, and disturbances act through their
+    matrix.
 
     A state that the region fixes, such as a known parameter, has no error. Jacobians, scales, gain
     and forms are of the states in ``free`` only, and of the disturbances in ``acting`` that move
@@ -107,8 +108,8 @@ class Search:
         self.scales = Scales(
             states / states.max(), np.where(outputs > 0.0, outputs / states.max(), 1.0)
         )
-        self._program: Program | None = None
-        self._answers: list[Answer] = []
+        self._program: SemidefiniteProgram | None = None
+        self._answers: list[ConicSolution] = []
         self.notes: tuple[str, ...] = ()
         self.room = self._angles()
 
@@ -171,10 +172,10 @@ class Search:
             self._matrix, self._sizes = np.eye(self.n), (0.0, v)
 
     @property
-    def program(self) -> Program:
+    def program(self) -> SemidefiniteProgram:
         """The program at the states chosen so far."""
         if self._program is None:
-            self._program = Program(
+            self._program = SemidefiniteProgram(
                 self.kind, self.jacobians[self._chosen], self.scales, self._sizes, self._matrix,
                 self.gain, self._growth, self._triangle,
             )
@@ -236,10 +237,10 @@ class Search:
         chosen = Matrices.exact(self.jacobians[self._chosen])
         return wider.holds_always() and bool(definite(wider.matrices(chosen)).all())
 
-    def _solved(self, rate: float, margin: float, deadline: Deadline) -> Answer:
+    def _solved(self, rate: float, margin: float, deadline: Deadline) -> ConicSolution:
         """What the program returns; an error if there is no time for it, or not enough."""
         expected, left = self.program.expected_seconds, deadline.left
-        answer, begun = Answer("user_limit"), left > 0.0 and expected <= _MISJUDGED * left
+        answer, begun = ConicSolution("user_limit"), left > 0.0 and expected <= _MISJUDGED * left
         if begun:
             answer = self.program.solve(rate, margin, left)
         if answer.status == "user_limit" and (deadline.passed or not begun):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,18 +59,6 @@ class SystemOptions(TypedDict, total=False):
 def timed_options(options: SystemOptions) -> SystemOptions:
     """The options of a timed system: its constraints are those of the usual one."""
     return {**options, "constraints": None}
-
-
-class _Moved:
-    """A former method of `System`, which is a function of the package now."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, system: object, owner: type) -> NoReturn:
-        raise AttributeError(
-            f"System.{self._name} is now qpmhe.{self._name}, with the same arguments."
-        )
 
 
 @report_unknown_options
@@ -362,11 +350,6 @@ class System:
 
         system.make_timed, system.make_augmented = timed, augmented
         return system
-
-    from_casadi = _Moved()
-    from_jax = _Moved()
-    from_control = _Moved()
-    from_sympy = _Moved()
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Made again from the user's functions: the closures inside cannot be pickled.

@@ -14,7 +14,7 @@ import numpy as np
 
 from .._checks import Array, count
 from ..errors import InvalidInputError, OptionError
-from .tables import RecordError, Row, open_table
+from .tables import RecordError, TableRow, open_table
 
 _TIMES = ("time", "t", "timestamp", "datetime", "date_time", "zeit", "zeitstempel")
 # Units with which a column called "t" is the time, and no temperature.
@@ -124,7 +124,7 @@ class RecordReader:
             held = before.u
             yield before
 
-    def _sample(self, row: Row, time: Time, held: Array | None) -> Measurement:
+    def _sample(self, row: TableRow, time: Time, held: Array | None) -> Measurement:
         columns, number = self._columns, self._reader.number
         y = np.array([self._value(row, i, number) if i >= 0 else np.nan for i in columns.outputs])
         u = np.array([self._value(row, i, number) for i in columns.inputs])
@@ -140,7 +140,7 @@ class RecordReader:
             self.held += int(missing.sum())
         return Measurement(row.line, time, y, u, row.ended)
 
-    def _value(self, row: Row, position: int, read: Any) -> Any:
+    def _value(self, row: TableRow, position: int, read: Any) -> Any:
         try:
             return read(row.fields[position])
         except ValueError as error:
@@ -165,7 +165,7 @@ class RecordReader:
                 what += " It is the last line, which has no end and may be cut off."
             raise self.error(what, row.line, self._table.header[position]) from None
 
-    def _check_order(self, row: Row, time: Time, before: Measurement) -> None:
+    def _check_order(self, row: TableRow, time: Time, before: Measurement) -> None:
         column, unit = self._table.header[self._columns.time], self._table.unit
         if time.kind != before.time.kind:
             raise self.error(

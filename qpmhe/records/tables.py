@@ -49,7 +49,7 @@ class RecordError(InvalidInputError):
         self.file, self.line, self.column = file, line, column
 
 
-class Row(NamedTuple):
+class TableRow(NamedTuple):
     """A line number, a field for each column, and whether the line has an end."""
 
     line: int
@@ -150,13 +150,13 @@ class CsvTable:
             "lines above the header with --skip-lines N, and delete comments."
         )
 
-    def __iter__(self) -> Iterator[Row]:
+    def __iter__(self) -> Iterator[TableRow]:
         width = len(self.header)
         for text in self._lines:
             fields, ended = self._split(text), text.endswith(("\n", "\r"))
             if len(fields) != width:
                 fields = self._fitted(fields, ended)
-            yield Row(self.line, fields, ended)
+            yield TableRow(self.line, fields, ended)
 
     def _read_lines(self) -> Iterator[str]:
         while True:
@@ -238,7 +238,7 @@ class ParquetTable:
         self.header: list[str] = list(self._file.schema_arrow.names)
         self.total = int(self._file.metadata.num_rows)
 
-    def __iter__(self) -> Iterator[Row]:
+    def __iter__(self) -> Iterator[TableRow]:
         batches = self._file.iter_batches(batch_size=_BATCH)
         while True:
             try:
@@ -252,7 +252,7 @@ class ParquetTable:
                 ) from error
             for values in zip(*columns, strict=True):
                 self.position += 1
-                yield Row(self.position, list(values), True)
+                yield TableRow(self.position, list(values), True)
 
     def _texts(self, column: Any) -> list[str]:
         """Values as a CSV file would have them; all digits of floats, nanoseconds of dates."""

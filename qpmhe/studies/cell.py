@@ -61,7 +61,7 @@ class Task:
         return 1.5 * self.timeout + 1.0
 
 
-class OutOfTimeError(Exception):
+class CellTimeoutError(Exception):
     """The cell's time is up."""
 
 
@@ -73,7 +73,7 @@ def compute(task: Task) -> StudyRow:
             return _measured(task, began + task.timeout)
         except KeyboardInterrupt:
             raise
-        except OutOfTimeError as error:
+        except CellTimeoutError as error:
             return failure(task, f"out of time: {error}")
         except BaseException as error:  # a solver may even try to leave the process
             return failure(task, f"{type(error).__name__}: {error}")
@@ -122,7 +122,7 @@ def _measured(task: Task, limit: float) -> StudyRow:
     if "accuracy" in task.parts:
         try:
             reference = _reference(task, record, limit)
-        except OutOfTimeError as error:
+        except CellTimeoutError as error:
             measured["reason"] = f"no cost ratio: the converged reference ran out of time, {error}"
             reference = None
         measured["cost_ratio"] = metrics.cost_ratio(run.costs, reference)
@@ -138,7 +138,7 @@ def _measured(task: Task, limit: float) -> StudyRow:
     if task.failing is not None and stopped:
         try:
             _keep_failing(task, task.failing, record, limit)
-        except (InvalidInputError, OutOfTimeError) as error:
+        except (InvalidInputError, CellTimeoutError) as error:
             measured["reason"] = f"not all failing QPs were kept: {error}"
     return StudyRow(**_fields(task), **measured, outcome="done")
 
@@ -185,7 +185,7 @@ def _run(
         if covariances:
             collected.append(_newest_covariance(mhe))
         if perf_counter() > limit:
-            raise OutOfTimeError(f"{len(estimates)} of {total} steps were done.")
+            raise CellTimeoutError(f"{len(estimates)} of {total} steps were done.")
     return Run.of(start, estimates, np.array(collected) if covariances else None)
 
 

@@ -81,7 +81,7 @@ class PaperStudy:
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperRow:
     """Accuracy, time and outcome of one run.
 
     The RMSEs are over all t and from `SETTLED` on, the times the median and the 95th percentile
@@ -113,9 +113,9 @@ class Reproduction:
     ----------
     study, backend : PaperStudy, str
         The record, and the backend of ``rows``.
-    rows : list of Row
+    rows : list of PaperRow
         i = 0, 1, 2, 5 and converged; then Ipopt's, if requested.
-    backends : list of Row
+    backends : list of PaperRow
         Every installed backend at each cap, with i = 2.
     files : list of Path
         What was written.
@@ -127,13 +127,13 @@ class Reproduction:
 
     study: PaperStudy
     backend: str
-    rows: list[Row]
-    backends: list[Row]
+    rows: list[PaperRow]
+    backends: list[PaperRow]
     files: list[Path]
     seeds: int
     converged_cost: float
 
-    def excess(self, row: Row) -> float:
+    def excess(self, row: PaperRow) -> float:
         """Relative excess of the mean cost of a row of ``backends`` over the converged cost."""
         return row.mean_cost / self.converged_cost - 1.0
 
@@ -202,7 +202,7 @@ def reproduce(
     records = [replace(study, seed=seed + k).record() for k in range(seeds)]
     done, total = 0, (len(paper) * seeds + len(compared)) * steps
 
-    def row_of(label: str, cap: int | None, make: Callable[[], Any], record: Record) -> Row:
+    def row_of(label: str, cap: int | None, make: Callable[[], Any], record: Record) -> PaperRow:
         nonlocal done
         mhe, estimates = make(), []
         for y in record.measurements:
@@ -226,7 +226,7 @@ def reproduce(
     return found
 
 
-def _mean(rows: list[Row]) -> Row:
+def _mean(rows: list[PaperRow]) -> PaperRow:
     """The means of a row over seeds, with confidence limits of the RMSEs."""
     names = ("rmse", "rmse_settled", "median_time", "high_time", "improved", "mean_cost")
     table = np.array([[getattr(row, name) for name in names] for row in rows])
@@ -240,9 +240,9 @@ def _mean(rows: list[Row]) -> Row:
     return replace(rows[0], **combined)
 
 
-def _row(label: str, cap: int | None, run: Run, record: Record, dt: float) -> Row:
+def _row(label: str, cap: int | None, run: Run, record: Record, dt: float) -> PaperRow:
     errors, times = accuracy(run.states, record.states, round(SETTLED / dt)), timing(run.times)
-    return Row(
+    return PaperRow(
         label, cap, run.states,
         # Both states are partial pressures: they add up as they are, as in the paper.
         rmse=float(np.linalg.norm(errors["rmse_states"])),

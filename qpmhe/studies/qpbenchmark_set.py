@@ -13,7 +13,7 @@ import numpy as np
 from qpmhe_solvers import QP
 from qpmhe_solvers.dispatch import qpsolvers_arguments
 from qpmhe_solvers.files import StoredQP, load, qp_files
-from qpmhe_solvers.layout import Layout, Structure, Style
+from qpmhe_solvers.layout import QPLayout, QPStructure, QPStyle
 
 from ..errors import InvalidInputError, OptionError
 
@@ -158,8 +158,8 @@ def _problem(qp: QP) -> qpsolvers.Problem:
 
     sides = [np.isfinite(side) for side in (qp.lower, qp.upper)]
     box = all(side.all() or not side.any() for side in sides)
-    style = Style("dense", bounds="box" if box else "rows", sides=1)
-    layout = Layout(style, Structure.of(qp, exact=True), *qp.sizes)
+    style = QPStyle("dense", bounds="box" if box else "rows", sides=1)
+    layout = QPLayout(style, QPStructure.of(qp, exact=True), *qp.sizes)
     layout.fill(qp, None)
     P, q, G, h, A, b, lower, upper = qpsolvers_arguments(layout)
     return qpsolvers.Problem(

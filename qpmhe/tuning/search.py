@@ -39,7 +39,7 @@ class TuningCheckpointError(QpmheError):
     """A checkpoint that is damaged, or belongs to another search."""
 
 
-class Checkpoint:
+class SearchProgress:
     """Where each start of a search stands, in a JSON file; without a path, in memory only."""
 
     def __init__(self, path: Path | None, identity: str) -> None:
@@ -138,7 +138,7 @@ def search_likelihood(
 
 
 def search_all(
-    likelihood: Likelihood, starts: list[Array], checkpoint: Checkpoint, jobs: int,
+    likelihood: Likelihood, starts: list[Array], checkpoint: SearchProgress, jobs: int,
     advance: Callable[[str], None],
 ) -> Array:
     """The best minimum of the likelihood over all starts; those known are not searched again."""
@@ -268,7 +268,7 @@ def limit(
 
 
 def refine(
-    score: Score, likelihood: Likelihood, theta: Array, checkpoint: Checkpoint,
+    score: Score, likelihood: Likelihood, theta: Array, checkpoint: SearchProgress,
     advance: Callable[[str], None],
 ) -> Array:
     """The minimum of the estimator's score, by differences of runs, with a share of the likelihood.

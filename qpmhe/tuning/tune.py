@@ -24,7 +24,7 @@ from .answer import Tuning
 from .data import Data, check_enough, checked_data, constant_inputs, hold_out
 from .likelihood import Likelihood
 from .score import Score
-from .search import Checkpoint, identity_of, polish, refine, search_all
+from .search import SearchProgress, identity_of, polish, refine, search_all
 from .structures import Structure, checked_start
 from .weights import ARRIVALS, Weights
 
@@ -187,7 +187,7 @@ def tune(
         if sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
             score.compile(start)
         _ = score.scale  # what is wrong with the options shows before the search
-    kept = Checkpoint(kept_in, identity_of(
+    kept = SearchProgress(kept_in, identity_of(
         likelihood, at_start, (objective, ahead, seed, starts, sorted(options.items(), key=str))
     ))
     beginnings = _beginnings(plan, starts, seed)

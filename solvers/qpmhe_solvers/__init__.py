@@ -1,7 +1,7 @@
 """QP backends for trajectories: convex QPs in, verified solutions out."""
 
 from .backend import Backend
-from .conformance import Capabilities, Conformance, Finding, check, measure
+from .conformance import Capabilities, CheckOutcome, Conformance, check, measure
 from .errors import BackendError, InvalidInputError, OptionError, QpmheError, ShapeError
 from .files import StoredQP, dump, load
 from .options import SolverOptions
@@ -16,8 +16,8 @@ __all__ = [
     "Backend",
     "BackendError",
     "Capabilities",
+    "CheckOutcome",
     "Conformance",
-    "Finding",
     "InvalidInputError",
     "OptionError",
     "QpmheError",

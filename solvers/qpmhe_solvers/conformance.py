@@ -46,7 +46,7 @@ class Capabilities:
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckOutcome:
     """The outcome of one ``check``: whether it ``passed``, and the ``detail`` of a failure."""
 
     check: str
@@ -64,14 +64,14 @@ class Conformance:
         The backend.
     declared, measured : Capabilities
         Its declared and its measured capabilities.
-    findings : tuple of Finding
+    findings : tuple of CheckOutcome
         All checks, passed or not.
     """
 
     name: str
     declared: Capabilities
     measured: Capabilities
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckOutcome, ...]
 
     @property
     def passed(self) -> bool:
@@ -101,7 +101,7 @@ def check(name: str) -> Conformance:
     for title, look in _CHECKS.items():
         if measured.inequalities or title in _WITHOUT_INEQUALITIES:
             detail = "; ".join(look(name, measured))
-            findings.append(Finding(title, not detail, detail))
+            findings.append(CheckOutcome(title, not detail, detail))
     return Conformance(
         name, Capabilities.declared(backend(name)), measured, tuple(findings)
     )

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend
-from .layout import Layout, Structure
-from .native import NATIVE, Answer, NativeSolver
+from .layout import QPLayout, QPStructure
+from .native import NATIVE, NativeAnswer, NativeSolver
 from .options import SolverOptions
 from .qp import QP
 from .translations import TRANSLATIONS
@@ -43,24 +43,24 @@ class DispatchSolver(NativeSolver):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.name, self.options)
 
-    def structure(self, qp: QP) -> Structure:
+    def structure(self, qp: QP) -> QPStructure:
         """The limits of this QP."""
-        return Structure.of(qp, exact=True, bounds=self.style.bounds == "rows")
+        return QPStructure.of(qp, exact=True, bounds=self.style.bounds == "rows")
 
-    def _set_up(self, layout: Layout) -> Any:
+    def _set_up(self, layout: QPLayout) -> Any:
         return self._package.Problem(*qpsolvers_arguments(layout, self._translation.keep_empty))
 
     def _limit(self, handle: Any, seconds: float) -> None:
         if self._translation.time_limit is not None:
             self._keywords[self._translation.time_limit] = seconds
 
-    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+    def _run(self, handle: Any, layout: QPLayout, start: Point, duals: Point) -> NativeAnswer:
         initial = start.copy() if start is not None and self._translation.start else None
         answer = self._solve_problem(
             handle, self.name, initvals=initial, verbose=False, **self._keywords
         )
         iterations, message = _report(answer.extras)
-        return Answer(
+        return NativeAnswer(
             answer.x, _multipliers(layout, answer), bool(answer.found), True, iterations, message
         )
 
@@ -80,7 +80,7 @@ def _silence_highs() -> None:
         first.run()
 
 
-def qpsolvers_arguments(layout: Layout, keep_empty: bool = False) -> tuple[Any, ...]:
+def qpsolvers_arguments(layout: QPLayout, keep_empty: bool = False) -> tuple[Any, ...]:
     r"""P, q, G, h, A, b, l, u of a one-sided layout; None for what there is not.
 
     .. math::
@@ -98,7 +98,7 @@ def qpsolvers_arguments(layout: Layout, keep_empty: bool = False) -> tuple[Any, 
     )
 
 
-def _multipliers(layout: Layout, answer: Any) -> Point:
+def _multipliers(layout: QPLayout, answer: Any) -> Point:
     """Multipliers of all constraints; None where some are missing."""
     parts = []
     for values, size in (

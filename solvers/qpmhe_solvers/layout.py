@@ -19,7 +19,7 @@ Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Style:
+class QPStyle:
     """How one solver wants its QP."""
 
     matrices: Literal["csc", "dense"]
@@ -32,7 +32,7 @@ class Style:
     objective: float = 1.0
 
 
-class Structure(NamedTuple):
+class QPStructure(NamedTuple):
     """Which limits a layout has room for, constraint by constraint; bounds come first.
 
     A limit that is finite at any stage but the last has room at all of these, so that limits
@@ -44,7 +44,7 @@ class Structure(NamedTuple):
     equal: Flags
 
     @staticmethod
-    def of(qp: QP, *, exact: bool = False, bounds: bool = False) -> Structure:
+    def of(qp: QP, *, exact: bool = False, bounds: bool = False) -> QPStructure:
         """The structure that a QP needs; with room for its own limits only, if exact.
 
         Equal bounds of an unknown are an equality if ``bounds``, where they become rows: active-set
@@ -61,7 +61,7 @@ class Structure(NamedTuple):
                 if stages > 1 and not exact:
                     part[:-1] = part[:-1].any(axis=0)
             sides.append(finite & ~equal)
-        return Structure(sides[0], sides[1], equal)
+        return QPStructure(sides[0], sides[1], equal)
 
     @property
     def key(self) -> Hashable:
@@ -77,7 +77,7 @@ class Voids(NamedTuple):
     upper: Index
 
 
-class Layout:
+class QPLayout:
     r"""The arrays of a QP for one structure.
 
     .. math::
@@ -92,7 +92,7 @@ class Layout:
     """
 
     def __init__(
-        self, style: Style, structure: Structure, stages: int, n: int, rows: int
+        self, style: QPStyle, structure: QPStructure, stages: int, n: int, rows: int
     ) -> None:
         places = Places.of(stages, n, rows)
         self.style, self.structure = style, structure
@@ -188,7 +188,7 @@ class Layout:
         return duals[: self.count]
 
 
-def _rows(style: Style, structure: Structure, size: int) -> tuple[Index, Index, Array]:
+def _rows(style: QPStyle, structure: QPStructure, size: int) -> tuple[Index, Index, Array]:
     """Constraints of the rows of A and of C, and the signs of the latter."""
     lower, upper = structure.lower.copy(), structure.upper.copy()
     if style.bounds == "box":
@@ -208,7 +208,7 @@ def _rows(style: Style, structure: Structure, size: int) -> tuple[Index, Index, 
 
 
 def _patterns(
-    style: Style, stages: int, n: int, rows: int, constraints: Index, equalities: Index
+    style: QPStyle, stages: int, n: int, rows: int, constraints: Index, equalities: Index
 ) -> list[csc_matrix]:
     """P, C and A; the entries of the latter are places in own rows, next rows, and a 1."""
     from scipy.sparse import csc_matrix, triu, vstack

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend
-from .layout import Layout, Structure, Style, Voids
+from .layout import QPLayout, QPStructure, QPStyle, Voids
 from .options import SolverOptions
 from .qp import QP, Array
 from .solution import RawSolution
@@ -26,7 +26,7 @@ Point = Array | None
 _KNOWN = 64
 
 
-class Answer(NamedTuple):
+class NativeAnswer(NamedTuple):
     """A solver's answer."""
 
     x: Array | None
@@ -40,7 +40,7 @@ class Answer(NamedTuple):
 class _Workspace:
     """A solver that is set up, its arrays, and the multipliers that it found last."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: QPLayout) -> None:
         self.layout = layout
         self.handle: Any = None
         self.duals: Array | None = None
@@ -53,7 +53,7 @@ class NativeSolver(Solver):
     #: The module of the solver, its name in the table of translations, and how it wants its QPs.
     package: ClassVar[str]
     translation: ClassVar[str]
-    style: Style
+    style: QPStyle
     # Workspaces kept: a window of full length needs one, or one for each structure that its sets
     # have; those of a growing window are used once.
     kept: ClassVar[int] = 4
@@ -69,9 +69,9 @@ class NativeSolver(Solver):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.options,)
 
-    def structure(self, qp: QP) -> Structure:
+    def structure(self, qp: QP) -> QPStructure:
         """The limits that a layout for this QP has room for."""
-        return Structure.of(qp)
+        return QPStructure.of(qp)
 
     def shift(self) -> None:
         """Move what is kept by one stage; see `Solver.shift`."""
@@ -98,17 +98,17 @@ class NativeSolver(Solver):
         return settings
 
     @abstractmethod
-    def _set_up(self, layout: Layout) -> Any:
+    def _set_up(self, layout: QPLayout) -> Any:
         """A solver for the arrays of a layout, which are filled."""
 
-    def _update(self, handle: Any, layout: Layout) -> None:
+    def _update(self, handle: Any, layout: QPLayout) -> None:
         """Hand the arrays, filled anew, to the solver; nothing where it reads them itself."""
 
     def _limit(self, handle: Any, seconds: float) -> None:
         """Set the time limit of the next solve; nothing for a solver without a clock."""
 
     @abstractmethod
-    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+    def _run(self, handle: Any, layout: QPLayout, start: Point, duals: Point) -> NativeAnswer:
         """Solve, from an increment (K n,) and multipliers (K n + K rows,); None for zero."""
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
@@ -150,7 +150,7 @@ class NativeSolver(Solver):
         key = qp.sizes, kind, qp.key if self._keeps else 0
         workspace = self._workspaces.pop(key, None)
         if workspace is None:
-            workspace = _Workspace(Layout(self.style, self.structure(qp), *qp.sizes))
+            workspace = _Workspace(QPLayout(self.style, self.structure(qp), *qp.sizes))
         if known is None:
             if len(self._known) == _KNOWN:
                 del self._known[next(iter(self._known))]
@@ -186,11 +186,11 @@ class ClarabelSolver(NativeSolver):
     """
 
     package, translation = "clarabel", "clarabel"
-    style = Style(
+    style = QPStyle(
         "csc", triangle="upper", bounds="rows", equalities="among", sides=1, infinite=False
     )
 
-    def _set_up(self, layout: Layout) -> Any:
+    def _set_up(self, layout: QPLayout) -> Any:
         settings = self._package.DefaultSettings()
         settings.verbose = False
         settings.presolve_enable = False  # its data could not be updated
@@ -209,7 +209,7 @@ class ClarabelSolver(NativeSolver):
             layout.hessian, layout.gradient, layout.matrix, layout.upper, cones, settings
         )
 
-    def _update(self, handle: Any, layout: Layout) -> None:
+    def _update(self, handle: Any, layout: QPLayout) -> None:
         handle.update(
             P=layout.hessian.data, q=layout.gradient, A=layout.matrix.data, b=layout.upper
         )
@@ -219,11 +219,11 @@ class ClarabelSolver(NativeSolver):
         settings.time_limit = seconds
         handle.update(settings=settings)
 
-    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+    def _run(self, handle: Any, layout: QPLayout, start: Point, duals: Point) -> NativeAnswer:
         solution = handle.solve()
         status = str(solution.status)
         solved = status == "Solved"
-        return Answer(
+        return NativeAnswer(
             np.array(solution.x), layout.duals(np.array(solution.z), None, None), solved,
             solved or status in ("MaxIterations", "MaxTime"), int(solution.iterations), status,
         )
@@ -252,9 +252,9 @@ class DaqpSolver(NativeSolver):
     """
 
     package, translation = "daqp", "daqp"
-    style = Style("dense", equalities="among")
+    style = QPStyle("dense", equalities="among")
 
-    def _set_up(self, layout: Layout) -> Any:
+    def _set_up(self, layout: QPLayout) -> Any:
         handle = self._package.Model()
         handle.settings = handle.settings | self._words
         flag, _ = handle.setup(
@@ -268,7 +268,7 @@ class DaqpSolver(NativeSolver):
     def _limit(self, handle: Any, seconds: float) -> None:
         handle.settings = handle.settings | {"time_limit": seconds}
 
-    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+    def _run(self, handle: Any, layout: QPLayout, start: Point, duals: Point) -> NativeAnswer:
         began, limit = perf_counter(), self.time_limit
         sense = self._sense(layout, start, duals)
         answer = self._from(handle, layout, sense)
@@ -282,7 +282,7 @@ class DaqpSolver(NativeSolver):
             answer = self._from(handle, layout, self._sense(layout, None, None))
         return answer
 
-    def _from(self, handle: Any, layout: Layout, sense: Index) -> Answer:
+    def _from(self, handle: Any, layout: QPLayout, sense: Index) -> NativeAnswer:
         """Solve from an active set."""
         # Without rows it must be given none: it would look at the first one.
         rows = {"A": layout.matrix} if layout.matrix.size else {}
@@ -290,18 +290,18 @@ class DaqpSolver(NativeSolver):
             rows |= {"bupper": layout.all_upper, "blower": layout.all_lower, "sense": sense}
         flag = handle.update(H=layout.hessian, f=layout.gradient, **rows)
         if flag < 0:
-            return Answer(None, None, False, False, None, _WORDS.get(flag, str(flag)))
+            return NativeAnswer(None, None, False, False, None, _WORDS.get(flag, str(flag)))
         x, _, flag, info = handle.solve()
         count, words = int(info["iterations"]), _WORDS.get(flag, str(flag))
         if flag == _AT_CAP:
             count -= 1  # the one that it did not begin
         if flag != 1:
-            return Answer(None, None, False, flag in _STOPPED, count, words)
+            return NativeAnswer(None, None, False, flag in _STOPPED, count, words)
         bounds = layout.size if layout.boxed else 0
         duals = layout.duals(info["lam"][bounds:], None, info["lam"][:bounds])
-        return Answer(x, duals, True, bool(np.isfinite(x).all()), count, words)
+        return NativeAnswer(x, duals, True, bool(np.isfinite(x).all()), count, words)
 
-    def _sense(self, layout: Layout, start: Array | None, duals: Array | None) -> Index:
+    def _sense(self, layout: QPLayout, start: Array | None, duals: Array | None) -> Index:
         """What each limit of the box, then each row, is to begin as."""
         sense = np.zeros(layout.all_upper.size, np.intc)
         bounds = layout.size if layout.boxed else 0
@@ -329,9 +329,9 @@ class OsqpSolver(NativeSolver):
     """Solve by OSQP."""
 
     package, translation = "osqp", "osqp"
-    style = Style("csc", triangle="upper", bounds="rows", equalities="among")
+    style = QPStyle("csc", triangle="upper", bounds="rows", equalities="among")
 
-    def _set_up(self, layout: Layout) -> Any:
+    def _set_up(self, layout: QPLayout) -> Any:
         handle, cap = self._package.OSQP(), self.options.max_iterations
         often = {} if cap is None or cap >= _CHECKED else {"check_termination": 1}
         handle.setup(
@@ -340,7 +340,7 @@ class OsqpSolver(NativeSolver):
         )
         return handle
 
-    def _update(self, handle: Any, layout: Layout) -> None:
+    def _update(self, handle: Any, layout: QPLayout) -> None:
         if not self.options.warm_start:
             handle.update_settings(rho=_RHO)  # adapted by the solves before
         handle.update(
@@ -351,7 +351,7 @@ class OsqpSolver(NativeSolver):
     def _limit(self, handle: Any, seconds: float) -> None:
         handle.update_settings(time_limit=seconds)
 
-    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+    def _run(self, handle: Any, layout: QPLayout, start: Point, duals: Point) -> NativeAnswer:
         handle.warm_start(
             x=np.zeros(layout.size) if start is None else start,
             y=np.zeros(layout.constraints.size) if duals is None else duals[layout.constraints],
@@ -360,7 +360,7 @@ class OsqpSolver(NativeSolver):
         status = result.info.status
         # Anything else comes without an iterate, or with a certificate in its place.
         stopped = status.startswith(("solved", "maximum", "run time"))
-        return Answer(
+        return NativeAnswer(
             result.x, layout.duals(result.y, None, None), status == "solved", stopped,
             int(result.info.iter), status,
         )
@@ -374,14 +374,14 @@ class PiqpSolver(NativeSolver):
     """
 
     package, translation = "piqp", "piqp"
-    style = Style("csc", triangle="upper", infinite=False)
+    style = QPStyle("csc", triangle="upper", infinite=False)
 
     def _made(self) -> Any:
         handle = self._package.SparseSolver()
         handle.settings.kkt_solver = self._package.KKTSolver.sparse_multistage
         return handle
 
-    def _set_up(self, layout: Layout) -> Any:
+    def _set_up(self, layout: QPLayout) -> Any:
         handle, options = self._made(), self.options
         settings = self._translated(handle.settings)
         settings.eps_duality_gap_abs = options.absolute_tolerance
@@ -389,21 +389,21 @@ class PiqpSolver(NativeSolver):
         handle.setup(layout.hessian, layout.gradient, *self._others(layout))
         return handle
 
-    def _update(self, handle: Any, layout: Layout) -> None:
+    def _update(self, handle: Any, layout: QPLayout) -> None:
         handle.update(layout.hessian, layout.gradient, *self._others(layout))
 
-    def _others(self, layout: Layout) -> tuple[Any, ...]:
+    def _others(self, layout: QPLayout) -> tuple[Any, ...]:
         """A, b, G, lower and upper limits, lower and upper bounds."""
         box = (layout.box_lower, layout.box_upper) if layout.boxed else (None, None)
         return (
             layout.equality_matrix, layout.level, layout.matrix, layout.lower, layout.upper, *box
         )
 
-    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+    def _run(self, handle: Any, layout: QPLayout, start: Point, duals: Point) -> NativeAnswer:
         status = handle.solve()
         result, kinds = handle.result, self._package.Status
         box = result.z_bu - result.z_bl if layout.boxed else None
-        return Answer(
+        return NativeAnswer(
             result.x, layout.duals(result.z_u - result.z_l, result.y, box),
             status == kinds.PIQP_SOLVED,
             status in (kinds.PIQP_SOLVED, kinds.PIQP_MAX_ITER_REACHED),
@@ -414,7 +414,7 @@ class PiqpSolver(NativeSolver):
 class PiqpDenseSolver(PiqpSolver):
     """Solve by PIQP with dense matrices."""
 
-    style = Style("dense", infinite=False)
+    style = QPStyle("dense", infinite=False)
 
     def _made(self) -> Any:
         return self._package.DenseSolver()
@@ -428,14 +428,14 @@ class ProxqpSolver(NativeSolver):
     """
 
     package, translation = "proxsuite", "proxqp"
-    style = Style("dense")
+    style = QPStyle("dense")
 
-    def _made(self, layout: Layout) -> Any:
+    def _made(self, layout: QPLayout) -> Any:
         return self._package.proxqp.dense.QP(
             layout.size, layout.equalities.size, layout.constraints.size, layout.boxed
         )
 
-    def _set_up(self, layout: Layout) -> Any:
+    def _set_up(self, layout: QPLayout) -> Any:
         handle, options = self._made(layout), self.options
         settings = self._translated(handle.settings)
         settings.eps_duality_gap_abs = options.absolute_tolerance
@@ -445,10 +445,10 @@ class ProxqpSolver(NativeSolver):
         handle.init(**self._parts(layout))
         return handle
 
-    def _update(self, handle: Any, layout: Layout) -> None:
+    def _update(self, handle: Any, layout: QPLayout) -> None:
         handle.update(**self._parts(layout), update_preconditioner=True)
 
-    def _parts(self, layout: Layout) -> dict[str, Any]:
+    def _parts(self, layout: QPLayout) -> dict[str, Any]:
         parts = {
             "H": layout.hessian, "g": layout.gradient, "A": layout.equality_matrix,
             "b": layout.level, "C": layout.matrix, "l": layout.lower, "u": layout.upper,
@@ -457,12 +457,12 @@ class ProxqpSolver(NativeSolver):
             parts |= {"l_box": layout.box_lower, "u_box": layout.box_upper}
         return parts
 
-    def _run(self, handle: Any, layout: Layout, start: Point, duals: Point) -> Answer:
+    def _run(self, handle: Any, layout: QPLayout, start: Point, duals: Point) -> NativeAnswer:
         handle.solve()
         results, count = handle.results, layout.constraints.size
         status, z = results.info.status.name, results.z
         solved = status == "PROXQP_SOLVED"
-        return Answer(
+        return NativeAnswer(
             results.x,
             layout.duals(z[:count], results.y, z[count:] if layout.boxed else None),
             solved, solved or status == "PROXQP_MAX_ITER_REACHED",
@@ -476,9 +476,9 @@ class ProxqpSparseSolver(ProxqpSolver):
     Every solve starts at the minimiser under the equality rows, as with the dense solver.
     """
 
-    style = Style("csc", bounds="rows")
+    style = QPStyle("csc", bounds="rows")
 
-    def _made(self, layout: Layout) -> Any:
+    def _made(self, layout: QPLayout) -> Any:
         return self._package.proxqp.sparse.QP(
             layout.size, layout.equalities.size, layout.constraints.size
         )

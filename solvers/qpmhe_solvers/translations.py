@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from .layout import Style
+from .layout import QPStyle
 from .options import SolverOptions
 
 
@@ -16,7 +16,7 @@ class Translation:
 
     method: str
     package: str
-    style: Style
+    style: QPStyle
     cap: str | None
     absolute: tuple[str, ...]
     relative: tuple[str, ...] = ()
@@ -49,51 +49,51 @@ class Translation:
 # change that of proxqp, which without a cap goes on for minutes.
 TRANSLATIONS: Mapping[str, Translation] = {
     "clarabel": Translation(
-        "interior point", "clarabel", Style("csc", bounds="rows", sides=1, needs_row=True),
+        "interior point", "clarabel", QPStyle("csc", bounds="rows", sides=1, needs_row=True),
         "max_iter", ("tol_gap_abs", "tol_feas"), ("tol_gap_rel",), "time_limit",
         reports_infeasibility=True,
     ),
     "cvxopt": Translation(
-        "interior point", "cvxopt", Style("csc", bounds="rows", sides=1),
+        "interior point", "cvxopt", QPStyle("csc", bounds="rows", sides=1),
         "maxiters", ("abstol", "feastol"), ("reltol",),
     ),
     "daqp": Translation(
-        "dual active set", "daqp", Style("dense", sides=1),
+        "dual active set", "daqp", QPStyle("dense", sides=1),
         "iter_limit", ("primal_tol", "dual_tol"), time_limit="time_limit", start=True,
         beyond_cap=1,
     ),
     "ecos": Translation(
-        "interior point", "ecos", Style("dense", bounds="rows", sides=1, needs_row=True),
+        "interior point", "ecos", QPStyle("dense", bounds="rows", sides=1, needs_row=True),
         "max_iters", ("abstol", "feastol", "reltol"),
     ),
     "highs": Translation(
-        "active set", "highspy", Style("csc", sides=1, needs_row=True),
+        "active set", "highspy", QPStyle("csc", sides=1, needs_row=True),
         "qp_iteration_limit", ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
         time_limit="time_limit", default_cap=10000, others=(("qp_regularization_value", 1e-9),),
     ),
     "osqp": Translation(
-        "ADMM", "osqp", Style("csc", sides=1),
+        "ADMM", "osqp", QPStyle("csc", sides=1),
         "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", start=True,
         reports_infeasibility=True, others=(("eps_dual_inf", 1e-12),),
     ),
     "piqp": Translation(
-        "interior point", "piqp", Style("csc", sides=1),
+        "interior point", "piqp", QPStyle("csc", sides=1),
         "max_iter", ("eps_abs",), ("eps_rel",), keep_empty=True, reports_infeasibility=True,
         others=(("eps_dual_inf", 1e-12),),
     ),
     "proxqp": Translation(
-        "augmented Lagrangian", "proxsuite", Style("dense", sides=1, objective=2.0**9),
+        "augmented Lagrangian", "proxsuite", QPStyle("dense", sides=1, objective=2.0**9),
         "max_iter", ("eps_abs",), ("eps_rel",), default_cap=200, reports_infeasibility=True,
     ),
     "qpalm": Translation(
-        "augmented Lagrangian", "qpalm", Style("csc", sides=1),
+        "augmented Lagrangian", "qpalm", QPStyle("csc", sides=1),
         "max_iter", ("eps_abs",), ("eps_rel",), "time_limit", reports_infeasibility=True,
     ),
     "quadprog": Translation(
-        "dual active set", "quadprog", Style("dense", bounds="rows", sides=1), None, (),
+        "dual active set", "quadprog", QPStyle("dense", bounds="rows", sides=1), None, (),
     ),
     "scs": Translation(
-        "ADMM", "scs", Style("csc", bounds="rows", sides=1, needs_row=True),
+        "ADMM", "scs", QPStyle("csc", bounds="rows", sides=1, needs_row=True),
         "max_iters", ("eps_abs",), ("eps_rel",), "time_limit_secs", start=True,
     ),
 }

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from qpmhe_solvers import SolverOptions, SolveStatus, create
-from qpmhe_solvers.layout import Style
-from qpmhe_solvers.native import Answer, NativeSolver
+from qpmhe_solvers.layout import QPStyle
+from qpmhe_solvers.native import NativeAnswer, NativeSolver
 from qpmhe_solvers.sample_qps import contradiction, sample
 
 from .problems import CASES, EVERY, NATIVE, TIGHT, make
@@ -146,7 +146,7 @@ def test_a_workspace_that_failed_is_dropped(name, monkeypatch):
 class Kept(NativeSolver):
     """Remembers the multipliers that it is started with."""
 
-    package, style = "numpy", Style("dense")
+    package, style = "numpy", QPStyle("dense")
 
     def __init__(self, warm_start):
         super().__init__(SolverOptions(warm_start=warm_start))
@@ -157,7 +157,7 @@ class Kept(NativeSolver):
 
     def _run(self, handle, layout, start, duals):
         self.starts.append(None if duals is None else duals.tolist())
-        return Answer(np.zeros(layout.size), np.arange(1.0, 13.0), False, True, 1, "")
+        return NativeAnswer(np.zeros(layout.size), np.arange(1.0, 13.0), False, True, 1, "")
 
 
 def test_multipliers_move_with_the_trajectory():

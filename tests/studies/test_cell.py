@@ -154,7 +154,7 @@ def test_whatever_is_raised_becomes_a_row_unless_it_is_the_user(monkeypatch):
             raise error
         return function
 
-    monkeypatch.setattr(module, "_reference", ends(module.OutOfTimeError("3 of 30 steps.")))
+    monkeypatch.setattr(module, "_reference", ends(module.CellTimeoutError("3 of 30 steps.")))
     row = row_of()
     assert (row.outcome, np.isfinite(row.rmse)) == ("done", True)
     assert np.isnan(row.cost_ratio)
