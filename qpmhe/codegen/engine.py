@@ -10,32 +10,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import check_problem, positive_definite
+from .._checks import check_problem
 from ..costs import Cost
-from ..costs.base import quadratic_form
 from ..errors import InvalidInputError
 from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
+from ..estimation.description import check_description, described
 from ..estimation.engine import PythonEngine
 from ..estimation.engines import EngineChangeError
 from ..estimation.estimate import DroppedRow, Estimate, Status
 from ..estimation.problem import Solved
 from ..estimation.run import Run
 from ..estimation.settings import Settings
-from ..estimation.snapshot import (
-    check_description,
-    check_root,
-    checked_array,
-    described,
-    mismatch,
-    near,
-    reading,
-)
+from ..memory.snapshot import reading
 from ..model.system import System
 from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
-from .handover import hand_over
-from .layout import CHANGES, SET_NAMES, STAGE_FLAGS
+from .exchange import empty_record, hand_over, own_fields, record_of, write
+from .layout import CHANGES
 from .library import EstimatorLibrary
 from .sample import SampleRecord
 from .watched import WatchedFunctions
@@ -155,7 +147,7 @@ class CompiledEngine:
     def state(self) -> Array:
         """The current estimate."""
         record = self._memory[0]
-        state: Array = record["history"][record["newest"]].copy()
+        state: Array = record["history_end"].copy()
         return state
 
     @property
@@ -213,8 +205,8 @@ class CompiledEngine:
             estimate = self._collect(time)
             estimate.step_time = perf_counter() - began
             if self._numbers[1] & WATCHED:
-                record = self._memory[0]
-                self._watch.warn(int(record["far"]), int(record["dropped"]), 3)
+                far, dropped = self._memory[0]["watched"].tolist()
+                self._watch.warn(far, dropped, 3)
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             if self.time != time:
@@ -237,7 +229,7 @@ class CompiledEngine:
         record, state = self._memory[0], self._memory[0]["z_end"].copy()
         parts = self._system, self._observer, self._given_cost, self._settings
         engine = PythonEngine(*parts, state)
-        hand_over(record, self._directions, self.usual, engine)
+        hand_over(record, self._library.layout, self._directions, self.usual, engine, True)
         raise EngineChangeError(engine, fault)
 
     def _collect(self, time: int) -> CompiledEstimate:
@@ -278,7 +270,7 @@ class CompiledEngine:
         samples = len(ys)
         log, start = self._library.log((samples,)), self.state
         observer_start = self.observer_state
-        dropped = self._memory["dropped"][0].copy()
+        dropped = self._memory["watched"][0, 1].copy()
         times = np.empty(samples)
         ys = np.ascontiguousarray(ys)
         us = None if us is None else np.ascontiguousarray(us)
@@ -320,7 +312,9 @@ class CompiledEngine:
             parts = self._system.copy(traced=True), self._observer, self._given_cost
             self._mirror = PythonEngine(*parts, self._settings, self.state)
         with np.errstate(all="ignore"):
-            hand_over(record, self._directions, self.usual, self._mirror)
+            hand_over(
+                record, self._library.layout, self._directions, self.usual, self._mirror, False
+            )
         return self._mirror.solved()
 
     def forget_warm_start(self) -> None:
@@ -328,12 +322,12 @@ class CompiledEngine:
 
     def state_dict(self) -> dict[str, Any]:
         """All information from the measurements so far, as plain arrays and numbers."""
-        memory = self._memory.view(np.uint8).copy()  # as bytes: padding is copied, too
-        memory.view(self._memory.dtype)["settings"] = 0  # an address means nothing elsewhere
+        record, layout = self._memory[0], self._library.layout
         return {
             "problem": self._size(), "engine": self.name, "estimator": self._description(),
-            "linearized": self._settings.qp_limit > 0, "memory": memory,
-            "usual": self.usual.state_dict(),
+            "linearized": self._settings.qp_limit > 0, "usual": self.usual.state_dict(),
+            "window": record_of(record, layout, self._directions).state_dict(),
+            "compiled": own_fields(record, layout.sizes),
         }
 
     def _description(self) -> dict[str, Any]:
@@ -354,203 +348,19 @@ class CompiledEngine:
         with reading():
             check_description(state["estimator"], self._description())
             tools = self._tools_for(self._reader.load(state["usual"], self.usual))
-            size, linearized = self._memory.itemsize, state["linearized"]
-            memory = checked_array("memory", state["memory"], (size,), np.uint8)
-            memory = memory.view(self._memory.dtype)
+            linearized, layout = state["linearized"], self._library.layout
             if not isinstance(linearized, bool):
                 raise TypeError(f"linearized is {linearized!r}")
-            memory["settings"] = tools.record.ctypes.data
-            with np.errstate(all="ignore"):
-                self._check(memory, linearized, tools)
+            record = empty_record(layout, self._directions)
+            record.load_state_dict(
+                state["window"], lambda own: self._reader.load(own, tools.usual),
+                may_be_irregular=bool(self._system.dt),
+                is_smoothed=self._settings.arrival == "smoothed",
+                # The trajectory may be that of a surrogate, whose end is no estimate.
+                ends_alike=self.cost.graduation == 1.0,
+            )
+            memory = self._library.estimators(record.z[:1], tools.record)
+            write(memory[0], layout.sizes, record, state["compiled"])
+            if self._settings.qp_limit and not linearized:
+                self._library.recompute(memory.ctypes.data)
         self._replace(memory, tools)
-
-    def _check(self, memory: NDArray[Any], linearized: bool, tools: Tools) -> None:
-        """Refuse a window that is impossible, or whose stages the model does not reproduce."""
-        record, horizon = memory[0], self._sizes[2]
-        time, length, first = (int(record[name]) for name in ("time", "length", "first"))
-        if not (
-            0 <= first < (horizon if length == horizon else 1)
-            and 0 <= length == min(horizon, time)
-            and record["newest"] == time % (horizon + 1)
-            and record["has_trajectory"] == (time > 0)
-            and 0 <= record["far"] <= time and 0 <= record["dropped"] <= time
-        ):
-            raise ValueError("its window is impossible")
-        trajectory, history = record["trajectory"][: length + 1], record["history"][: time + 1]
-        places = (first + np.arange(length)) % horizon
-        z = np.vstack((record["stages"]["z"][places], record["z_end"]))
-        if not all(np.isfinite(x).all() for x in (z, trajectory, history, record["last_good"])):
-            raise ValueError("a state is not finite")
-        ends = np.array_equal(trajectory[-1], history[record["newest"]])
-        if time and not ends and self.cost.graduation == 1.0:  # else it may be a surrogate's
-            raise ValueError("history does not end where the trajectory does")
-        for stage in record["stages"][places]:
-            self._check_flags(stage, tools)
-        smoothed = self._settings.arrival == "smoothed" and time > horizon
-        if record["has_smoothed"] != smoothed or not np.isfinite(record["smoothed"]).all():
-            raise ValueError("there must be a smoothed prior once the window has moved on")
-        if self._system.held and not np.isfinite(record["trusted"]).all():
-            raise ValueError("a trusted value is not finite")
-        self._check_metric(record)
-        covariances = self._covariances_of(record, places)
-        computed, usual = [self._recomputed(memory)], tools.record
-        self._check_rejections(record, computed[0][0][0], places)
-        if record["metric_settled"] and not usual["metric_settled"]:
-            # Some stages may have been computed before the metric settled.
-            before = memory.copy()
-            before["metric"] = usual["metric"]
-            computed.append(self._recomputed(before))
-        sizes, wanted = np.abs(z).max(axis=0), self._settings.qp_limit > 0
-        for k, place in enumerate(places):
-            stage = record["stages"][place]
-            weight = tools.cost.joint_weight(stage["noise_weight"], None)
-            if stage["has_own_disturbance"]:
-                n = self._sizes[0]
-                weight[:n, :n] = stage["own_disturbance_weight"].reshape(n, n)
-            for left, (again, reached, _) in zip(
-                range(len(computed))[::-1], computed, strict=True
-            ):
-                fresh = again[0]["stages"][place]
-                try:
-                    self._check_stage(stage, fresh, z[k + 1], reached[k], sizes, weight)
-                    break
-                except InvalidInputError:
-                    if not left:
-                        raise
-            if covariances is not None and np.isfinite(stage["cost"]):
-                self._check_covariance(covariances[k + 1], computed[0][2][k])
-            if linearized == wanted and wanted:
-                self._check_terms(stage, fresh, sizes, np.abs(weight))
-            else:
-                stage["terms"] = fresh["terms"]
-
-    def _recomputed(self, memory: NDArray[Any]) -> tuple[NDArray[Any], Array, Array]:
-        """Stages as the model computes them now, and states and covariances behind them."""
-        n, _, horizon = self._sizes
-        again, reached, spread = memory.copy(), np.zeros((horizon, n)), np.zeros((horizon, n, n))
-        self._library.recompute(again.ctypes.data, reached.ctypes.data, spread.ctypes.data)
-        return again, reached, spread
-
-    def _check_metric(self, record: Any) -> None:
-        """Refuse a metric of the observer that is none."""
-        if record["metric_settled"] not in (0, 1):
-            raise ValueError("the observer's metric is impossible")
-        if self._system.states is not None:
-            n = self._sizes[0]
-            positive_definite("metric", record["metric"].reshape(n, n))
-
-    def _check_flags(self, stage: Any, tools: Tools) -> None:
-        """Refuse a stage whose sample is impossible."""
-        flags = {name: int(stage[name]) for name in STAGE_FLAGS}
-        observed, step, sampled = stage["is_observed"], stage["step"], stage["is_sampled"]
-        if not (
-            np.isin([*flags.values(), *observed, *sampled], (0, 1)).all() and sampled.any()
-            and flags["is_complete"] == observed.all() and np.isfinite(stage["y"]).all()
-        ):
-            raise ValueError("a stage is impossible")
-        if not (
-            0.0 < step < np.inf and self._system.dt if flags["is_irregular"]
-            else step == tools.record["sample_time"]
-        ):
-            raise ValueError("a step's length is impossible")
-        saved: dict[str, Any] = {}
-        directions = self._directions
-        if flags["has_own_noise"]:
-            saved["noise_weight"] = stage["own_noise_weight"]
-        if flags["has_own_disturbance"]:
-            saved["disturbance_weight"] = directions.weight_of_w(stage["own_disturbance_weight"])
-        for letter, name in zip("wvx", SET_NAMES, strict=True):
-            if flags[f"has_own_{letter}"]:
-                sides, built = stage[f"own_{letter}"], self._system.set_of(name)
-                if built is None:
-                    raise mismatch(f"set of {name}")
-                saved[name] = directions.read_sides(name, sides, built)
-        self._reader.load(saved, tools.usual)
-
-    def _check_stage(
-        self, stage: Any, fresh: Any, following: Array, reached: Array, sizes: Array,
-        joint: Array,
-    ) -> None:
-        """Compare a stage with what the model makes of it now."""
-        weight = fresh["noise_weight"]
-        if not near(stage["noise_weight"], weight, np.abs(weight).max()):
-            raise mismatch("weight of the stages' cost")
-        for letter in "wvx":
-            if stage[f"has_own_{letter}"]:  # all but the sides is computed
-                stage[f"own_{letter}"] = fresh[f"own_{letter}"]
-        if np.isfinite(stage["cost"]) != np.isfinite(fresh["cost"]):
-            raise mismatch("model")
-        w, v = stage["w"], stage["v"]
-        sizes = np.maximum(sizes, np.abs(fresh["w"]))
-        # Residuals that cancel are rounded as their terms are.
-        if not near(v, fresh["v"], np.abs(stage["y"]) + np.abs(fresh["v"])):
-            raise mismatch("model (h)")
-        if not near(w, fresh["w"], sizes):
-            raise mismatch("observer")
-        if not np.isfinite(stage["cost"]):
-            return  # the observer may have been restarted behind it
-        if not near(following, reached, sizes):
-            raise mismatch("model (f)")
-        r = np.append(w, v)
-        # In the dimension of C: the user's cost may be one of fewer disturbances.
-        size = quadratic_form(np.abs(r)[None], np.abs(joint))[0]
-        if not near(stage["cost"], fresh["cost"], max(size, fresh["cost"])):
-            raise mismatch("cost")
-
-    def _check_rejections(self, record: Any, again: Any, places: NDArray[np.intp]) -> None:
-        """Compare the counts of its sensors with those that follow from the stages."""
-        if not self._library.layout.sensors:
-            return
-        found, expected = (
-            np.vstack((one["stages"]["rejections"][places], one["rejections_end"]))
-            for one in (record, again)
-        )
-        if (found < 0).any():
-            raise ValueError("a sensor's failures are fewer than none")
-        if not np.array_equal(found, expected):
-            raise mismatch("observer")
-
-    def _covariances_of(self, record: Any, places: NDArray[np.intp]) -> Array | None:
-        """The observer's covariances (K + 1, n, n) along the window; None if it has none."""
-        if not self._library.layout.covariance:
-            return None
-        found = np.concatenate((
-            record["stages"]["covariance"][places], record["covariance_end"][None]
-        ))
-        if not (np.isfinite(found).all() and np.isfinite(record["last_good_covariance"]).all()):
-            raise ValueError("a covariance is not finite")
-        if self._library.layout.roots:
-            ends = (record["root_end"][None], record["is_vague_end"][None])
-            parts = (record["stages"][name][places] for name in ("root", "is_vague"))
-            roots, vague = (np.concatenate(pair) for pair in zip(parts, ends, strict=True))
-            if not (np.isin(vague, (0, 1)).all() and np.isfinite(roots[vague > 0]).all()):
-                raise ValueError("a root of a covariance is impossible")
-            for root, covariance in zip(roots[vague > 0], found[vague > 0], strict=True):
-                check_root(root, covariance)
-        return found
-
-    def _check_covariance(self, following: Array, reached: Array) -> None:
-        """Compare the observer's covariance behind a stage with what follows from the stage."""
-        deviations = np.sqrt(np.abs(reached.diagonal()))
-        if not near(following, reached, np.outer(deviations, deviations)):
-            raise mismatch("observer")
-
-    def _check_terms(self, stage: Any, fresh: Any, sizes: Array, weight: Array) -> None:
-        """Compare Jacobians and terms with what the model makes of them now."""
-        n, found, expected = self._sizes[0], stage["terms"], fresh["terms"]
-        for name in ("f_jacobian", "h_jacobian"):
-            if not near(found[name], expected[name], np.abs(expected[name]).max(1, keepdims=True)):
-                raise mismatch("model (its Jacobians)")
-        sizes = np.append(np.maximum(sizes, np.abs(stage["w"])), np.abs(stage["y"]))
-        sizes[n:] += np.abs(stage["v"])
-        if self._library.layout.loss:
-            scale = np.append(expected["disturbance_scale"], expected["noise_scale"])
-            weight = weight * scale[:, None]
-        slopes = np.abs(np.vstack((expected["f_jacobian"], expected["h_jacobian"])))
-        bounds = {
-            "hessian": slopes.T @ weight @ slopes, "coupling": slopes.T @ weight[:, :n],
-            "own": slopes.T @ weight @ sizes, "following": weight[:n] @ sizes,
-        }
-        for name, bound in bounds.items():
-            if name in (found.dtype.names or ()) and not near(found[name], expected[name], bound):
-                raise mismatch("weight of the stages' cost")

@@ -28,8 +28,7 @@ class CompiledWatch(ObserverWatch):
 
     def warn(self, far: int, dropped: int, level: int) -> None:
         """Warn once, at a level of the stack, if too many consecutive samples are counted."""
-        self.counts = far, dropped
-        text = self.warning()
+        text = self.warning((far, dropped))
         if text is not None:
             warnings.warn(text, ObserverWarning, stacklevel=level + 1)
 

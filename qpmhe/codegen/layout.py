@@ -18,6 +18,7 @@ from ..estimation.constraints import Constraints
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
 from ..estimation.settings import Infeasible, Settings
+from ..memory.fields import Sizes
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -34,11 +35,6 @@ SET_NAMES = ("disturbances", "noises", "states")
 TERMS = ("prior", "disturbance", "noise")
 LOSSES = ("quadratic", "huber", "power")
 
-#: Flags of a stage.
-STAGE_FLAGS = (
-    "has_own_noise", "has_own_disturbance", "has_own_w", "has_own_v", "has_own_x", "is_irregular",
-    "is_complete",
-)
 #: What mhe_set changes, in the order of its bits.
 CHANGES = ("noise_weight", "disturbance_weight", *SET_NAMES)
 
@@ -153,6 +149,8 @@ class Layout:
             "turns": int(self.turns), "quiet": self.quiet, "held": self.held,
             "rolled": int(self.free is not None), "free": self.free or 0,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
+            "stage_members": self.sizes.c_text(True),
+            "estimator_members": self.sizes.c_text(False),
         }
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
@@ -216,13 +214,14 @@ class Layout:
     def estimate_type(self) -> np.dtype[Any]:
         """``mhe_estimate``."""
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
+        rejected = [("rejected", np.uint8, self.sensors)] if self.sensors else []
         return _struct([
             ("cost", r), ("candidate_cost", r), ("trajectory", r, (count + 1, n)),
             ("candidate", r, (count + 1, n)), ("disturbances", r, (count, n)),
             ("noises", r, (count, p)), ("observer_state", r, n), ("filtered", r, n),
             ("time", np.int64), ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, self.rows), *self._if_sensors(np.uint8, "rejected"),
+            ("dropped", np.uint8, self.rows), *rejected,
         ])
 
     def set_type(self, name: str) -> np.dtype[Any]:
@@ -280,7 +279,7 @@ class Layout:
 
     def estimator_type(self) -> np.dtype[Any]:
         """``mhe_estimator``."""
-        r, n, p, count = self.number, self.nx, self.ny, self.horizon
+        r, n, p, sizes = self.number, self.nx, self.ny, self.sizes
         terms = _struct([
             ("f_jacobian", r, (n, n)), ("h_jacobian", r, (p, n)),
             *((name, r, (n, n)) for name in ("hessian", "coupling") if self.free is None),
@@ -288,48 +287,23 @@ class Layout:
             ("disturbance_scale", r, n if self.loss else 1),
             ("noise_scale", r, p if self.loss else 1),
         ])
-        stage = _struct([
-            ("z", r, n), ("y", r, p), ("u", r, max(self.nu, 1)), ("step", r), ("w", r, n),
-            ("v", r, p), ("noise_weight", r, (p, p)), ("own_noise_weight", r, (p, p)),
-            ("own_disturbance_weight", r, (n, n)),
-            *(
-                (f"own_{letter}", self.set_type(name))
-                for letter, name, (there, _) in zip("wvx", SET_NAMES, self.sets, strict=True)
-                if there
-            ),
-            ("cost", r), *((flag, np.int32) for flag in STAGE_FLAGS), ("is_observed", np.uint8, p),
-            ("is_sampled", np.uint8, p), *self._if_covariance("covariance"),
-            *self._if_roots("root", "is_vague"), *self._if_sensors(np.int32, "rejections"),
-            ("terms", terms),
-        ])
+        kinds: dict[str, Any] = {"real": r, "terms": terms}
+        for letter, name in zip("wvx", SET_NAMES, strict=True):
+            kinds[f"{letter}_set"] = self.set_type(name)
+        stage = _struct(sizes.c_type(True, kinds))
         return _struct([
-            ("settings", np.uintp), ("time", np.int64), ("first", np.int32),
-            ("length", np.int32), ("newest", np.int32), ("has_trajectory", np.int32),
-            ("has_smoothed", np.int32), ("far", np.int32), ("dropped", np.int32),
-            ("metric_settled", np.int32), ("metric", r, self.metric_size),
-            ("smoothed", r, n), *([("trusted", r, (2, self.held))] if self.held else []),
-            ("last_good", r, n), ("z_end", r, n),
-            *self._if_covariance("last_good_covariance", "covariance_end"),
-            *self._if_roots("root_end", "is_vague_end"),
-            *self._if_sensors(np.int32, "rejections_end"),
-            ("history", r, (count + 1, n)), ("trajectory", r, (count + 1, n)),
-            ("places", np.int8, self.rows), ("stages", stage, count),
+            ("settings", np.uintp), *sizes.c_type(False, kinds), ("stages", stage, self.horizon),
         ])
-
-    def _if_sensors(self, kind: Any, name: str) -> list[Any]:
-        return [(name, kind, (self.sensors,))] if self.sensors else []
 
     @property
-    def roots(self) -> bool:
-        """Whether the covariance is propagated by its root where it has lost digits."""
-        return _OBSERVERS[self.observer] in ("extended", "unscented")
-
-    def _if_roots(self, root: str, flag: str) -> list[Any]:
-        return [(root, self.number, (self.nx, self.nx)), (flag, np.int32)] if self.roots else []
-
-    def _if_covariance(self, *names: str) -> list[Any]:
-        n = self.nx
-        return [(name, self.number, (n, n)) for name in names if self.covariance]
+    def sizes(self) -> Sizes:
+        """What the memory's table of fields needs."""
+        sets = {f"{one}_set": there for one, (there, _) in zip("wvx", self.sets, strict=True)}
+        return Sizes.of(
+            self.nx, self.ny, self.nu, self.horizon, sensors=self.sensors, held=self.held,
+            rows=self.rows, covariance=self.covariance, **sets,
+            roots=_OBSERVERS[self.observer] in ("extended", "unscented"),
+        )
 
 
 def settings_record(

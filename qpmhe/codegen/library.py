@@ -336,7 +336,7 @@ class EstimatorLibrary:
             function.restype = None
         self.amend.argtypes = [pointer, pointer, integer, pointer, pointer]
         self.reset.argtypes = [pointer, pointer, pointer]
-        self.recompute.argtypes = [pointer, pointer, pointer]
+        self.recompute.argtypes = [pointer]
         self.undo.argtypes = [pointer, pointer]
         self.set.argtypes = [
             pointer, pointer, pointer, ctypes.c_int32, pointer, ctypes.c_int32, pointer

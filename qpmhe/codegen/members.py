@@ -22,7 +22,7 @@ from ..model.system import System
 from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledWatch
-from .handover import hand_over
+from .exchange import hand_over
 from .rehearsal import checked_library
 from .watched import WatchedFunctions
 
@@ -77,9 +77,9 @@ class CompiledMembers:
 
     def hand_over(self, engines: Sequence[PythonEngine]) -> None:
         """Let new Python engines, one for each member, continue where these members stand."""
-        usual = usual_conditions(self._settings)
+        usual, library = usual_conditions(self._settings), self._library
         for record, engine in zip(self._memory, engines, strict=True):
-            hand_over(record, self._library.directions, usual, engine)
+            hand_over(record, library.layout, library.directions, usual, engine, True)
 
     def _check_trace(self, u: Array) -> None:
         """Compare trace and functions at z(t) of some members; raise where they differ."""
@@ -93,8 +93,7 @@ class CompiledMembers:
     @property
     def states(self) -> Array:
         """The current estimates (K, n)."""
-        newest = self._memory["newest"]
-        states: Array = self._memory["history"][np.arange(len(newest)), newest]
+        states: Array = self._memory["history_end"].copy()
         return states
 
     @property
@@ -118,7 +117,7 @@ class CompiledMembers:
 
         self._share(work)
         if (found["status"] & WATCHED).any():
-            far, dropped = (int(self._memory[name].max()) for name in ("far", "dropped"))
+            far, dropped = self._memory["watched"].max(axis=0).tolist()
             self._watch.warn(far, dropped, 4)
         states = slice(0, int(found["length"][0]) + 1)
         return {
@@ -137,7 +136,7 @@ class CompiledMembers:
         """Process records (K, T, p) and (K, T, m) without leaving C."""
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
         observers = self.observer_states
-        samples, dropped = ys.shape[1], self._memory["dropped"].copy()
+        samples, dropped = ys.shape[1], self._memory["watched"][:, 1].copy()
         before = None if self._next_check == math.inf or not samples else self._memory.copy()
         log = self._library.log(ys.shape[:2])
 

@@ -189,7 +189,9 @@ def model_files(model: CasadiModel) -> dict[str, str]:
 
 def header(name: str, values: dict[str, Any]) -> str:
     """The estimator's header with its sizes filled in."""
-    return Template(renamed(template("estimator.h"), name)).substitute(values, name=name)
+    members = {key: renamed(text, name) for key, text in values.items() if key.endswith("_members")}
+    text = Template(renamed(template("estimator.h"), name))
+    return text.substitute(values | members, name=name)
 
 
 def estimator_files(

@@ -13,10 +13,11 @@ from qpmhe_solvers.values import shown
 from .._checks import positive_definite, vector
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, SetError, ShapeError
+from ..memory.snapshot import checked_array, mismatch
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_set
+from .description import SET_NAMES
 from .settings import Settings
-from .snapshot import SET_NAMES, checked_array, mismatch
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

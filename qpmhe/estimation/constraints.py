@@ -16,9 +16,9 @@ from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..terms.rows import Rows, function_rows
 from .conditions import Conditions
+from .description import SET_NAMES
 from .estimate import DroppedRow
 from .limits import FEASIBLE, IN_RANGE
-from .snapshot import SET_NAMES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
-from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -19,6 +17,8 @@ from .._checks import check_problem
 from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
+from ..memory.record import Mark, Record
+from ..memory.snapshot import reading
 from ..model.residuals import difference
 from ..model.system import System
 from ..model.traces import next_check, warn_of
@@ -26,19 +26,11 @@ from ..observers import Observer
 from ..terms.sum import weight_of_first
 from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
+from .description import check_description, described
 from .estimate import Estimate, Status
 from .optimizer import Optimizer
 from .problem import Formulation, Solved
-from .recheck import check_stages
 from .settings import Settings
-from .snapshot import (
-    check_description,
-    check_size,
-    checked_array,
-    described,
-    reading,
-)
-from .stages import Mark
 from .subproblem import Subproblem
 from .watch import ObserverWatch
 from .window import Window
@@ -58,22 +50,10 @@ class Tools(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """The memory of an estimator between steps."""
+    """All that an estimator remembers, and how it goes on from there."""
 
     tools: Tools
     window: Window
-    trajectory: Array | None
-    watched: tuple[int, int]
-    history: list[Array]
-
-
-class Taken(NamedTuple):
-    """A sample as it was taken in."""
-
-    y: Array
-    u: Array
-    dt: float | None
-    own: Conditions | None
 
 
 class PythonEngine:
@@ -125,13 +105,7 @@ class PythonEngine:
         self._nearby = system.f_jacobian.nearby, system.h_jacobian.nearby
         # The time of the next comparison of the trace with the functions that it stands for.
         self._next_check: float = 0 if system.is_traced else math.inf
-        self._undo_point: tuple[Mark, Array | None, tuple[int, int], tuple[Array, ...]]
-        self._trajectory: Array | None = None  # of the last estimate
-        # The last estimates, each made at its own time: of x(t-N), ..., x(t) for re-initialised
-        # candidates, else of x(t) alone.
-        self._history: deque[Array] = deque(
-            [initial_state.copy()], maxlen=settings.horizon + 1 if self._reinitialized else 1
-        )
+        self._undo_point: Mark
 
     def _scale_constraints(self, initial_state: Array) -> None:
         """Give the nonlinear constraints the standard deviations of what they are functions of."""
@@ -178,7 +152,9 @@ class PythonEngine:
     @property
     def state(self) -> Array:
         """The current estimate."""
-        return self._history[-1].copy()
+        window = self._window
+        state: Array = window.history[window.end].copy()
+        return state
 
     @property
     def observer_state(self) -> Array:
@@ -209,13 +185,13 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 if window.length == self._settings.horizon:
                     self._solver.shift()
-                    if self._smoothed and self._trajectory is not None:
-                        window.smoothed_prior = self._trajectory[1].copy()
+                    if self._smoothed and window.trajectory is not None:
+                        window.smoothed_prior = window.trajectory[1].copy()
                 window.push(y, u, dt, own)
                 if reinitialized:
-                    window.reinitialize(self._history)
+                    window.reinitialize(window.history[window.start : window.end])
                 estimate = self._estimate(began)
-            self._history.append(estimate.state.copy())
+            window.history[window.end] = estimate.state
             self._warn()
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
@@ -238,7 +214,7 @@ class PythonEngine:
         self.set(USUAL, None)
 
     def _warn(self) -> None:
-        text = self._watch.warning()
+        text = self._watch.warning(self._window.watched)
         if text is not None:
             warnings.warn(text, ObserverWarning, stacklevel=4)
 
@@ -278,10 +254,13 @@ class PythonEngine:
                 offset = difference(
                     self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
                 )
-            if self._watch.note(offset, problem.prior.distance_weight, bool(outcome.dropped)):
+            window.watched = self._watch.counted(
+                window.watched, offset, problem.prior.distance_weight, bool(outcome.dropped)
+            )
+            if window.watched[0] >= settings.horizon:
                 status |= Status.OBSERVER_FAR
         else:
-            self._watch.counts = 0, 0
+            window.watched = 0, 0
             # The candidate's arrays are views of the window: copy.
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
@@ -316,13 +295,14 @@ class PythonEngine:
         if problem.hold is not None:
             window.trust(problem.hold, trajectory if outcome.improved else None)
         # The estimate's arrays are the user's.
-        self._trajectory = (trajectory if outcome.followed is None else outcome.followed).copy()
+        window.trajectory = (trajectory if outcome.followed is None else outcome.followed).copy()
         estimate.step_time = perf_counter() - began
         return estimate
 
     def _shifted(self) -> Array | None:
         """The previous estimate, shifted by one step of the model to the present window."""
-        window, previous = self._window, self._trajectory
+        window = self._window
+        previous = window.trajectory
         if previous is None:
             return None
         shifted = np.empty((previous.shape[0] + 1, previous.shape[1]))
@@ -335,16 +315,16 @@ class PythonEngine:
 
     def amend(self, time: int, y: Array) -> Estimate:
         """Insert a late measurement, and estimate again."""
-        began = perf_counter()
+        began, window = perf_counter(), self._window
         self._set_undo_point(True)
         try:
             with np.errstate(all="ignore"):
-                self._window.amend(time, y)
-                self._trajectory = None  # of this window already: no warm start from it
-                counts = self._watch.counts
+                window.amend(time, y)
+                window.trajectory = None  # of this window already: no warm start from it
+                watched = window.watched
                 estimate = self._estimate(began)
-                self._watch.counts = counts  # no sample more
-            self._history[-1] = estimate.state.copy()
+                window.watched = watched  # no sample more
+            window.history[window.end] = estimate.state
             return estimate
         except BaseException:
             self.undo()
@@ -354,15 +334,11 @@ class PythonEngine:
         """Save what `undo` needs; all stages where some will be rewritten."""
         one, other = self._nearby
         one.used = other.used = False
-        mark = self._window.mark(whole)
-        self._undo_point = mark, self._trajectory, self._watch.counts, tuple(self._history)
+        self._undo_point = self._window.mark(whole)
 
     def undo(self) -> None:
         """Undo the last step; the solver loses its warm start."""
-        mark, self._trajectory, self._watch.counts, history = self._undo_point
-        self._window.roll_back(mark)
-        self._history.clear()
-        self._history.extend(history)
+        self._window.roll_back(self._undo_point)
         self._tools.subproblem.forget()
         self._solver.forget()
 
@@ -370,7 +346,7 @@ class PythonEngine:
         """Forget all measurements and start at this state."""
         self._solver.forget()
         window = self._fresh_window(initial_state, self._tools)
-        self.replace(Memory(self._tools, window, None, (0, 0), [window.initial_state]))
+        self.replace(Memory(self._tools, window))
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
         """Change the conditions of all samples in the window and of later ones."""
@@ -386,15 +362,14 @@ class PythonEngine:
                 window = self._fresh_window(before.window.initial_state, tools)
                 window.take_over(before.window, changes, parameters)
                 if self._reinitialized and window.length:
-                    estimates = before.history[:-1]
-                    estimates[-window.length] = window.initial_state  # in the new X
+                    estimates = window.history[: window.end].copy()
+                    estimates[0] = window.z[0]  # in the new X
                     window.reinitialize(estimates)
                 self._solver.forget()
-                self._tools, self._window, self._trajectory = tools, window, None
+                self._tools, self._window = tools, window
                 estimate = self._estimate(began) if window.length else None
-                state = window.initial_state if estimate is None else estimate.state.copy()
-                self._history[-1] = state
-                self._watch.counts = before.watched  # no sample more
+                window.history[window.end] = window.z[0] if estimate is None else estimate.state
+                window.watched = before.window.watched  # no sample more
             return estimate
         except BaseException:
             self.replace(before)
@@ -403,9 +378,7 @@ class PythonEngine:
     @property
     def memory(self) -> Memory:
         """What `replace` restores."""
-        return Memory(
-            self._tools, self._window, self._trajectory, self._watch.counts, list(self._history)
-        )
+        return Memory(self._tools, self._window)
 
     def replace(self, memory: Memory) -> None:
         """Replace the memory: all of it or, if interrupted, nothing."""
@@ -417,51 +390,41 @@ class PythonEngine:
             raise
 
     def _use(self, memory: Memory) -> None:
-        self._tools, self._window, self._trajectory, self._watch.counts, history = memory
-        self._history = deque(history, maxlen=self._history.maxlen)
+        self._tools, self._window = memory
         self._next_check = 0 if self._system.is_traced else math.inf
 
-    def take_over(
-        self, usual: Conditions, time: int, state: Array, covariance: Array | None,
-        root: Array | None, rejections: NDArray[np.integer[Any]] | None,
-        samples: Sequence[Taken],
-        trajectory: Array | None, history: list[Array],
-        watched: tuple[int, int], smoothed: Array | None, trusted: Array | None,
+    def adopt(
+        self, usual: Conditions, record: Record, residuals: Array,
+        metric: tuple[Array, bool] | None, replay: bool,
     ) -> None:
-        """Continue from another engine, whose window starts at a time and state.
+        """Continue from another engine's record.
 
-        With the observer's covariance, its root where only that has all digits, and its sensors'
-        failures there if it has any, the samples since then, the last estimate's trajectory, the
-        last states that were estimated, the smoothed prior, and the trusted values of held
-        parameters.
+        With its joint residuals along the candidate, and the state of its `ErrorMetric`. With
+        ``replay``, the observer runs through the window's samples again.
         """
         tools = self._tools if usual is self._tools.usual else self._tools_for(usual)
-        window = self._fresh_window(state, tools)
-        window.time, window.smoothed_prior = time, smoothed
-        if window._covariances is not None and covariance is not None:
-            window._covariances[0] = covariance
-        if window._roots is not None and root is not None:
-            window._roots[0], window._vague[0] = root, True
-        if window._rejections is not None and rejections is not None:
-            window._rejections[0] = rejections
+        window = self._fresh_window(record.z[record.start], tools)
+        if window.metric is not None and metric is not None:
+            window.metric.state = metric
         with np.errstate(all="ignore"):
-            for one in samples:
-                window.push(*one)
-            if self._reinitialized and samples:
-                window.reinitialize(history[:-1])
-        window.trusted = trusted
-        self.replace(Memory(tools, window, trajectory, watched, history))
+            window.adopt(record, residuals)
+            if replay:
+                window.replay(window.length)
+                if self._reinitialized and window.length:
+                    window.reinitialize(window.history[window.start : window.end])
+        self.replace(Memory(tools, window))
 
     def run(self, ys: Array, us: Array | None) -> None:
         """None: this engine only takes one sample at a time."""
 
     def covariances(self) -> Array:
         """Covariances along the last estimate."""
-        if self._trajectory is None:
+        trajectory = self._window.trajectory
+        if trajectory is None:
             raise InvalidInputError("there is no estimate yet; call update first.")
         with np.errstate(all="ignore"):
             problem = self._tools.formulation.problem(self._window)
-            trial = problem.evaluate(self._trajectory.copy(), roll_out=False)
+            trial = problem.evaluate(trajectory.copy(), roll_out=False)
             if trial.violation == math.inf:
                 raise InvalidInputError("the model has no finite values along the estimate.")
             return window_covariances(
@@ -472,12 +435,12 @@ class PythonEngine:
 
     def solved(self) -> Solved:
         """The last step's problem and its estimate."""
-        if self._trajectory is None:
-            raise InvalidInputError("there is no estimate yet; call update first.")
         window, formulation = self._window, self._tools.formulation
+        if window.trajectory is None:
+            raise InvalidInputError("there is no estimate yet; call update first.")
         with np.errstate(all="ignore"):
             problem = formulation.problem(window)
-        return Solved(problem, formulation, self._trajectory.copy(), window.conditions)
+        return Solved(problem, formulation, window.trajectory.copy(), window.conditions)
 
     def state_dict(self) -> dict[str, Any]:
         """The memory as plain arrays and numbers; a solver's warm start is not among them."""
@@ -489,9 +452,6 @@ class PythonEngine:
             "linearized": self._with_terms,
             "usual": self._tools.usual.state_dict(),
             "window": self._window.state_dict(),
-            "history": [state.copy() for state in self._history],
-            "trajectory": None if self._trajectory is None else self._trajectory.copy(),
-            "watched": self._watch.counts,
             # How the model is called: another way would round differently.
             "modes": list(modes),
             "methods": list(methods),
@@ -532,38 +492,21 @@ class PythonEngine:
 
     def _checked_memory(self, state: dict[str, Any]) -> Memory:
         """The memory in a state."""
-        n, with_terms = self._system.n, state["linearized"]
+        with_terms = state["linearized"]
         if not isinstance(with_terms, bool):
             raise TypeError(f"linearized is {with_terms!r}")
         tools = self._tools_for(self._reader.load(state["usual"], self._tools.usual))
-        loaded, recomputed = (self._fresh_window(np.zeros(n), tools) for _ in range(2))
-        for one in (loaded, recomputed):
-            one.load_state_dict(
-                state["window"], self._system.make_timed is not None,
-                lambda own: self._reader.load(own, tools.usual),
-            )
-        if (loaded.smoothed_prior is None) == (self._smoothed and loaded.time > loaded.horizon):
-            raise ValueError("there must be a smoothed prior once the window has moved on")
-        history = [checked_array("history", one, (n,)) for one in state["history"]]
-        count = min(loaded.length + 1, self._history.maxlen or 1)
-        if len(history) != count:
-            raise ValueError(f"history has {len(history)} states; expected {count}")
-        trajectory = state["trajectory"]
-        if (trajectory is None) != (loaded.time == 0):
-            raise TypeError("there must be a trajectory if and only if there was a measurement")
-        if trajectory is not None:
-            trajectory = checked_array("trajectory", trajectory, (loaded.length + 1, n))
+        window = self._fresh_window(np.zeros(self._system.n), tools)
+        window.load_state_dict(
+            state["window"], lambda own: self._reader.load(own, tools.usual),
+            may_be_irregular=self._system.make_timed is not None, is_smoothed=self._smoothed,
             # The trajectory may be that of a surrogate, whose end is no estimate.
-            if self._cost.graduation == 1.0 and not np.array_equal(trajectory[-1], history[-1]):
-                raise ValueError("history does not end where the trajectory does")
-        same_terms = with_terms == self._with_terms
-        check_stages(recomputed, loaded, same_terms)
-        far, dropped = (
-            check_size("watched", found, lambda count: 0 <= count <= loaded.time)
-            for found in state["watched"]
+            ends_alike=self._cost.graduation == 1.0,
         )
-        window = loaded if same_terms else recomputed
-        return Memory(tools, window, trajectory, (far, dropped), history)
+        if window.has_terms and not with_terms:
+            with np.errstate(all="ignore"):
+                window.restate()
+        return Memory(tools, window)
 
     def _checked_modes(
         self, modes: Any, methods: Any

@@ -22,6 +22,7 @@ from .._checks import flag, numbers, positive, vector
 from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
+from ..memory.snapshot import read, written
 from ..model.second_derivatives import SecondDerivatives
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -36,7 +37,6 @@ from .estimate import Estimate
 from .problem import Solved
 from .run import Run, RunSource
 from .settings import Settings
-from .snapshot import read, written
 from .step_length import step_error, warn_of_step
 from .time_index import paired_record
 
@@ -733,8 +733,8 @@ class MovingHorizonEstimator:
 
         Notes
         -----
-        Every stored stage is recomputed and compared. With ``engine="auto"`` the estimator
-        continues with the snapshot's engine.
+        A digest shows damage. Functions are compared by their values at a few points. With
+        ``engine="auto"`` the estimator continues with the snapshot's engine.
         """
         memory = read(state)
         pinned = memory.get("engine")

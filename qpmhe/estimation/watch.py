@@ -21,15 +21,17 @@ class ObserverWatch:
 
     def __init__(self, horizon: int) -> None:
         self._horizon = horizon
-        #: Consecutive samples with the observer far away, and with rows dropped.
-        self.counts: tuple[int, int] = (0, 0)
         self._warned = False
 
-    def note(self, offset: Array, prior_weight: Array, dropped_rows: bool) -> bool:
-        """Count a sample; return whether the observer has been far away for long.
+    def counted(
+        self, counts: tuple[int, int], offset: Array, prior_weight: Array, dropped_rows: bool
+    ) -> tuple[int, int]:
+        """The counts after a sample.
 
         Parameters
         ----------
+        counts : (int, int)
+            Consecutive samples with the observer far away, and with rows dropped, before it.
         offset : (n,) array
             The estimate minus the observer's state.
         prior_weight : (n, n) array
@@ -37,15 +39,14 @@ class ObserverWatch:
         dropped_rows : bool
             Whether the step dropped rows.
         """
-        far, dropped = self.counts
+        far, dropped = counts
         # A comparison with NaN is false.
         far = far + 1 if offset.dot(prior_weight).dot(offset) > FAR**2 else 0
-        self.counts = far, (dropped + 1 if dropped_rows else 0)
-        return far >= self._horizon
+        return far, (dropped + 1 if dropped_rows else 0)
 
-    def warning(self) -> str | None:
-        """The warning, once, as soon as it has a reason; None otherwise."""
-        far, dropped = self.counts
+    def warning(self, counts: tuple[int, int]) -> str | None:
+        """The warning, once, as soon as the counts are a reason; None otherwise."""
+        far, dropped = counts
         if self._warned or max(far, dropped) < self._horizon:
             return None
         self._warned = True

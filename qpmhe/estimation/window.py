@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._linalg import cholesky, inverse, least_pivot
 from ..costs import Cost
+from ..memory.fields import Sizes
+from ..memory.record import Mark, Record
 from ..model.functions import contained, raised
 from ..model.sets import ConvexSet
 from ..model.system import Function, System
@@ -19,12 +22,12 @@ from ..observers.projection import ErrorMetric, NearestPoint
 from ..observers.roots import VAGUE
 from ..terms.base import read_only
 from ..terms.hold import WindowHold
-from ..terms.linearization import Stage
+from ..terms.linearization import Stage, StageTerms
 from .conditions import USUAL, Conditions
 from .estimate import Status
 from .limits import LARGEST
 from .running import RunningObservers
-from .stages import Stages, StageView, WindowView
+from .stages import StageView, Views, WindowView
 
 Array = NDArray[np.float64]
 
@@ -36,11 +39,14 @@ _PROJECTED, _PREDICTION_OUTSIDE, _METRIC_SINGULAR = (
 _SENSORS_REJECTED, _ALL_REJECTED = Status.SENSORS_REJECTED.value, Status.ALL_REJECTED.value
 _OBSERVER_RESET = Status.OBSERVER_RESET.value
 _OF_PROJECTION = _PROJECTED | _PREDICTION_OUTSIDE | _METRIC_SINGULAR
+# Views are made in advance up to this horizon: beyond it they would take more memory than the
+# arrays, and making them is a small part of a step.
+_KEPT = 1000
 # Observers run side by side if they hold at most this many numbers; otherwise `replay` does it.
 _MOST_RUNNING = 2**23
 
 
-class Window(Stages):
+class Window(Record):
     """Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
 
     Here t is ``time``, the number of samples taken: y(t-1) is the newest, and x(t) is estimated.
@@ -71,14 +77,42 @@ class Window(Stages):
         self._n, self._m = n, m
         self._quadratic = cost.quadratic
         self._with_jacobians = with_terms or observer.needs_jacobians
+        covariance, self._held = observer.initial_covariance(), list(system.held)
+        sizes = Sizes.of(
+            n, p, m, horizon, sensors=len(observer.sensors), held=len(self._held),
+            covariance=covariance is not None, majorised=not cost.quadratic,
+            roots=observer.propagates_roots,
+        )
         super().__init__(
-            n, p, m, horizon, initial_state, observer.initial_covariance(), cost.stage_weight,
-            cost.quadratic, system.dt or 0.0, len(observer.sensors), observer.propagates_roots,
+            sizes, initial_state, covariance, system.dt or 0.0, cost.stage_weight
         )
         # What the covariance restarts at where it is lost; C finds such a loss as no number.
-        self._first_covariance = observer.initial_covariance()
-        self._raises_lost = self._first_covariance is not None and observer.c_form is not None
-        self._held = list(system.held)
+        self._first_covariance = covariance
+        self._raises_lost = covariance is not None and observer.c_form is not None
+        room = self.room
+        self.terms = StageTerms(
+            room, n, p, self.linear, self.panel, self.gradient, self.next_gradient
+        )
+        # For observers and losses: a user's code cannot write into the window.
+        self._read_only_covariance = (
+            None if self.covariance is None else read_only(self.covariance)
+        )
+        self._read_only_weight = read_only(self.weight)
+        self._read_only_residuals = read_only(self.terms.residuals)
+        # Views of each stage, and of each full window by its first stage.
+        self._stage_views: Sequence[StageView] = Views(
+            room, lambda k: StageView(self, self.terms, k)
+        )
+        self._window_views: Sequence[WindowView] = Views(
+            room + 1 - horizon, lambda k: WindowView(self, self.terms, k, k + horizon)
+        )
+        if horizon <= _KEPT:
+            self._stage_views = list(self._stage_views)
+            self._window_views = list(self._window_views)
+        #: Whether any stage may weigh its disturbance in its own way.
+        self.has_disturbance_weights: bool = not cost.quadratic
+        # Time up to which running observers have taken the samples; -1 makes them start again.
+        self._advanced_to = -1
         self.trust_start()
         self._sample = Sample(system, np.zeros(m))
         self._rejects = observer.rejects
@@ -87,16 +121,19 @@ class Window(Stages):
         self._evaluating = ""  # for messages: the function that is being evaluated
         #: Flags of `Status` for the stage computed last.
         self.events: int = 0
+        #: Metric of the projection onto X, where the observer has no covariance.
+        self.metric: ErrorMetric | None = None
         # Projects the observer onto X: usually, and at the state that is being computed.
         self._usual_nearest: NearestPoint | None = None
         self._projections: dict[int, tuple[ConvexSet, NearestPoint]] = {}  # onto X of samples
         if project and system.states is not None:
             self._usual_nearest = NearestPoint(system.states)
-            if self._covariances is None or observer.metric is not None:
+            if self.covariance is None or observer.metric is not None:
                 noise = np.sqrt(inverse(cost.noise).diagonal())
                 self.metric = ErrorMetric(
                     observer, cost.initial_weight(observer.initial_covariance()), noise
                 )
+                self.slots["metric"] = self.metric
         #: Whether the observer is projected onto X.
         self.projects: bool = self._usual_nearest is not None
         self._nearest = self._usual_nearest
@@ -104,7 +141,7 @@ class Window(Stages):
         self._observers: RunningObservers | None = None
         gain, simple = observer.constant_gain, not observer.needs_jacobians
         small = horizon * horizon * (2 * n + p) <= _MOST_RUNNING
-        if reinitialized and gain is not None and small and simple and self._covariances is None:
+        if reinitialized and gain is not None and small and simple and self.covariance is None:
             self._observers = RunningObservers(gain, horizon, self._nearest, self._keep_inside)
         self._output_residual, self._state_residual = system.output_residual, system.state_residual
         self._turns = system.turns
@@ -124,29 +161,77 @@ class Window(Stages):
         )
 
     @property
+    def view(self) -> WindowView:
+        """The views of the present window, which has at least one stage."""
+        if self.end - self.start < self.horizon:
+            return WindowView(self, self.terms, self.start, self.end)
+        return self._window_views[self.start]
+
+    @property
+    def newest_failed(self) -> bool:
+        """Whether the newest stage could not be evaluated."""
+        return not math.isfinite(self.cost[self.end - 1])
+
+    @property
+    def candidate(self) -> Array:
+        """Candidate trajectory z(t-N), ..., z(t) (eq:warmstart): a view."""
+        return self.z[self.start : self.end + 1]
+
+    @property
+    def residuals(self) -> Array:
+        """Joint residuals (L(i), v_z(i)) of the candidate: a view."""
+        return self.terms.residuals[self.start : self.end]
+
+    @property
+    def measurements(self) -> Array:
+        """y, with any number where it is missing: a view."""
+        return self.y[self.start : self.end]
+
+    @property
+    def weights(self) -> Array:
+        """The stages' weights, usual or not: a view."""
+        return self.weight[self.start : self.end]
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """Which components of y are not missing: a view."""
+        return self.is_observed[self.start : self.end]
+
+    @property
+    def prior_covariance(self) -> Array | None:
+        """The observer's covariance at z(t-N), if it has one."""
+        return None if self.covariance is None else self.covariance[self.start]
+
+    @property
+    def initial_state(self) -> Array:
+        """The first state of the window."""
+        state: Array = self.z[self.start].copy()
+        return state
+
+    @property
     def has_special_weights(self) -> bool:
         """Whether some sample of the window came with another weight."""
-        return self.unusual and bool(np.count_nonzero(self._special[self.start : self.end]))
+        return self.unusual and bool(np.count_nonzero(self.is_special[self.start : self.end]))
 
     @property
     def has_irregular_steps(self) -> bool:
         """Whether some stage of the window has a step of unusual length."""
-        return self.unusual and bool(np.count_nonzero(self._irregular[self.start : self.end]))
+        return self.unusual and bool(np.count_nonzero(self.is_irregular[self.start : self.end]))
 
     @property
     def has_own_bounds(self) -> bool:
         """Whether some stage of the window has sets with other sides."""
-        return bool(self._own) and any(own.has_bounds for own in self._own.values())
+        return bool(self.own) and any(own.has_bounds for own in self.own.values())
 
     @property
     def conditions(self) -> list[Conditions]:
         """The conditions of each stage."""
-        return [self._own.get(t, USUAL) for t in range(self.time - self.length, self.time)]
+        return [self.own.get(t, USUAL) for t in range(self.time - self.length, self.time)]
 
     def moves_state(self, own: Conditions | None) -> bool:
         """Whether a sample with these conditions may project z(t) onto another X."""
         states = None if own is None else own.states
-        return states is not self._own.get(self.time - 1, USUAL).states
+        return states is not self.own.get(self.time - 1, USUAL).states
 
     def push(
         self, y: Array, u: Array, dt: float | None = None, own: Conditions | None = None
@@ -165,10 +250,10 @@ class Window(Stages):
         if m:
             view.u[...] = u
         if dt is not None:
-            self._irregular[k] = self.unusual = True
-            self._u[k, m] = dt
+            self.is_irregular[k] = self.unusual = True
+            self.u[k, m] = dt
         if own is not None:
-            self._own[time] = own
+            self.own[time] = own
             if own.noise_weight is not None or own.disturbance_weight is not None:
                 self._set_weight(k, time)
         if self._observers_ready:
@@ -181,8 +266,8 @@ class Window(Stages):
             self.events |= events
         if k + 1 - self.start > self.horizon:
             self.start += 1
-            if self._own:
-                self._own.pop(time - self.horizon, None)
+            if self.own:
+                self.own.pop(time - self.horizon, None)
 
     def _move_state(self, k: int, time: int, failed: bool) -> int:
         """Put z(t) into the X that has come with its sample; return flags of `Status`."""
@@ -195,16 +280,16 @@ class Window(Stages):
     def enter_states(self, k: int, time: int) -> None:
         """Project the state before stage k onto its X: no correction leads there."""
         nearest = self._projection(time)
-        if nearest is None or nearest.contains(self._z[k]):
+        if nearest is None or nearest.contains(self.z[k]):
             return
         if self.metric is not None:
-            self._z[k] = nearest(self._z[k], self.metric.covariance).point
-        elif self._covariances is not None:
-            self._z[k] = nearest(self._z[k], self._covariances[k]).point
+            self.z[k] = nearest(self.z[k], self.metric.covariance).point
+        elif self.covariance is not None:
+            self.z[k] = nearest(self.z[k], self.covariance[k]).point
 
     def _projection(self, time: int) -> NearestPoint | None:
         """The projection onto X at a time: the newest sample's before its own has come."""
-        states = self._own.get(min(time, self.time - 1), USUAL).states if self._own else None
+        states = self.own.get(min(time, self.time - 1), USUAL).states if self.own else None
         if states is None or self._usual_nearest is None:
             return self._usual_nearest
         if id(states) not in self._projections:
@@ -218,8 +303,8 @@ class Window(Stages):
         self._advanced_to = min(self._advanced_to, time)
         k = self.end - (self.time - time)
         new = np.abs(y) < LARGEST
-        self._y[k, new] = y[new]
-        self._observed[k] |= new
+        self.y[k, new] = y[new]
+        self.is_observed[k] |= new
         self._set_weight(k, time)
         self.replay(self.time - time)
 
@@ -228,22 +313,20 @@ class Window(Stages):
     ) -> None:
         """Take the samples of another window, with these changes, and process them again."""
         length, m = other.length, self._m
-        mine, kept = self._arrays(), other._copies()
-        for name in ("y", "u", "irregular", "observed"):
-            mine[name][:length] = kept[name]
+        kept = other.copies()
+        for name in ("y", "u", "is_irregular", "is_observed"):
+            self.rows[name][:length] = kept[name]
+        self.history[: length + 1] = kept["history"]
         if parameters is not None:
-            self._u[:length, m - parameters.size : m] = parameters
-        if self._covariances is not None:
-            self._covariances[0] = kept["covariance"][0]
-        if self._roots is not None:
-            self._roots[0], self._vague[0] = kept["root"][0], kept["vague"][0]
-        if self._rejections is not None:
-            self._rejections[0] = kept["rejections"][0]
-        self._earlier_state, self._earlier_covariance = other._last_good(other.start)
+            self.u[:length, m - parameters.size : m] = parameters
+        for field in self.sizes.fields("both", "state"):
+            self.rows[field.name][0] = kept[field.name][0]
+        self.last_good, self.last_good_covariance = other.last_good_before(other.start)
         self.smoothed_prior, self.trusted = other.smoothed_prior, other.trusted
+        self.watched = other.watched
         if self.metric is not None and other.metric is not None:
             self.metric.state = other.metric.state
-        self._own = {time: own.without(changes) for time, own in other._own.items()}
+        self.own = {time: own.without(changes) for time, own in other.own.items()}
         self.start, self.end, self.time, self.unusual = 0, length, other.time, True
         self.enter_states(0, self.time - length)
         for k in range(length):
@@ -254,11 +337,11 @@ class Window(Stages):
         """Redo the last ``steps`` stages, from another state of the observer if one is given."""
         first = self.end - steps
         if state is not None:
-            self._z[first] = state
+            self.z[first] = state
         for k in range(first, self.end):
             self._compute_stage(k, self.time - (self.end - k))
 
-    def reinitialize(self, estimates: Sequence[Array]) -> None:
+    def reinitialize(self, estimates: Array) -> None:
         """Replay the window from its first estimate; the last ones are x(t-N), ..., x(t-1)."""
         if not self._observers_ready or not self._follow(estimates):
             self.replay(self.length, estimates[-self.length])
@@ -268,7 +351,7 @@ class Window(Stages):
         """Whether observers run side by side; not before their metric is final."""
         return self._observers is not None and (self.metric is None or self.metric.settled)
 
-    def _follow(self, estimates: Sequence[Array]) -> bool:
+    def _follow(self, estimates: Array) -> bool:
         """Take the candidate from a running observer; False where `replay` has to make it."""
         observers, now, first = self._observers, self.time, self.time - self.length
         assert observers is not None
@@ -279,9 +362,9 @@ class Window(Stages):
             k = self.end - (now - time)
             self._fill_sample(k, time, self._find_observed(k, time))
             observers.nearest = self._nearest = self._projection(time + 1)
-            observers.advance(time, estimates[time - now], self._y[k], self._sample)
+            observers.advance(time, estimates[time - now], self.y[k], self._sample)
         self._advanced_to = now
-        self._z[self.start : self.end + 1], self.residuals[...], self.events = (
+        self.z[self.start : self.end + 1], self.residuals[...], self.events = (
             observers.trajectory(first, now)
         )
         self.failure = ""
@@ -305,7 +388,7 @@ class Window(Stages):
                 view.costs[...] = checked = self._evaluate_costs(residuals, read_only(weights))
                 if self.has_terms:
                     weights = self._majorise(residuals, read_only(weights))
-                    self._majorising_weights[self.start : self.end] = weights
+                    self.majorising_weight[self.start : self.end] = weights
                     checked = checked + self.terms.set_all(self.length, weights, self.start)
         except Exception:  # what the user wrote, at some stage
             return False
@@ -322,7 +405,7 @@ class Window(Stages):
             small = np.abs(y) < LARGEST
             if not small.all():  # a huge component may be the reason: without it
                 self._advanced_to = min(self._advanced_to, time)
-                self._observed[k] = observed = small
+                self.is_observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
         model_failed = not math.isfinite(cost)
@@ -333,7 +416,7 @@ class Window(Stages):
         if model_failed:
             self.events &= ~_OBSERVER_RESET
             self._fill_failed(k)
-        self._stage_costs[k] = cost
+        self.cost[k] = cost
         if observed is not None and self._is_missing(time, observed):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
@@ -369,14 +452,14 @@ class Window(Stages):
         return self._rejected_at(self.end - 1) if self._rejects else None
 
     def _rejected_at(self, k: int) -> NDArray[np.bool_]:
-        rejections = self._rejections
+        rejections = self.rejections
         assert rejections is not None
         grown: NDArray[np.bool_] = rejections[k + 1] > rejections[k]
         return grown
 
     def _report_rejected(self, k: int) -> None:
         """Add the flags of sensors that were rejected at stage k."""
-        rejected, observed = self._rejected_at(k), self._observed[k]
+        rejected, observed = self._rejected_at(k), self.is_observed[k]
         if rejected.any():
             self.events |= _SENSORS_REJECTED
             sensors = zip(self._observer.sensors, rejected, strict=True)
@@ -387,40 +470,38 @@ class Window(Stages):
         """Mark the missing components of y at stage k; return which are there, or None for all."""
         y = self._stage_views[k].y
         if not math.isfinite(y.dot(y)):
-            self._observed[k] = np.abs(y) < LARGEST  # False for NaN, too
+            self.is_observed[k] = np.abs(y) < LARGEST  # False for NaN, too
             self._set_weight(k, time)
-        elif not self.unusual or False not in self._observed[k].tolist():
+        elif not self.unusual or False not in self.is_observed[k].tolist():
             return None
-        observed: NDArray[np.bool_] = self._observed[k]
+        observed: NDArray[np.bool_] = self.is_observed[k]
         return observed
 
     def _is_missing(self, time: int, observed: NDArray[np.bool_]) -> bool:
         """Whether a component was sampled that is not there."""
-        sampled = self._own.get(time, USUAL).sampled
+        sampled = self.own.get(time, USUAL).sampled
         if sampled is None:
             return True
         return sampled.tobytes() != observed.tobytes() and bool((sampled & ~observed).any())
 
     def _set_weight(self, k: int, time: int) -> None:
         """Set the weight of stage k from its observed components and its own weights."""
-        own, observed = self._own.get(time, USUAL), self._observed[k]
+        own, observed = self.own.get(time, USUAL), self.is_observed[k]
         weights = own.noise_weight, own.disturbance_weight
         if weights[1] is not None:
             self.has_disturbance_weights = True
         if False in observed.tolist():  # NumPy's `all` takes ten times as long
             self._stage_views[k].y[~observed] = 0.0  # any number: its weight is zero
-            self._weights[k] = self._cost.partial_weight(observed, *weights)
-            self._special[k] = self.unusual = True
+            self.weight[k] = self._cost.partial_weight(observed, *weights)
+            self.is_special[k] = self.unusual = True
             return
-        weight = self._usual_weight
+        weight = usual = self._cost.stage_weight
         if any(one is not None for one in weights):
             weight = self._cost.joint_weight(*weights)
-        self._weights[k] = weight
+        self.weight[k] = weight
         # A usual weight that was given as its own is as good as none.
-        self._special[k] = weight is not self._usual_weight and not np.array_equal(
-            weight, self._usual_weight
-        )
-        self.unusual |= bool(self._special[k])
+        self.is_special[k] = weight is not usual and not np.array_equal(weight, usual)
+        self.unusual |= bool(self.is_special[k])
 
     def _evaluate_stage(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> float:
         """Evaluate the model and the observer at stage k; return its cost, or infinity."""
@@ -483,15 +564,15 @@ class Window(Stages):
     ) -> tuple[System, Array]:
         """Fill the `Sample` that the observer gets for stage k; return its model and input."""
         model, u, sample = self._system, self._stage_views[k].u, self._sample
-        own = self._own.get(time, USUAL) if self._own else USUAL
+        own = self.own.get(time, USUAL) if self.own else USUAL
         if own is not self._filled:
             self._filled = None  # an interrupt may leave half of it
             whole = own if self._usual is USUAL else own.over(self._usual)
             sample.noise_weight, sample.states = whole.noise_weight, whole.states
             sample.disturbance_weight = whole.disturbance_weight
             self._filled = own
-        if self.unusual and self._irregular[k]:
-            model, u = self._system.timed, self._u[k]
+        if self.unusual and self.is_irregular[k]:
+            model, u = self._system.timed, self.u[k]
         sample.system, sample.u, sample.observed = model, u, observed
         return model, u
 
@@ -500,15 +581,15 @@ class Window(Stages):
         sample, terms, z_next = self._sample, view.terms, view.z_next
         if self._observer.needs_jacobians:
             sample.f_jacobian, sample.h_jacobian = -terms.minus_a, -terms.minus_c
-        if self._read_only_covariances is not None:
-            sample.covariance = self._read_only_covariances[k]
-        rejections = self._rejections
+        if self._read_only_covariance is not None:
+            sample.covariance = self._read_only_covariance[k]
+        rejections = self.rejections
         if rejections is not None:
             rejections[k + 1] = rejections[k]
             sample.rejections, sample.next_rejections = rejections[k], rejections[k + 1]
         sample.root = sample.next_root = None
-        if self._roots is not None and self._vague[k]:
-            sample.root = self._roots[k]
+        if self.root is not None and self.is_vague[k]:
+            sample.root = self.root[k]
         correction, posterior = self._corrected(k, view)
         terms.disturbance[...] = correction
         predicted = z_next.copy() if self._nearest is not None else None
@@ -519,10 +600,10 @@ class Window(Stages):
             if self._turns is not None:
                 z_next[...] = self._turns(z_next)
                 predicted = None if predicted is None else self._turns(predicted)
-        if self._covariances is not None:
+        if self.covariance is not None:
             if posterior is None:
                 return False
-            self._covariances[k + 1] = posterior
+            self.covariance[k + 1] = posterior
         if not math.isfinite(z_next.dot(z_next)):
             return False
         if predicted is not None:
@@ -532,15 +613,15 @@ class Window(Stages):
     def _corrected(self, k: int, view: StageView) -> tuple[Array, Array | None]:
         """The correction and the next covariance: the first one without a correction where lost."""
         sample, arguments = self._sample, (view.arguments[0], view.error)
-        roots, found = self._roots, 0.0
+        roots, found = self.root, 0.0
         try:
             correction, posterior = self._correct(*arguments, sample)
-            if self._covariances is None or posterior is None:
+            if self.covariance is None or posterior is None:
                 return correction, posterior
             found = least_pivot(posterior)
             if found < VAGUE and roots is not None and sample.next_root is None:
                 # Digits that matter may be lost: the same from a root of what has them all.
-                roots[k], self._vague[k] = cholesky(self._covariances[k]).T, True
+                roots[k], self.is_vague[k] = cholesky(self.covariance[k]).T, True
                 sample.root = roots[k]
                 correction, posterior = self._correct(*arguments, sample)
                 found = least_pivot(posterior)
@@ -553,13 +634,13 @@ class Window(Stages):
             # As the prior's weight, what is no covariance would make J negative.
             self.events |= _OBSERVER_RESET
             posterior = self._first_covariance
-            if self._rejections is not None:
-                self._rejections[k + 1] = 0
+            if self.rejections is not None:
+                self.rejections[k + 1] = 0
             if self._observer.constant_gain is None:
                 correction = np.zeros_like(view.z)
         if roots is not None:
             following = sample.next_root if 0.0 <= found < VAGUE else None
-            self._vague[k + 1] = following is not None
+            self.is_vague[k + 1] = following is not None
             if following is not None:
                 roots[k + 1] = following
         return correction, posterior
@@ -638,15 +719,15 @@ class Window(Stages):
 
     def _cost_and_terms(self, k: int) -> float:
         """Compute the cost of stage k, or infinity, and the terms that are still missing."""
-        weight, stage = self._read_only_weights[k], self._stage_views[k].terms
+        weight, stage = self._read_only_weight[k], self._stage_views[k].terms
         terms, residual = self.terms, self._read_only_residuals[k]
         try:
             cost = float(self._evaluate_costs(residual[None], weight)[0])
             if not math.isfinite(cost):
                 return math.inf
             if self.has_terms and not self._quadratic:
-                self._majorising_weights[k] = self._majorise(residual[None], weight)[0]
-                weight = self._majorising_weights[k]
+                self.majorising_weight[k] = self._majorise(residual[None], weight)[0]
+                weight = self.majorising_weight[k]
         except Exception as error:  # a user's loss
             self.failure = raised("the cost", error, self._stage_views[k].z)
             return math.inf
@@ -662,28 +743,42 @@ class Window(Stages):
 
     def _fill_failed(self, k: int) -> None:
         """Fill a stage at which the model failed: z stays at its last good value, no residual."""
-        self._z[k + 1], covariance = self._last_good(k)
-        if self._covariances is not None:
-            self._covariances[k + 1] = covariance
-            self._vague[k + 1] = False
-        if self._rejections is not None:
-            self._rejections[k + 1] = self._rejections[k]
+        self.z[k + 1], covariance = self.last_good_before(k)
+        if self.covariance is not None:
+            self.covariance[k + 1] = covariance
+            self.is_vague[k + 1] = False
+        if self.rejections is not None:
+            self.rejections[k + 1] = self.rejections[k]
+        self._fill_terms(k)
+
+    def _fill_terms(self, k: int) -> None:
+        """Fill in the terms of a stage at which the model failed: no residual."""
         stage = self._stage_views[k].terms
         stage.linear[:, 0], stage.linear[:, 1:] = 0.0, self._minus_stand_in
-        self._majorising_weights[k] = self._weights[k]
+        self.majorising_weight[k] = self.weight[k]
         if self.has_terms:
-            self.terms.set_stage(stage, self._weights[k])
+            self.terms.set_stage(stage, self.weight[k])
 
     @property
     def observer_state(self) -> Array:
         """z(t), the observer's newest state: a view."""
-        newest: Array = self._z[self.end]
+        newest: Array = self.z[self.end]
         return newest
+
+    def roll_back(self, mark: Mark) -> None:
+        """Undo all changes since a mark; see `Record.roll_back`."""
+        self._advanced_to = -1
+        super().roll_back(mark)
+
+    def load_state_dict(self, *arguments: Any, **options: Any) -> None:
+        """Load a snapshot; see `Record.load_state_dict`."""
+        super().load_state_dict(*arguments, **options)
+        self.has_disturbance_weights = True
 
     def trust_start(self) -> None:
         """Trust the initial state's values of the parameters that are held."""
         if self._held:
-            self.trusted = np.tile(self._z[0, self._held], (2, 1))
+            self.trusted = np.tile(self.z[0, self._held], (2, 1))
 
     def trust(self, hold: WindowHold, trajectory: Array | None) -> None:
         """Let the next window's trusted values follow an estimate; None leaves them."""
@@ -692,9 +787,33 @@ class Window(Stages):
             following = hold.followed(trajectory[int(self.length == self.horizon)])
         self.trusted = np.stack((hold.target, following))
 
+    def adopt(self, record: Record, residuals: Array) -> None:
+        """Go on from another engine's record, with its joint residuals along the candidate."""
+        self.copy_from(record)
+        self.terms.residuals[: self.end] = residuals
+        for k in range(self.end):
+            self._set_weight(k, self.time - (self.end - k))
+        self.restate()
+
+    def restate(self) -> None:
+        """Compute what QPs need of all stages, from the samples, the states and the residuals."""
+        for k in range(self.start, self.end):
+            view, time = self._stage_views[k], self.time - (self.end - k)
+            following, error = view.z_next.copy(), view.error.copy()
+            observed = self.is_observed[k]
+            if not math.isfinite(self.cost[k]):
+                self._fill_terms(k)
+                continue
+            try:
+                self._evaluate_model(k, time, view, None if observed.all() else observed)
+            except Exception:  # outside of the model's domain, which it was not before
+                view.terms.linear[:, 1:] = self._minus_stand_in
+            view.z_next[...], view.terms.noise[...] = following, error
+            self._cost_and_terms(k)
+
     def restart(self, state: Array) -> None:
         """Set z(t), the observer's newest state, after a failed stage."""
-        self._z[self.end] = state
+        self.z[self.end] = state
 
     @property
     def candidate_cost(self) -> float:
@@ -721,7 +840,7 @@ class Window(Stages):
     def inputs(self) -> Array:
         """The inputs u, and the step lengths in a last column if some are irregular: a view."""
         columns = None if self.has_irregular_steps else self._m
-        return self._u[self.start : self.end, :columns]
+        return self.u[self.start : self.end, :columns]
 
     @property
     def model(self) -> System:
@@ -738,4 +857,4 @@ class Window(Stages):
         """`stage_weights` of the quadratic form that majorises the cost at the candidate."""
         if self._cost.quadratic:
             return self.stage_weights
-        return self._majorising_weights[self.start : self.end]
+        return self.majorising_weight[self.start : self.end]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import Array
+from .._checks import Array, positive_definite
 from .._linalg import inverse
+from ..memory.snapshot import checked_array
 from ..model.sets import ConvexSet
 from .base import Observer, Sample
 
@@ -243,6 +244,18 @@ class ErrorMetric:
     @state.setter
     def state(self, state: tuple[Array, bool]) -> None:
         self.covariance, self.settled = state
+
+    def state_dict(self) -> tuple[Array, bool]:
+        """A copy of the state."""
+        return self.covariance.copy(), self.settled
+
+    def checked(self, saved: Any) -> tuple[Array, bool]:
+        """The state that `state_dict` saved; raises any exception if it is damaged."""
+        covariance, settled = saved
+        if not isinstance(settled, bool):
+            raise TypeError(f"metric is {settled!r}")
+        checked = checked_array("metric", covariance, self.covariance.shape)
+        return positive_definite("metric", checked), settled
 
     def settle(self, z: Array, a: Array, c: Array, sample: Sample) -> None:
         """Take the Lyapunov matrix at z with the Jacobians a of f and c of h, if E is stable."""

@@ -84,6 +84,8 @@ class StageTerms:
     - ``gradient[i]``: :math:`-G_i^\top W_i r_i`, with respect to :math:`d_i`;
     - ``next_gradient[i]``: :math:`Q_i w_i`, with respect to :math:`d_{i+1}`.
 
+    Its arrays are those given, in the order of the attributes, or its own.
+
     Attributes
     ----------
     linear : (stages, n + p, 1 + n) array
@@ -99,19 +101,17 @@ class StageTerms:
         "_zeros", "gradient", "linear", "next_gradient", "panel", "residuals",
     )
 
-    names = ("linear", "panel", "gradient", "next_gradient")
-
-    def __init__(self, stages: int, n: int, p: int) -> None:
-        q = n + p
-        self.linear: Array = np.zeros((stages, q, 1 + n))
+    def __init__(self, stages: int, n: int, p: int, *arrays: Array) -> None:
+        q, wide = n + p, 1 + n
+        if not arrays:
+            shapes = (stages, q, wide), (stages, n, 2 * n), (stages, n), (stages, n)
+            arrays = tuple(np.zeros(shape) for shape in shapes)
+        self.linear, self.panel, self.gradient, self.next_gradient = arrays
         self.residuals: Array = self.linear[:, :, 0]
-        self.panel: Array = np.zeros((stages, n, 2 * n))
-        self.gradient: Array = np.zeros((stages, n))
-        self.next_gradient: Array = np.zeros((stages, n))
         # Workspace for one stage, with M = [r, -G]: M^T W M, then W M, then a number that stays 0.
-        self._flat = np.zeros((1 + n) ** 2 + q * (1 + n) + 1)
-        self._square = self._flat[: (1 + n) ** 2].reshape(1 + n, 1 + n)
-        self._weighted = self._flat[(1 + n) ** 2 : -1].reshape(q, 1 + n)
+        self._flat = np.zeros(wide**2 + q * wide + 1)
+        self._square = self._flat[: wide**2].reshape(wide, wide)
+        self._weighted = self._flat[wide**2 : -1].reshape(q, wide)
         self._zeros = np.zeros(self._flat.size)
         # First columns: that of M^T W M is -G^T W r below its corner, that of W M begins with Q w.
         self._gradient_column, self._next_column = self._square[1:, 0], self._weighted[:n, 0]
@@ -143,9 +143,6 @@ class StageTerms:
         costs: Array = flat[:, 0] + flat.dot(self._zeros)
         return costs
 
-    def arrays(self) -> dict[str, Array]:
-        """The arrays, each with one entry a stage."""
-        return {name: getattr(self, name) for name in self.names}
 
 
 def _panel_index(n: int, p: int) -> NDArray[np.intp]:

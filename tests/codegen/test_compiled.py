@@ -11,7 +11,7 @@ import qpmhe
 from qpmhe import Status
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import InvalidInputError
-from qpmhe.estimation.snapshot import read
+from qpmhe.memory.snapshot import read
 
 from .cases import Case, case, recorded, spd
 from .test_agreement import ARRAYS, agree
@@ -168,20 +168,29 @@ def test_damaged_snapshots_are_refused_whole():
         mhe.update(**sample)
         twin.update(**sample)
     good = read(mhe.state_dict())
-    memory = good["memory"]
     damaged = [{}, {**good, "problem": (2, 1, 0, 99)}, {**good, "engine": "python"}]
-    damaged += [{**good, "memory": bad} for bad in (None, memory[:-1], np.full_like(memory, 255))]
-    for name, value in (
-        ("history", NAN), ("z_end", NAN), ("last_good", INF), ("trajectory", NAN),
-        ("is_observed", 2), ("is_complete", 0), ("step", -1.0), ("first", 9), ("far", -1),
+    damaged += [{**good, part: bad} for part in ("window", "compiled") for bad in (None, {}, [])]
+    for part, name, value in (
+        ("window", "history", NAN), ("window", "z", NAN), ("window", "last_good", INF),
+        ("window", "trajectory", NAN), ("window", "u", -1.0), ("window", "cost", -1.0),
+        ("window", "watched", (0, -1)), ("window", "time", 3), ("compiled", "w", NAN),
+        ("compiled", "noise_weight", INF), ("compiled", "terms", None),
+        ("compiled", "places", None),
     ):
-        changed = memory.copy()
-        record = changed.view(mhe._engine._memory.dtype)
-        (record if name in record.dtype.names else record["stages"])[name].flat[0] = value
-        damaged.append({**good, "memory": changed})
+        changed = good[part][name]
+        if value is None:
+            changed = changed[:-1]
+        elif isinstance(changed, np.ndarray):
+            changed = changed.copy()
+            changed.flat[-1] = value
+        else:
+            changed = value
+        damaged.append({**good, part: {**good[part], name: changed}})
+    before = mhe._engine._memory.tobytes()
     for state in damaged:
         with pytest.raises(InvalidInputError):
             mhe._engine.load_state_dict(state)
+        assert mhe._engine._memory.tobytes() == before
     for sample in one.samples[2:6]:
         equal(mhe.update(**sample), twin.update(**sample))
 

@@ -16,7 +16,7 @@ import qpmhe
 from qpmhe.codegen import compiler, fingerprint, folders, library, rehearsal
 from qpmhe.codegen.compiler import compiled_library, find_compiler
 from qpmhe.errors import CompilationError, EngineWarning, InvalidInputError, OptionError
-from qpmhe.estimation.snapshot import read, written
+from qpmhe.memory.snapshot import read, written
 
 from .cases import CASES, case
 

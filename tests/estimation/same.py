@@ -6,7 +6,7 @@ import sys
 import numpy as np
 
 import qpmhe
-from qpmhe.estimation.snapshot import read
+from qpmhe.memory.snapshot import read
 
 WITHIN = str(pathlib.Path(qpmhe.__file__).parent)
 NAMES = ("trajectory", "state", "filtered", "candidate", "disturbances", "noises")

@@ -61,7 +61,7 @@ static const mhe_x_set *mhe_x_set_at(const mhe_settings *s, const mhe_stage *sta
 /* Take a sample's measurement and what it comes with. */
 static void mhe_take_conditions(const mhe_settings *s, mhe_stage *stage, const mhe_sample *sample)
 {
-    stage->step = sample->step > 0 ? sample->step : s->sample_time;
+    stage->u[NU] = sample->step > 0 ? sample->step : s->sample_time;
     stage->is_irregular = sample->step > 0;
     stage->has_own_noise = sample->noise_weight != 0;
     if (stage->has_own_noise)

@@ -259,65 +259,15 @@ typedef struct {
     mhe_real disturbance_scale[MHE_LOSS ? MHE_NX : 1], noise_scale[MHE_LOSS ? MHE_NY : 1];
 } mhe_terms;
 
+/* One sample of the window, the observer there, and what is computed from both. */
 typedef struct {
-    mhe_real z[MHE_NX], y[MHE_NY], u[MHE_SIZE(MHE_NU)], step;
-    mhe_real w[MHE_NX], v[MHE_NY]; /* residuals of the candidate */
-    mhe_real noise_weight[MHE_NY * MHE_NY]; /* of the components that are observed */
-    mhe_real own_noise_weight[MHE_NY * MHE_NY], own_disturbance_weight[MHE_NX * MHE_NX];
-#if MHE_W_SET
-    mhe_w_set own_w;
-#endif
-#if MHE_V_SET
-    mhe_v_set own_v;
-#endif
-#if MHE_X_SET
-    mhe_x_set own_x;
-#endif
-    mhe_real cost;                 /* infinite where the model could not be evaluated */
-    int32_t has_own_noise, has_own_disturbance, has_own_w, has_own_v, has_own_x;
-    int32_t is_irregular, is_complete;
-    uint8_t is_observed[MHE_NY], is_sampled[MHE_NY];
-#if MHE_COVARIANCE
-    mhe_real covariance[MHE_NX * MHE_NX]; /* of the observer's error at z */
-#endif
-#if MHE_ROOTS
-    mhe_real root[MHE_NX * MHE_NX]; /* upper triangular U, U'U the covariance, if that is vague */
-    int32_t is_vague;
-#endif
-#if MHE_SENSORS
-    int32_t rejections[MHE_SENSORS]; /* how often in a row each has failed before */
-#endif
-    mhe_terms terms;
+$stage_members
 } mhe_stage;
 
+/* All that an estimator remembers. Names that end in _end are of the state behind the last stage. */
 typedef struct {
     const mhe_settings *settings;
-    int64_t time;                  /* samples taken */
-    int32_t first, length;         /* the window in the ring of stages */
-    int32_t newest, has_trajectory;
-    int32_t has_smoothed;          /* whether there is a smoothed prior */
-    int32_t far, dropped;          /* samples running with a far observer, with rows dropped */
-    int32_t metric_settled;        /* whether the metric below is for good */
-    mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)]; /* of the observer, as a covariance */
-    mhe_real smoothed[MHE_NX];     /* the prior in place of the window's first z */
-#if MHE_HELD
-    mhe_real trusted[2 * MHE_HELD]; /* values of held parameters: for this window and the next */
-#endif
-    mhe_real last_good[MHE_NX];    /* of the stages that have left the window */
-    mhe_real z_end[MHE_NX];        /* the observer's state behind the last stage */
-#if MHE_COVARIANCE
-    mhe_real last_good_covariance[MHE_NX * MHE_NX], covariance_end[MHE_NX * MHE_NX];
-#endif
-#if MHE_ROOTS
-    mhe_real root_end[MHE_NX * MHE_NX];
-    int32_t is_vague_end;
-#endif
-#if MHE_SENSORS
-    int32_t rejections_end[MHE_SENSORS];
-#endif
-    mhe_real history[(MHE_HORIZON + 1) * MHE_NX]; /* ring of estimates of x(t), newest last */
-    mhe_real trajectory[(MHE_HORIZON + 1) * MHE_NX];
-    int8_t places[MHE_ROWS];       /* of the window's rows in the last QP's active set */
+$estimator_members
     mhe_stage stages[MHE_HORIZON];
 } mhe_estimator;
 
@@ -484,10 +434,8 @@ void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspac
 void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspace,
              int64_t samples, const mhe_real *y, const mhe_real *u, const mhe_log *log);
 
-/* Compute the stages of the window again, each from its own state and sample, to check an
- * estimator that was saved. `reached`: MHE_HORIZON states, the one behind each stage;
- * `covariances`: the same of the observer's, if it has them. */
-void mhe_recompute(mhe_estimator *estimator, mhe_real *reached, mhe_real *covariances);
+/* Compute what QPs need of the stages, where an estimator that was saved had no QPs. */
+void mhe_recompute(mhe_estimator *estimator);
 
 #if MHE_LAPACK
 /* Call this first: dpotrf, dtrsm, dsyrk and dgemm, by Fortran's convention with 32-bit integers. */

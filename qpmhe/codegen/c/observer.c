@@ -645,11 +645,11 @@ static int mhe_correction(const mhe_settings *s, const mhe_stage *stage, real *o
     real at[NX], middle[NX], state[NX], P[NX * NX], root[NX * NX];
     mhe_see_judged(s, stage, &seen, P, root, next);
     mhe_sigma_points(s, stage, P, stage->is_vague ? root : 0, &sigma);
-    mhe_f(stage->z, stage->u, stage->step, middle);
+    mhe_f(stage->z, stage->u, stage->u[NU], middle);
     for (int k = 0; k < POINTS; k++) {
         real *change = ahead + k * NX;
         for (int j = 0; j < NX; j++) at[j] = stage->z[j] + sigma.moves[k * NX + j];
-        mhe_f(at, stage->u, stage->step, state);
+        mhe_f(at, stage->u, stage->u[NU], state);
         for (int j = 0; j < NX; j++) change[j] = state[j] - middle[j];
         mhe_wrap_state(s, state, change);
         for (int j = 0; j < NX; j++) change[j] *= sigma.roots[k % NX];

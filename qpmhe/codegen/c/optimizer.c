@@ -361,7 +361,7 @@ static void mhe_shift(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int be
     mhe_stage *last = mhe_stage_at(e, count - 1);
     real *x = o->spare->x;
     memcpy(x, e->trajectory + skipped * NX, sizeof(real) * (size_t)count * NX);
-    mhe_f(x + (count - 1) * NX, last->u, last->step, x + count * NX);
+    mhe_f(x + (count - 1) * NX, last->u, last->u[NU], x + count * NX);
     mhe_clip_trial(e, k, o->spare);
     mhe_evaluate(e, k, o->spare);
 }

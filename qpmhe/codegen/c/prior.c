@@ -96,10 +96,10 @@ static real mhe_move_prior(mhe_estimator *e, mhe_workspace *k)
 {
     real offset[NX];
     if (!e->has_smoothed) return 0;
-    for (int j = 0; j < NX; j++) offset[j] = mhe_stage_at(e, 0)->z[j] - e->smoothed[j];
+    for (int j = 0; j < NX; j++) offset[j] = mhe_stage_at(e, 0)->z[j] - e->smoothed_prior[j];
     mhe_wrap_state(e->settings, mhe_stage_at(e, 0)->z, offset);
     const real cost = mhe_prior_cost(e->settings, k, offset);
     if (!isfinite(cost)) return 0;
-    k->prior.mean = e->smoothed;
+    k->prior.mean = e->smoothed_prior;
     return k->factors[0] * cost;
 }

@@ -1,11 +1,5 @@
 /* What the caller sees. */
 
-static void mhe_remember(mhe_estimator *e, const real *state)
-{
-    e->newest = e->newest < MHE_HORIZON ? e->newest + 1 : 0;
-    memcpy(e->history + e->newest * NX, state, sizeof(real) * NX);
-}
-
 /* Count consecutive samples in which the observer was far from the estimate, or rows dropped. */
 static void mhe_watch(mhe_estimator *e, const mhe_workspace *k, mhe_outcome *o)
 {
@@ -14,9 +8,10 @@ static void mhe_watch(mhe_estimator *e, const mhe_workspace *k, mhe_outcome *o)
         offset[j] = o->best->x[e->length * NX + j] - o->candidate->x[e->length * NX + j];
     mhe_wrap_state(e->settings, o->best->x + e->length * NX, offset);
     const int far = mhe_form(NX, k->prior.distance_weight, offset) > MHE_FAR * MHE_FAR;
-    e->far = far ? e->far + (e->far < INT32_MAX) : 0;
-    e->dropped = o->rows_dropped ? e->dropped + (e->dropped < INT32_MAX) : 0;
-    if (e->far >= MHE_HORIZON) o->events |= MHE_OBSERVER_FAR;
+    const int counted[] = {far, o->rows_dropped};
+    for (int i = 0; i < 2; i++)
+        e->watched[i] = counted[i] ? e->watched[i] + (e->watched[i] < INT32_MAX) : 0;
+    if (e->watched[0] >= MHE_HORIZON) o->events |= MHE_OBSERVER_FAR;
 }
 
 /* Estimate on the window as it stands, and keep what the next step needs. */
@@ -71,7 +66,7 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
     const int before = e->has_trajectory ? e->length : -1;
     mhe_begin(e, k);
     if (e->settings->smooth && e->has_trajectory && e->length == MHE_HORIZON) {
-        memcpy(e->smoothed, e->trajectory + NX, sizeof e->smoothed);
+        memcpy(e->smoothed_prior, e->trajectory + NX, sizeof e->smoothed_prior);
         e->has_smoothed = 1;
     }
 #if MHE_HELD
@@ -82,14 +77,12 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
 #endif
     int events = mhe_push(e, sample);
     if (e->settings->reinitialize) {
-        /* The ring of estimates reaches back to that of the window's first state. */
-        int at = e->newest - (e->length - 1);
-        if (at < 0) at += MHE_HORIZON + 1;
-        memcpy(mhe_stage_at(e, 0)->z, e->history + at * NX, sizeof(real) * NX);
+        mhe_stage *oldest = mhe_stage_at(e, 0);
+        memcpy(oldest->z, oldest->history, sizeof oldest->z);
         events = (events & MHE_DERIVATIVE_NEARBY) | mhe_replay(e, 0);
     }
     mhe_estimate_now(e, k, o, events, before);
-    mhe_remember(e, o->best->x + e->length * NX);
+    memcpy(e->history_end, o->best->x + e->length * NX, sizeof e->history_end);
 }
 
 #if MHE_SENSORS
@@ -158,7 +151,7 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
     }
 #endif
     memcpy(e->last_good, e->z_end, sizeof e->last_good);
-    memcpy(e->history, e->z_end, sizeof e->z_end);
+    memcpy(e->history_end, e->z_end, sizeof e->z_end);
 #if MHE_HELD
     mhe_trust_start(e);
 #endif
@@ -230,11 +223,12 @@ void mhe_update_members(mhe_estimator *estimators, int64_t members, mhe_workspac
 static void mhe_estimate_again(mhe_estimator *e, mhe_workspace *k, int failed, mhe_estimate *out)
 {
     mhe_outcome outcome;
-    const int32_t far = e->far, dropped = e->dropped;
+    int32_t watched[2];
+    memcpy(watched, e->watched, sizeof watched);
     /* The kept trajectory does not belong to the window before this one. */
     mhe_estimate_now(e, k, &outcome, failed, -1);
-    e->far = far, e->dropped = dropped; /* no sample more */
-    memcpy(e->history + e->newest * NX, outcome.best->x + e->length * NX, sizeof(real) * NX);
+    memcpy(e->watched, watched, sizeof watched); /* no sample more */
+    memcpy(e->history_end, outcome.best->x + e->length * NX, sizeof e->history_end);
     mhe_fill(e, k, &outcome, out);
 }
 
@@ -273,7 +267,7 @@ void mhe_set(mhe_estimator *e, mhe_workspace *k, const mhe_settings *settings, i
     /* The window's first state, or the only one there is. */
     mhe_put_inside(e, e->length ? mhe_x_set_at(settings, mhe_stage_at(e, 0)) : &settings->states,
                    mhe_next_covariance(e, -1), mhe_next_state(e, -1));
-    if (!e->length) memcpy(e->history + e->newest * NX, e->z_end, sizeof e->z_end);
+    if (!e->length) memcpy(e->history_end, e->z_end, sizeof e->z_end);
 #endif
     if (e->length) mhe_estimate_again(e, k, mhe_replay(e, 0), out);
 }
@@ -305,39 +299,14 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
     }
 }
 
-void mhe_recompute(mhe_estimator *e, real *reached, real *covariances)
+void mhe_recompute(mhe_estimator *e)
 {
+    const mhe_settings *s = e->settings;
     for (int i = 0; i < e->length; i++) {
-        mhe_set_noise_weight(e->settings, mhe_stage_at(e, i));
-        mhe_complete_own_sets(e->settings, mhe_stage_at(e, i));
-    }
-    for (int i = 0; i < e->length; i++) {
-        real *next = mhe_next_state(e, i), kept[NX];
-        memcpy(kept, next, sizeof kept);
-#if MHE_COVARIANCE
-        real *following = mhe_next_covariance(e, i), kept_covariance[NX * NX];
-        memcpy(kept_covariance, following, sizeof kept_covariance);
-#endif
-#if MHE_ROOTS
-        mhe_stage *behind = i + 1 < e->length ? mhe_stage_at(e, i + 1) : 0;
-        real *root = behind ? behind->root : e->root_end, kept_root[NX * NX];
-        int32_t *is_vague = behind ? &behind->is_vague : &e->is_vague_end;
-        const int32_t was_vague = *is_vague;
-        memcpy(kept_root, root, sizeof kept_root);
-#endif
-        mhe_enter(e, i, 0);
-#if MHE_ROOTS
-        memcpy(root, kept_root, sizeof kept_root);
-        *is_vague = was_vague;
-#endif
-        memcpy(reached + i * NX, next, sizeof kept);
-        memcpy(next, kept, sizeof kept);
-#if MHE_COVARIANCE
-        memcpy(covariances + i * NX * NX, following, sizeof kept_covariance);
-        memcpy(following, kept_covariance, sizeof kept_covariance);
-#else
-        (void)covariances;
-#endif
+        mhe_stage *stage = mhe_stage_at(e, i);
+        real next[NX], output[NY];
+        mhe_linear(s, stage->z, stage, next, output, &stage->terms);
+        mhe_enter_terms(s, stage);
     }
 }
 

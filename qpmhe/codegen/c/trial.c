@@ -25,7 +25,7 @@ static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
         const mhe_stage *stage = mhe_stage_at(e, i);
         real *x = trial->x + i * NX;
         real *w = trial->w + i * NX, *v = trial->v + i * NY, predicted[NX], output[NY];
-        mhe_f(x, stage->u, stage->step, predicted);
+        mhe_f(x, stage->u, stage->u[NU], predicted);
         mhe_h(x, stage->u, output);
 #if MHE_W_SET
         const mhe_w_set *set = &s->disturbances;

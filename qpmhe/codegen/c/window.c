@@ -62,7 +62,7 @@ static int mhe_fill_rows(int count, real *jacobian, const real *other)
 static int mhe_linear(const mhe_settings *s, const real *x, const mhe_stage *stage, real *next,
                        real *output, mhe_terms *t)
 {
-    mhe_f_jacobian(x, stage->u, stage->step, next, t->f_jacobian);
+    mhe_f_jacobian(x, stage->u, stage->u[NU], next, t->f_jacobian);
     mhe_h_jacobian(x, stage->u, output, t->h_jacobian);
     int helped = 0;
     for (int aside = !MHE_X_SET; aside < 2; aside++) {
@@ -76,7 +76,7 @@ static int mhe_linear(const mhe_settings *s, const real *x, const mhe_stage *sta
             at[j] = above < s->inner_upper[j] ? above : s->inner_upper[j];
         }
         if (!f) {
-            mhe_f_jacobian(at, stage->u, stage->step, unused, f_there);
+            mhe_f_jacobian(at, stage->u, stage->u[NU], unused, f_there);
             helped |= mhe_fill_rows(NX, t->f_jacobian, f_there);
         }
         if (!h) {
@@ -172,7 +172,7 @@ static real mhe_advance(mhe_estimator *e, int i, int linear, real *next, const m
     if (linear) {
         *events |= mhe_linear(s, stage->z, stage, predicted, output, &stage->terms);
     } else {
-        mhe_f(stage->z, stage->u, stage->step, predicted);
+        mhe_f(stage->z, stage->u, stage->u[NU], predicted);
         mhe_h(stage->z, stage->u, output);
     }
     for (int j = 0; j < NY; j++) v[j] = stage->y[j] - output[j];
@@ -195,6 +195,21 @@ static real mhe_advance(mhe_estimator *e, int i, int linear, real *next, const m
     return isfinite(cost) ? cost : INFINITY;
 }
 
+/* Set a stage's terms from its residuals and Jacobians; whether the model had finite ones. */
+static int mhe_enter_terms(const mhe_settings *s, mhe_stage *stage)
+{
+    mhe_terms *t = &stage->terms;
+    const int finite = isfinite(stage->cost) && mhe_all_finite(NX * NX, t->f_jacobian) &&
+                       mhe_all_finite(NY * NX, t->h_jacobian);
+    if (!finite) {
+        memset(t->f_jacobian, 0, sizeof t->f_jacobian);
+        memset(t->h_jacobian, 0, sizeof t->h_jacobian);
+        for (int j = 0; j < NX; j++) t->f_jacobian[j * NX + j] = 1;
+    }
+    mhe_set_terms(s, 0, stage, stage->w, stage->v, t);
+    return finite;
+}
+
 /* Compute stage i of the window from z(i) and its sample; bits of the status: MODEL_FAILED where the
  * model has no finite values (held) or only no finite Jacobians. The observer goes on in X, or in
  * `onto` if there is one. */
@@ -202,7 +217,6 @@ static int mhe_enter(mhe_estimator *e, int i, const mhe_x_set *onto)
 {
     const mhe_settings *s = e->settings;
     mhe_stage *stage = mhe_stage_at(e, i);
-    mhe_terms *t = &stage->terms;
     const int linear = s->max_qps > 0, derived = linear || MHE_OBSERVER == MHE_EXTENDED;
     real *next = mhe_next_state(e, i), *following = mhe_next_covariance(e, i);
     int32_t *rejections = mhe_next_rejections(e, i);
@@ -233,16 +247,8 @@ static int mhe_enter(mhe_estimator *e, int i, const mhe_x_set *onto)
 #if MHE_INNOVATION == MHE_GATED
     events |= mhe_rejection(s, stage, rejections);
 #endif
-    if (!linear) return held ? events | MHE_MODEL_FAILED : events;
-    const int finite = mhe_all_finite(NX * NX, t->f_jacobian) &&
-                       mhe_all_finite(NY * NX, t->h_jacobian);
-    if (held || !finite) {
-        memset(t->f_jacobian, 0, sizeof t->f_jacobian);
-        memset(t->h_jacobian, 0, sizeof t->h_jacobian);
-        for (int j = 0; j < NX; j++) t->f_jacobian[j * NX + j] = 1;
-    }
-    mhe_set_terms(s, 0, stage, stage->w, stage->v, t);
-    return held || !finite ? events | MHE_MODEL_FAILED : events;
+    const int failed = linear ? !mhe_enter_terms(s, stage) : held;
+    return failed ? events | MHE_MODEL_FAILED : events;
 }
 
 /* Redo all stages from i on; bits of the status: of the last one, and whether a derivative of any was
@@ -298,6 +304,7 @@ static int mhe_push(mhe_estimator *e, const mhe_sample *sample)
     }
     mhe_stage *stage = mhe_stage_at(e, e->length - 1);
     memcpy(stage->z, e->z_end, sizeof stage->z);
+    memcpy(stage->history, e->history_end, sizeof stage->history);
 #if MHE_COVARIANCE
     memcpy(stage->covariance, e->covariance_end, sizeof stage->covariance);
 #endif

@@ -1,0 +1,199 @@
+"""The table of what an estimator remembers; the records of both engines are made from it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Field(NamedTuple):
+    """One field of the memory.
+
+    Attributes
+    ----------
+    name : str
+        Its name, in Python and in C.
+    rows : {"stage", "state", "once"}
+        Whether there is one for each stage of the window, one for each state (a last one more than
+        there are stages), or a single one, which is replaced and never changed in place.
+    shape : str
+        Names of its dimensions, which `Sizes` has.
+    kind : str
+        What its entries are: real numbers, flags, counts, times, or a structure of C.
+    engine : {"both", "python", "c"}
+        Which engine has it.
+    when : str
+        The feature without which there is no such field; blank for a field that is always there.
+    about : str
+        What it is, for the header in C.
+    is_finite : bool
+        Whether a number in it that is not finite can only be damage.
+    """
+
+    name: str
+    rows: str
+    shape: str = ""
+    kind: str = "real"
+    engine: str = "both"
+    when: str = ""
+    about: str = ""
+    is_finite: bool = True
+
+
+#: All fields. Both engines have the samples, the observer along them and the last estimates; each
+#: has the linearised stages in the form in which it computes with them.
+FIELDS = (
+    Field("time", "once", kind="time", about="samples taken"),
+    Field("watched", "once", "2", "count",
+          about="samples in a row with a far observer, with rows dropped"),
+    Field("trajectory", "once", "states n", about="of the last estimate"),
+    Field("smoothed_prior", "once", "n", about="the prior in place of the window's first z"),
+    Field("trusted", "once", "2 held", when="held",
+          about="values of held parameters: for this window and the next"),
+    Field("last_good", "once", "n", about="z of the stages that have left the window"),
+    Field("last_good_covariance", "once", "n n", when="covariance"),
+    Field("z", "state", "n", about="the observer's state"),
+    Field("history", "state", "n", about="estimate of the state, made at its own time"),
+    Field("covariance", "state", "n n", when="covariance", about="of the observer's error at z"),
+    Field("root", "state", "n n", when="roots", is_finite=False,
+          about="upper triangular U, with U'U the covariance where that is vague"),
+    Field("is_vague", "state", kind="flag", when="roots"),
+    Field("rejections", "state", "sensors", "count", when="sensors",
+          about="how often in a row each sensor has failed before"),
+    Field("y", "stage", "p", about="any number where it is missing"),
+    Field("u", "stage", "inputs", is_finite=False, about="the input, then the step's length"),
+    Field("is_irregular", "stage", kind="flag", about="whether that is not the usual length"),
+    Field("is_observed", "stage", "p", "flag"),
+    Field("cost", "stage", is_finite=False,
+          about="infinite where the model could not be evaluated"),
+    # In Python: W, and M = [r, -G] with what it adds to a QP; see `StageTerms`.
+    Field("is_special", "stage", kind="flag", engine="python"),
+    Field("weight", "stage", "q q", engine="python"),
+    Field("majorising_weight", "stage", "q q", engine="python", when="majorised"),
+    Field("linear", "stage", "q wide", engine="python", is_finite=False),
+    Field("panel", "stage", "n pair", engine="python", is_finite=False),
+    Field("gradient", "stage", "n", engine="python", is_finite=False),
+    Field("next_gradient", "stage", "n", engine="python", is_finite=False),
+    # In C: where the ring of stages begins, and what a sample has of its own.
+    Field("first", "once", kind="count", engine="c", about="stage of the window in the ring"),
+    Field("length", "once", kind="count", engine="c", about="stages in the window"),
+    Field("has_trajectory", "once", kind="flag", engine="c"),
+    Field("has_smoothed", "once", kind="flag", engine="c",
+          about="whether there is a smoothed prior"),
+    Field("metric_settled", "once", kind="flag", engine="c",
+          about="whether the metric is for good"),
+    Field("metric", "once", "metric", engine="c", about="of the observer, as a covariance"),
+    Field("places", "once", "row_stages stage_rows", "place", engine="c",
+          about="of the window's rows in the last QP's active set"),
+    Field("w", "stage", "n", engine="c", about="residuals of the candidate"),
+    Field("v", "stage", "p", engine="c"),
+    Field("noise_weight", "stage", "p p", engine="c",
+          about="of the components that are observed"),
+    Field("is_complete", "stage", kind="flag", engine="c", about="whether these are all"),
+    Field("is_sampled", "stage", "p", "flag", engine="c"),
+    Field("has_own_noise", "stage", kind="flag", engine="c"),
+    Field("has_own_disturbance", "stage", kind="flag", engine="c"),
+    Field("has_own_w", "stage", kind="flag", engine="c"),
+    Field("has_own_v", "stage", kind="flag", engine="c"),
+    Field("has_own_x", "stage", kind="flag", engine="c"),
+    Field("own_noise_weight", "stage", "p p", engine="c", is_finite=False),
+    Field("own_disturbance_weight", "stage", "n n", engine="c", is_finite=False),
+    Field("own_w", "stage", kind="w_set", engine="c", when="w_set"),
+    Field("own_v", "stage", kind="v_set", engine="c", when="v_set"),
+    Field("own_x", "stage", kind="x_set", engine="c", when="x_set"),
+    Field("terms", "stage", kind="terms", engine="c"),
+)
+
+_KINDS: dict[str, Any] = {
+    "real": np.float64, "flag": np.bool_, "count": np.int64, "time": np.int64,
+}
+# The same in C, where a flag alone is an integer; structures have names of their own.
+_C_KINDS: dict[str, tuple[str, Any]] = {
+    "flag": ("uint8_t", np.uint8), "count": ("int32_t", np.int32), "time": ("int64_t", np.int64),
+    "place": ("int8_t", np.int8),
+}
+_C_FLAG = "int32_t", np.int32
+# Dimensions in C.
+_C_DIMENSIONS = {
+    "n": "MHE_NX", "p": "MHE_NY", "inputs": "(MHE_NU + 1)", "states": "(MHE_HORIZON + 1)",
+    "sensors": "MHE_SENSORS", "held": "MHE_HELD", "2": "2",
+    "metric": "MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)",
+    "row_stages": "(MHE_HORIZON + MHE_X_SET)", "stage_rows": "MHE_SIZE(MHE_STAGE_ROWS)",
+}
+
+
+class Sizes(NamedTuple):
+    """Dimensions by name, and the features that an estimator has."""
+
+    dimensions: dict[str, int]
+    features: frozenset[str]
+
+    @classmethod
+    def of(
+        cls, n: int, p: int, m: int, horizon: int, *, sensors: int = 0, held: int = 0,
+        rows: tuple[int, int] = (0, 0), **features: bool,
+    ) -> Sizes:
+        """The sizes of an estimator with n states, p outputs, m inputs and this horizon.
+
+        ``rows`` are the stages of a full window with rows in C, and the rows of each.
+        """
+        features |= {"sensors": sensors > 0, "held": held > 0}
+        return cls(
+            {"n": n, "p": p, "inputs": m + 1, "q": n + p, "wide": 1 + n, "pair": 2 * n,
+             "N": horizon, "states": horizon + 1, "sensors": sensors, "held": held, "2": 2,
+             "metric": n * n if features.get("x_set") else 1,
+             "row_stages": rows[0], "stage_rows": rows[1]},
+            frozenset(name for name, is_there in features.items() if is_there),
+        )
+
+    def fields(self, engine: str, *rows: str) -> tuple[Field, ...]:
+        """The fields that an engine has, with these rows; of "both", those that both have."""
+        return tuple(
+            one for one in FIELDS
+            if one.rows in rows and one.engine in ("both", engine)
+            and (not one.when or one.when in self.features)
+        )
+
+    def shape(self, field: Field) -> tuple[int, ...]:
+        """The shape of one row of a field."""
+        return tuple(self.dimensions[name] for name in field.shape.split())
+
+    def record_type(self, engine: str, room: int) -> np.dtype[Any]:
+        """A record in Python: its fields are contiguous arrays with ``room`` stages."""
+        return np.dtype([
+            (one.name, _KINDS[one.kind], (room + (one.rows == "state"), *self.shape(one)))
+            for one in self.fields(engine, "stage", "state")
+        ], align=True)
+
+    def c_fields(self, of_stage: bool) -> list[tuple[str, Field]]:
+        """The members of ``mhe_stage``, or those of ``mhe_estimator`` before its stages.
+
+        The estimator has the last state, behind all stages, by a name that ends in ``_end``.
+        """
+        if of_stage:
+            return [(one.name, one) for one in self.fields("c", "state", "stage")]
+        single = [(one.name, one) for one in self.fields("c", "once")]
+        return single + [(f"{one.name}_end", one) for one in self.fields("c", "state")]
+
+    def c_type(self, of_stage: bool, kinds: dict[str, Any]) -> list[tuple[Any, ...]]:
+        """These members as NumPy sees them; ``kinds`` has reals and structures."""
+        return [
+            (name, kinds.get(one.kind) or _c_kind(one)[1], self.shape(one))
+            for name, one in self.c_fields(of_stage)
+        ]
+
+    def c_text(self, of_stage: bool) -> str:
+        """These members as declared in C."""
+        lines = []
+        for name, one in self.c_fields(of_stage):
+            kind = f"mhe_{one.kind}" if one.kind not in _C_KINDS else _c_kind(one)[0]
+            size = " * ".join(_C_DIMENSIONS[dimension] for dimension in one.shape.split())
+            size = size.strip("()") if " * " not in size and "MHE_SIZE" not in size else size
+            note = f" /* {one.about} */" if one.about and name == one.name else ""
+            lines.append(f"    {kind} {name}{f'[{size}]' if size else ''};{note}")
+        return "\n".join(lines)
+
+
+def _c_kind(field: Field) -> tuple[str, Any]:
+    return _C_FLAG if field.kind == "flag" and not field.shape else _C_KINDS[field.kind]
