@@ -72,7 +72,7 @@ def estimator(model, kind, deviation, engine, units=1.0, **options):
 def newest_covariance(mhe):
     engine = mhe._engine
     if mhe.engine == "python":
-        return engine._window._covariances[engine._window.end]
+        return engine._window.covariance[engine._window.end]
     return engine._memory[0]["covariance_end"].copy()
 
 
@@ -153,8 +153,8 @@ def test_snapshots_and_late_measurements_keep_the_roots(kind, engine):
 def test_a_root_that_is_not_the_covariances_is_refused(kind):
     mhe = estimator(MODELS["jerk"], kind, 1e10, "python")
     mhe.run(measurements(1)[:2])
-    state = mhe._engine.state_dict()
-    assert state["window"]["vague"].any()
-    state["window"]["root"] *= 2.0
-    with pytest.raises(qpmhe.errors.InvalidInputError, match="observer"):
-        mhe._engine.load_state_dict(state)
+    state = mhe.state_dict()
+    assert state["window/is_vague"].any()
+    state["window/root"] *= 2.0
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="its digest is another"):
+        mhe.load_state_dict(state)
