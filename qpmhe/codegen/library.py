@@ -59,6 +59,11 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "(Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, UnscentedKalman, "
             "OutputInjection)."
         )
+    if observer.initial_memory() is not None:
+        return (
+            f"{type(observer).__name__} has a memory of its own, which the compiled step does not "
+            "have; take engine='python'."
+        )
     if form.correction is not None and (why := form.correction(system.n, system.p).reason):
         return (
             f"the correction of {type(observer).__name__} has no C form ({why}); change that, or "

@@ -15,6 +15,7 @@ from ..errors import InvalidInputError, ModelError, PriorWarning, QpmheError
 from ..model.functions import EvaluationError
 from ..model.system import System
 from ..observers import Observer, Sample
+from ..terms.base import read_only
 
 Array = NDArray[np.float64]
 
@@ -42,6 +43,14 @@ def check_observer(system: System, observer: Observer) -> None:
         # The package's own observers name the parameter that has the wrong size.
         if matrix is not None and not type(observer).__module__.startswith("qpmhe."):
             numbers_of(f"{name}.{attribute}", matrix, shape)
+
+
+    memory = observer.initial_memory()
+    if memory is not None:
+        method = f"{name}.initial_memory"
+        found = numbers_of(method, memory, (max(np.size(memory), 1),))
+        if not np.isfinite(found).all():
+            raise ModelError(f"{method} returned {found.tolist()}; expected finite numbers.")
 
 
 def check_correction(
@@ -98,6 +107,8 @@ def _sample(system: System, observer: Observer, state: Array, u: Array) -> Sampl
         sample.f_jacobian, sample.h_jacobian = (
             np.array(jacobian(state, u)) for jacobian in (system.f_jacobian, system.h_jacobian)
         )
+    if (memory := observer.initial_memory()) is not None:
+        sample.memory, sample.next_memory = read_only(np.array(memory)), np.array(memory)
     if observer.sensors:
         count = len(observer.sensors)
         sample.rejections, sample.next_rejections = np.zeros((2, count), np.int64)

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..costs.contracts import spare
 from ..memory.snapshot import mismatch
 from ..model.functions import Probes
 from ..model.residuals import Residual
 from ..model.system import System, probe_points
 from ..observers import Observer, Sample
+from ..terms.base import read_only
 from .settings import Settings
 
 Array = NDArray[Any]
@@ -82,10 +84,13 @@ def _values_at(points: Sequence[tuple[Any, ...]], shape: tuple[int, ...], functi
 def _corrections(system: System, observer: Observer, points: Probes) -> Array:
     """The corrections of an observer without Jacobians, at fitting errors of all sizes."""
     errors = np.ldexp(1.0, np.arange(-4, 5, 2))[:, None] * np.linspace(1.0, 2.0, system.p)
-    covariance, count = observer.initial_covariance(), len(observer.sensors)
+    observer, covariance = spare(observer), observer.initial_covariance()
+    count, memory = len(observer.sensors), observer.initial_memory()
 
     def correction(x: Array, u: Array, error: Array) -> Array:
         sample = Sample(system, u, covariance=covariance)
+        if memory is not None:
+            sample.memory, sample.next_memory = read_only(np.array(memory)), np.array(memory)
         if count:
             sample.rejections, sample.next_rejections = np.zeros((2, count), np.int64)
         return observer.correct(x, error, sample)[0]

@@ -78,10 +78,11 @@ class Window(Record):
         self._quadratic = cost.quadratic
         self._with_jacobians = with_terms or observer.needs_jacobians
         covariance, self._held = observer.initial_covariance(), list(system.held)
+        memory = observer.initial_memory()
         sizes = Sizes.of(
             n, p, m, horizon, sensors=len(observer.sensors), held=len(self._held),
             covariance=covariance is not None, majorised=not cost.quadratic,
-            roots=observer.propagates_roots,
+            roots=observer.propagates_roots, memory=0 if memory is None else len(memory),
         )
         super().__init__(
             sizes, initial_state, covariance, system.dt or 0.0, cost.stage_weight
@@ -98,6 +99,9 @@ class Window(Record):
             None if self.covariance is None else read_only(self.covariance)
         )
         self._read_only_weight = read_only(self.weight)
+        if self.memory is not None:
+            self.memory[0] = memory
+            self._read_only_memory = read_only(self.memory)
         self._read_only_residuals = read_only(self.terms.residuals)
         # Views of each stage, and of each full window by its first stage.
         self._stage_views: Sequence[StageView] = Views(
@@ -141,7 +145,8 @@ class Window(Record):
         self._observers: RunningObservers | None = None
         gain, simple = observer.constant_gain, not observer.needs_jacobians
         small = horizon * horizon * (2 * n + p) <= _MOST_RUNNING
-        if reinitialized and gain is not None and small and simple and self.covariance is None:
+        simple = simple and self.covariance is None and self.memory is None
+        if reinitialized and gain is not None and small and simple:
             self._observers = RunningObservers(gain, horizon, self._nearest, self._keep_inside)
         self._output_residual, self._state_residual = system.output_residual, system.state_residual
         self._turns = system.turns
@@ -319,7 +324,7 @@ class Window(Record):
         self.history[: length + 1] = kept["history"]
         if parameters is not None:
             self.u[:length, m - parameters.size : m] = parameters
-        for field in self.sizes.fields("both", "state"):
+        for field in self.sizes.fields("python", "state"):
             self.rows[field.name][0] = kept[field.name][0]
         self.last_good, self.last_good_covariance = other.last_good_before(other.start)
         self.smoothed_prior, self.trusted = other.smoothed_prior, other.trusted
@@ -444,6 +449,8 @@ class Window(Record):
                 return "the observer's correction is not finite"
             if not np.isfinite(view.z_next).all():
                 return "the observer's next state is not finite"
+            if self.memory is not None and not np.isfinite(self.memory[k + 1]).all():
+                return "what the observer remembers is not finite"
         return "the observer or the cost is not finite"
 
     @property
@@ -587,6 +594,9 @@ class Window(Record):
         if rejections is not None:
             rejections[k + 1] = rejections[k]
             sample.rejections, sample.next_rejections = rejections[k], rejections[k + 1]
+        if self.memory is not None:
+            self.memory[k + 1] = self.memory[k]
+            sample.memory, sample.next_memory = self._read_only_memory[k], self.memory[k + 1]
         sample.root = sample.next_root = None
         if self.root is not None and self.is_vague[k]:
             sample.root = self.root[k]
@@ -605,6 +615,8 @@ class Window(Record):
                 return False
             self.covariance[k + 1] = posterior
         if not math.isfinite(z_next.dot(z_next)):
+            return False
+        if self.memory is not None and not np.isfinite(self.memory[k + 1]).all():
             return False
         if predicted is not None:
             self._project(view, predicted, posterior)
@@ -749,6 +761,8 @@ class Window(Record):
             self.is_vague[k + 1] = False
         if self.rejections is not None:
             self.rejections[k + 1] = self.rejections[k]
+        if self.memory is not None:
+            self.memory[k + 1] = self.memory[k]
         self._fill_terms(k)
 
     def _fill_terms(self, k: int) -> None:

@@ -67,6 +67,8 @@ FIELDS = (
     Field("is_observed", "stage", "p", "flag"),
     Field("cost", "stage", is_finite=False,
           about="infinite where the model could not be evaluated"),
+    Field("memory", "state", "memory", engine="python", when="memory",
+          about="what a user's observer remembers"),
     # In Python: W, and M = [r, -G] with what it adds to a QP; see `StageTerms`.
     Field("is_special", "stage", kind="flag", engine="python"),
     Field("weight", "stage", "q q", engine="python"),
@@ -132,16 +134,18 @@ class Sizes(NamedTuple):
     @classmethod
     def of(
         cls, n: int, p: int, m: int, horizon: int, *, sensors: int = 0, held: int = 0,
-        rows: tuple[int, int] = (0, 0), **features: bool,
+        memory: int = 0, rows: tuple[int, int] = (0, 0), **features: bool,
     ) -> Sizes:
         """The sizes of an estimator with n states, p outputs, m inputs and this horizon.
 
-        ``rows`` are the stages of a full window with rows in C, and the rows of each.
+        ``memory`` is the size of what a user's observer remembers; ``rows`` are the stages of a
+        full window with rows in C, and the rows of each.
         """
-        features |= {"sensors": sensors > 0, "held": held > 0}
+        features |= {"sensors": sensors > 0, "held": held > 0, "memory": memory > 0}
         return cls(
             {"n": n, "p": p, "inputs": m + 1, "q": n + p, "wide": 1 + n, "pair": 2 * n,
              "N": horizon, "states": horizon + 1, "sensors": sensors, "held": held, "2": 2,
+             "memory": memory,
              "metric": n * n if features.get("x_set") else 1,
              "row_stages": rows[0], "stage_rows": rows[1]},
             frozenset(name for name, is_there in features.items() if is_there),

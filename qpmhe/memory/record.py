@@ -92,7 +92,8 @@ class Record:
         self.rejections: NDArray[np.int64] | None
         self.root: Array | None
         self.is_vague: Flags = np.zeros(room + 1, np.bool_)
-        for name in ("covariance", "rejections", "root"):
+        self.memory: Array | None  # of a user's observer
+        for name in ("covariance", "rejections", "root", "memory"):
             setattr(self, name, self.rows.get(name))
         for name, array in self.rows.items():
             setattr(self, name, array)
@@ -248,7 +249,7 @@ class Record:
         length = min(time, self.horizon)
         for name, what in (
             ("covariance", "observer"), ("root", "observer"), ("rejections", "observer"),
-            ("majorising_weight", "cost"),
+            ("memory", "observer"), ("majorising_weight", "cost"),
         ):
             if (name in self.rows) != (name in state):
                 raise mismatch(what)

@@ -52,6 +52,10 @@ class Sample:
     root, next_root : (n, n) array or None
         An upper triangular U with U'U the covariance, where only U has all digits that matter, and
         where `Observer.correct` leaves the one of the next step.
+    memory, next_memory : (k,) array or None
+        What the observer remembers at this sample, read-only, and an array, first equal to it, into
+        which `Observer.correct` writes what it remembers at the next; None if it has no
+        `Observer.initial_memory`.
     """
 
     system: System
@@ -67,6 +71,8 @@ class Sample:
     next_rejections: Counts | None = None
     root: Array | None = None
     next_root: Array | None = None
+    memory: Array | None = None
+    next_memory: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +113,9 @@ class ObserverForm:
 class Observer(ABC):
     r"""An observer :math:`z(t+1) = f(z, u) + L(z, y - h(z, u))` with :math:`L(\cdot, 0) = 0`.
 
-    An observer has no memory: what it needs from sample to sample, a covariance, passes through
-    `correct` and is stored in the estimator's window.
+    The object itself remembers nothing: what an observer needs from sample to sample, a covariance
+    or a memory of its own, passes through `correct` and is stored in the estimator's window. Thus
+    late measurements, resets, snapshots and steps that were interrupted find it as it was.
     """
 
     #: Whether `correct` reads the Jacobians of f and h at z.
@@ -151,6 +158,13 @@ class Observer(ABC):
 
     def initial_covariance(self) -> Array | None:
         """The covariance (n, n) of the initial estimate; None for observers without one."""
+        return None
+
+    def initial_memory(self) -> Array | None:
+        """What it remembers before the first sample (k,); None for observers without a memory.
+
+        `correct` finds it in `Sample.memory`, and writes into `Sample.next_memory`.
+        """
         return None
 
     @property
