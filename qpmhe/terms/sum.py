@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..costs import Cost
 from ..model.system import System
-from .base import Term, Trial, WindowData, WindowView
+from .base import Term, TermForm, Trial, WindowData, WindowView
 from .hold import Hold, WindowHold
 from .prior import Prior, PriorCost
 from .soft import Penalties
@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 
 class TermRule(Protocol):
     """A term of J for all windows of an estimator."""
+
+    @property
+    def c_form(self) -> TermForm | None:
+        """The term as the step in C computes it; None if it cannot."""
 
     def of_window(self, window: WindowData, view: WindowView) -> Term:
         """The term of a window."""
@@ -57,6 +61,12 @@ class CostSum:
         self.penalties: Penalties | None = penalties if penalties else None
         # What not every estimator has, in the order of the sum; a new term joins here.
         self._others: list[TermRule] = [one for one in (self.penalties,) if one is not None]
+
+    @property
+    def c_forms(self) -> tuple[TermForm, ...]:
+        """The terms that not every estimator has, as the step in C computes them."""
+        rules = *(() if self._hold is None else (self._hold,)), *self._others
+        return tuple(form for one in rules if (form := one.c_form) is not None)
 
     def of_window(
         self, window: WindowData, view: WindowView, weights: Array
