@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..errors import OptionError
 from ..model.system import System
 from .base import Term, TermForm, Trial, WindowData, WindowView
 from .hold import Hold, WindowHold
@@ -64,9 +65,20 @@ class CostSum:
 
     @property
     def c_forms(self) -> tuple[TermForm, ...]:
-        """The terms that not every estimator has, as the step in C computes them."""
-        rules = *(() if self._hold is None else (self._hold,)), *self._others
-        return tuple(form for one in rules if (form := one.c_form) is not None)
+        """The terms that not every estimator has, as the step in C computes them.
+
+        Raises an `OptionError` where it cannot compute one.
+        """
+        rules: list[TermRule] = [*(() if self._hold is None else (self._hold,)), *self._others]
+        forms = []
+        for one in rules:
+            form = one.c_form
+            if form is None:
+                raise OptionError(
+                    f"the step in C has no {type(one).__name__}; take engine='python'."
+                )
+            forms.append(form)
+        return tuple(forms)
 
     def of_window(
         self, window: WindowData, view: WindowView, weights: Array
