@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..estimation.constraints import Constraints
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers import Observer
-from ..terms.prior import PriorWeights
+from ..terms.base import TermForm
+from ..terms.prior import PriorCost
 from ..terms.rows import Rows
+from ..terms.sum import CostSum
 
 Array = NDArray[np.float64]
 
@@ -50,9 +51,13 @@ class Directions:
 
     def constraints_of(self, system: System, cost: Cost) -> Constraints:
         """The same for a system with other sets, and a cost of d with other weights."""
-        observer = self.observer
-        _, regular = PriorWeights(system, observer, cost)(observer.initial_covariance())
-        return Constraints(system, cost, inverse(regular))
+        return Constraints(system, cost, PriorCost(system, self.observer, cost).covariance)
+
+    def terms_of(self, system: System, cost: Cost) -> tuple[TermForm, ...]:
+        """The terms of J that not every estimator has."""
+        prior = PriorCost(system, self.observer, cost)
+        basis = Constraints(system, cost, prior.covariance).basis
+        return CostSum(system, cost, prior, basis).c_forms
 
     @property
     def quiet(self) -> int:

@@ -24,7 +24,6 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers.base import covariance_of
 from ..observers.roots import least_share
-from ..terms.hold import Hold
 from ..terms.prior import PriorWeights
 from ..terms.rows import Rows
 from .directions import Directions
@@ -91,6 +90,9 @@ class Layout:
     free: int | None = None
     #: States that are held where the window does not see them.
     held: int = 0
+    #: The terms of J that not every estimator has: their names in C, and of their numbers the
+    #: names, whether they are integers, and how many there are.
+    terms: tuple[tuple[str, tuple[tuple[str, bool, int], ...]], ...] = ()
 
     @classmethod
     def of(
@@ -126,6 +128,10 @@ class Layout:
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
             free=directions.free, held=len(system.held),
+            terms=tuple(
+                (name, tuple((k, one.dtype.kind == "i", one.size) for k, one in data.items()))
+                for name, data in directions.terms_of(system, cost)
+            ),
         )
 
     @property
@@ -152,10 +158,24 @@ class Layout:
             "stage_members": self.sizes.c_text(True),
             "estimator_members": self.sizes.c_text(False),
         }
+        values["term_types"], values["term_fields"] = self._term_types(name)
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
             values[f"{letter}_rows"] = rows
         return values
+
+    def _term_types(self, prefix: str) -> tuple[str, str]:
+        """The structs of the terms in C, and the fields of the settings that have them."""
+        types, fields = [], []
+        for name, data in self.terms:
+            rows = "".join(
+                f"    {'int32_t' if whole else f'{prefix}_real'} {field}[{size}];\n"
+                for field, whole, size in data
+            )
+            types.append(f"\n/* The numbers of a term of J. */\ntypedef struct {{\n{rows}}} "
+                         f"{prefix}_{name};\n")
+            fields.append(f"    {prefix}_{name} {name};\n")
+        return "".join(types), "".join(fields)
 
     def settings_type(self) -> np.dtype[Any]:
         """``mhe_settings``."""
@@ -177,11 +197,9 @@ class Layout:
                 *(bounds if self.observer_prior else []),
                 ("least", r), ("spread", r), ("noise_share", r), ("typical", r, n),
             ])))
-        if k := self.held:
-            fields.append(("hold", _struct([
-                ("deviations", r, n), ("root", r, n * n), ("spread", r, n * n),
-                ("pick", r, k * n), ("units", r, k * k), ("inverse_units", r, k * k),
-                ("stiffness", r, k), ("components", np.int32, k),
+        for name, data in self.terms:
+            fields.append((name, _struct([
+                (field, np.int32 if whole else r, size) for field, whole, size in data
             ])))
         if self.sensors:
             fields.append(("innovation", _struct([
@@ -404,11 +422,9 @@ def _filled(
     if layout.free is not None:
         for name, matrix in directions.elimination(system, cost).items():
             _fill(record, name, matrix)
-    if layout.held:
-        basis = directions.constraints_of(system, cost).basis
-        hold = Hold(system.held, inverse(regular), basis, cost.disturbance, cost.discount)
-        for name in record["hold"].dtype.names or ():
-            _fill(record["hold"], name, getattr(hold, name))
+    for name, data in directions.terms_of(system, cost) if layout.terms else ():
+        for field, values in data.items():
+            _fill(record[name], field, values)
     record["inner_lower"], record["inner_upper"] = system.f_jacobian.inner
     record["aside"] = system.f_jacobian.aside
     if system.states is not None:

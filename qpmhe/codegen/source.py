@@ -18,6 +18,8 @@ from ..model.expressions import CasadiModel, import_casadi
 from .layout import TERMS, Layout
 from .single import in_single_precision
 
+# In the place of a part: the calls of the further terms.
+_FURTHER = ""
 #: The file that holds a whole estimator.
 MAIN = "mhe.c"
 # Four (n, n) arrays of them fit on any usual stack.
@@ -201,12 +203,17 @@ def estimator_files(
     head = header(name, {**layout.header_values(name), "version": __version__})
     parts = (
         "algebra.c", "residuals.c", "conditions.c", "cost.c", "observer.c", "projection.c",
-        "window.c", "prior.c", "hold.c", "sets.c", "trial.c",
+        "window.c", "prior.c", *(f"{term}.c" for term, _ in layout.terms), _FURTHER, "sets.c",
+        "trial.c",
         "factor.c" if layout.free is None else "elimination.c", "budget.c", "inequalities.c",
         "optimizer.c", "step.c",
     )
     single = layout.real == "float"
-    texts = model_source(model, single), *(template(part) for part in parts)
+    further = _further_terms([term for term, _ in layout.terms])
+    texts = [
+        model_source(model, single),
+        *(further if part == _FURTHER else template(part) for part in parts),
+    ]
     body = prologue() + "\n".join(texts)
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
@@ -216,6 +223,30 @@ def estimator_files(
         body, data = in_single_precision(body), in_single_precision(data)
     text = renamed(f'#include "mhe.h"\n{body}{data}', name).replace('"mhe.h"', f'"{name}.h"')
     return {f"{name}.h": head, f"{name}.c": text}
+
+
+def _further_terms(names: list[str]) -> str:
+    """C functions that call those of the terms that not every estimator has."""
+
+    def body(call: str) -> str:
+        return "".join(f"    {call.format(name)};\n" for name in names)
+
+    return (
+        "/* The terms of J that not every estimator has. */\n\n"
+        "/* Before a step. */\n"
+        "static void mhe_begin_further(mhe_estimator *e, mhe_workspace *k)\n"
+        f"{{\n    (void)e; (void)k;\n{body('mhe_{}_begin(e, k)')}}}\n\n"
+        "/* What they add to J of a trajectory that starts at x. */\n"
+        "static real mhe_further_cost(const mhe_estimator *e, const mhe_workspace *k, "
+        "const real *x)\n"
+        "{\n    real cost = 0;\n    (void)e; (void)k; (void)x;\n"
+        f"{body('cost += mhe_{}_cost(e, k, x)')}    return cost;\n}}\n\n"
+        "/* Add them to the first state's matrix, by rows of this width, and to the gradient. */\n"
+        "static void mhe_add_further(const mhe_estimator *e, mhe_workspace *k, real factor,\n"
+        "                            real *matrix, int width)\n"
+        "{\n    (void)e; (void)k; (void)factor; (void)matrix; (void)width;\n"
+        f"{body('mhe_{}_add(e, k, factor, matrix, width)')}}}\n"
+    )
 
 
 def _initializer(record: NDArray[Any]) -> str:

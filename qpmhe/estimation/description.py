@@ -39,7 +39,8 @@ def described(
     found: dict[str, Any] = {
         "candidate": settings.candidate, "arrival": settings.arrival, "sampling time": system.dt,
     }
-    _describe("disturbance_matrix", system.disturbance_matrix, found)
+    for name in system.described:
+        _describe(name, getattr(system, name), found)
     if system.held:
         found["hold"] = np.array(list(system.held.items()))
     if settings.parameters:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Protocol, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -139,6 +139,9 @@ class System:
     >>> system.derivatives
     {'f': 'traced', 'h': 'traced'}
     """
+
+    #: Attributes that describe a system beside its functions, sets and constraints.
+    described: ClassVar[tuple[str, ...]] = ("disturbance_matrix",)
 
     def __init__(
         self,

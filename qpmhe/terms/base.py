@@ -221,6 +221,24 @@ class TermDerivative(ABC):
         """Add the change (..., K + 1, n), (..., K, q) of the first derivatives with the data."""
 
 
+class TermForm(NamedTuple):
+    """A term in the first state as the step in C computes it: by ``codegen/c/NAME.c``.
+
+    That part has three functions: ``mhe_NAME_begin`` before a step, ``mhe_NAME_cost``, and
+    ``mhe_NAME_add``, which adds weight and force to the QP.
+
+    Attributes
+    ----------
+    name : str
+        NAME; the numbers are ``settings->NAME`` there.
+    data : mapping
+        The numbers: real ones, or integers of 32 bits.
+    """
+
+    name: str
+    data: Mapping[str, NDArray[Any]]
+
+
 class SoftRows(NamedTuple):
     """Rows that a term penalises, along a trajectory: (K, r) or (K + 1, r) arrays.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from qpmhe_solvers.qp import band_of
 
 from .._linalg import cholesky, inverse, solve
-from .base import FirstStateDerivative, FirstStateTerm, Trial, WindowData, WindowView
+from .base import FirstStateDerivative, FirstStateTerm, TermForm, Trial, WindowData, WindowView
 from .information import prior_units, window_information
 
 Array = NDArray[np.float64]
@@ -63,6 +63,15 @@ class Hold:
         spread = cholesky(inverse(basis.T @ disturbance @ basis)) if basis.size else basis.T @ basis
         spread = basis @ spread / self.deviations[:, None]
         self.spread: Array = spread @ spread.T
+
+    @property
+    def c_form(self) -> TermForm:
+        """The hold in C."""
+        names = (
+            "deviations", "root", "spread", "pick", "units", "inverse_units", "stiffness",
+            "components",
+        )
+        return TermForm("hold", {name: getattr(self, name) for name in names})
 
     def of_window(self, window: WindowData, view: WindowView) -> WindowHold | None:
         """The hold of a window; None where no QP chooses the parameters."""

@@ -91,6 +91,10 @@ class Penalties:
     def __bool__(self) -> bool:
         return self.size > 0
 
+    @property
+    def c_form(self) -> None:
+        """None: the step in C has no soft rows."""
+
     def of_window(self, window: WindowData, view: WindowView) -> Penalty:
         """The soft rows of a window."""
         return Penalty(self, self._rows_of(window, len(view.candidate) - 1))

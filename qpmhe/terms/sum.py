@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..errors import OptionError
 from ..model.system import System
-from .base import Term, Trial, WindowData, WindowView
+from .base import Term, TermForm, Trial, WindowData, WindowView
 from .hold import Hold, WindowHold
 from .prior import Prior, PriorCost
 from .soft import Penalties
@@ -21,6 +22,10 @@ Array = NDArray[np.float64]
 
 class TermRule(Protocol):
     """A term of J for all windows of an estimator."""
+
+    @property
+    def c_form(self) -> TermForm | None:
+        """The term as the step in C computes it; None if it cannot."""
 
     def of_window(self, window: WindowData, view: WindowView) -> Term:
         """The term of a window."""
@@ -57,6 +62,23 @@ class CostSum:
         self.penalties: Penalties | None = penalties if penalties else None
         # What not every estimator has, in the order of the sum; a new term joins here.
         self._others: list[TermRule] = [one for one in (self.penalties,) if one is not None]
+
+    @property
+    def c_forms(self) -> tuple[TermForm, ...]:
+        """The terms that not every estimator has, as the step in C computes them.
+
+        Raises an `OptionError` where it cannot compute one.
+        """
+        rules: list[TermRule] = [*(() if self._hold is None else (self._hold,)), *self._others]
+        forms = []
+        for one in rules:
+            form = one.c_form
+            if form is None:
+                raise OptionError(
+                    f"the step in C has no {type(one).__name__}; take engine='python'."
+                )
+            forms.append(form)
+        return tuple(forms)
 
     def of_window(
         self, window: WindowData, view: WindowView, weights: Array

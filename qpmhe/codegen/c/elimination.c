@@ -156,7 +156,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         for (int c = 0; c < NX; c++)
             first[r * NX + c] = mhe_scaled(factor, scale, r) * weight[r * NX + c];
     mhe_times(NX, first, offset, k->gradient);
-    mhe_add_hold(e, k, factor, first, NX);
+    mhe_add_further(e, k, factor, first, NX);
     memcpy(k->prior_gradient, k->gradient, sizeof k->prior_gradient);
     mhe_root(NX, first, k->prior_root);
     for (int i = 0; i < count; i++) {

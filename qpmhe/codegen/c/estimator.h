@@ -164,20 +164,7 @@ typedef struct {
     mhe_real typical[MHE_NX]; /* variances where states may be known exactly, else 0 */
 } mhe_covariances;
 #endif
-
-#if MHE_HELD
-/* What holds parameters that a window does not see, in deviations of the first prior. */
-typedef struct {
-    mhe_real deviations[MHE_NX];           /* units of the matrices on all states */
-    mhe_real root[MHE_NX * MHE_NX];        /* of the prior's covariance */
-    mhe_real spread[MHE_NX * MHE_NX];      /* covariance of the disturbances */
-    mhe_real pick[MHE_HELD * MHE_NX];      /* from columns of `root` to held parameters */
-    mhe_real units[MHE_HELD * MHE_HELD], inverse_units[MHE_HELD * MHE_HELD];
-    mhe_real stiffness[MHE_HELD];
-    int32_t components[MHE_HELD];
-} mhe_hold;
-#endif
-
+$term_types
 #if MHE_SENSORS
 typedef struct {
     mhe_real limits[MHE_NY];   /* of squared innovations of sensors with 1, 2, ... outputs there */
@@ -199,10 +186,7 @@ typedef struct {
 #if MHE_COVARIANCE
     mhe_covariances covariances; /* of the observer */
 #endif
-#if MHE_HELD
-    mhe_hold hold;
-#endif
-#if MHE_SENSORS
+$term_fields#if MHE_SENSORS
     mhe_innovation innovation;
 #endif
     mhe_real discount;         /* factor on a stage's cost for each step of age */
@@ -330,11 +314,10 @@ typedef struct {
     const mhe_real *mean, *weight, *distance_weight;
     mhe_real own_weight[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
     mhe_real own_distance[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
+    const mhe_real *first; /* the first state of the trajectory around which the QP is */
 #if MHE_HELD
-    /* Of the present window: the weight of held parameters, how their trusted values follow, and the
-     * first state of the trajectory around which the QP is. */
+    /* Of the present window: the weight of held parameters, and how their trusted values follow. */
     mhe_real held[MHE_HELD * MHE_HELD], follow[MHE_HELD * MHE_HELD];
-    const mhe_real *first;
 #endif
 } mhe_prior;
 

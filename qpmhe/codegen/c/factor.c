@@ -40,7 +40,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         if (i == 0) {
             mhe_times(NX, weight, offset, g);
             for (int j = 0; j < NX; j++) g[j] *= mhe_scaled(factor, scale, j);
-            mhe_add_hold(e, k, factor, k->panels, WIDTH);
+            mhe_add_further(e, k, factor, k->panels, WIDTH);
         } else {
             for (int j = 0; j < NX; j++) g[j] = factor * k->at[i - 1]->following[j];
         }

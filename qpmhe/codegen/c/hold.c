@@ -1,6 +1,8 @@
-/* Parameters held at their last trusted values where the window does not see them. */
+/* A term of J: parameters are held at their last trusted values where the window does not see them.
+ * Of the settings: `deviations` are the units of the matrices on all states, `root` is that of the
+ * prior's covariance, `spread` the covariance of the disturbances; `pick` leads from the columns of
+ * `root` to held parameters, of which `components` are the states. */
 
-#if MHE_HELD
 /* What the data of the window say about its first state, in deviations of the prior. */
 static void mhe_window_information(mhe_estimator *e, real *M)
 {
@@ -67,7 +69,7 @@ static void mhe_held_form(const real *B, const real *M, real *out)
 }
 
 /* Set the weight of held parameters, and how their trusted values follow the estimate. */
-static void mhe_set_hold(mhe_estimator *e, mhe_workspace *k)
+static void mhe_hold_begin(mhe_estimator *e, mhe_workspace *k)
 {
     const mhe_hold *hold = &e->settings->hold;
     mhe_prior *prior = &k->prior;
@@ -125,26 +127,19 @@ static void mhe_trust_start(mhe_estimator *e)
     for (int j = 0; j < 2 * MHE_HELD; j++)
         e->trusted[j] = e->z_end[e->settings->hold.components[j % MHE_HELD]];
 }
-#endif
 
 /* What the hold adds to J of a trajectory that starts at x. */
 static real mhe_hold_cost(const mhe_estimator *e, const mhe_workspace *k, const real *x)
 {
-#if MHE_HELD
     real offset[MHE_HELD];
     mhe_held_offset(e, x, offset);
     return k->factors[0] * mhe_form(MHE_HELD, k->prior.held, offset);
-#else
-    (void)e; (void)k; (void)x;
-    return 0;
-#endif
 }
 
 /* Add it to the first state's matrix, by rows of this width, and to the gradient of the QP. */
-static void mhe_add_hold(const mhe_estimator *e, mhe_workspace *k, real factor, real *matrix,
+static void mhe_hold_add(const mhe_estimator *e, mhe_workspace *k, real factor, real *matrix,
                          int width)
 {
-#if MHE_HELD
     const int32_t *at = e->settings->hold.components;
     real offset[MHE_HELD];
     mhe_held_offset(e, k->prior.first, offset);
@@ -154,7 +149,4 @@ static void mhe_add_hold(const mhe_estimator *e, mhe_workspace *k, real factor, 
         for (int c = 0; c < MHE_HELD; c++)
             matrix[at[r] * width + at[c]] += factor * row[c];
     }
-#else
-    (void)e; (void)k; (void)factor; (void)matrix; (void)width;
-#endif
 }

@@ -114,9 +114,7 @@ static int mhe_solve_as_is(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 {
     const real *prior = k->prior.mean;
     real offset[NX];
-#if MHE_HELD
     k->prior.first = around->x;
-#endif
 #if MHE_ROLLED
     k->around = around;
 #endif
@@ -391,7 +389,7 @@ static void mhe_weigh(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
     for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - k->prior.mean[j];
     mhe_wrap_state(e->settings, trial->x, offset);
     cost += k->factors[0] * mhe_prior_cost(e->settings, k, offset);
-    cost += mhe_hold_cost(e, k, trial->x);
+    cost += mhe_further_cost(e, k, trial->x);
     trial->cost = cost >= 0 && isfinite(cost) ? cost : INFINITY;
 }
 
@@ -507,7 +505,7 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
     }
     /* No cost is NaN, but 0 times infinity is where a discount underflows. */
     if (isnan(trial->cost)) trial->cost = INFINITY;
-    trial->cost += mhe_hold_cost(e, k, trial->x);
+    trial->cost += mhe_further_cost(e, k, trial->x);
     trial->cost += mhe_move_prior(e, k);
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
 #if CONSTRAINED
@@ -570,9 +568,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     }
     k->factors[0] = factor;
     mhe_set_prior(e, k);
-#if MHE_HELD
-    mhe_set_hold(e, k);
-#endif
+    mhe_begin_further(e, k);
     memset(o, 0, sizeof *o);
 #if MHE_WIDENED
     mhe_set_widening(k, s, 0);

@@ -1,0 +1,166 @@
+"""Each term of J against differences of its cost: its quadratic model, and its derivatives."""
+
+from copy import copy
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.terms.base import Derivatives, QuadraticModel
+from qpmhe.terms.linearization import Span, StageTerms
+from qpmhe.terms.sum import weight_of_first
+from qpmhe_solvers import QP
+from qpmhe_solvers.qp import band_of
+from tests.codegen.cases import case
+
+pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.ObserverWarning")
+
+CASES = {
+    "inputs": {"Stages", "Prior"},  # with a discount
+    "huber everywhere": {"Stages", "Prior"},
+    "extended prior": {"Stages", "Prior"},  # about a smoothed mean
+    "angles, conditions": {"Stages", "Prior"},
+    "held with gaps": {"Stages", "Prior", "WindowHold"},
+    "held, graduated": {"Stages", "Prior", "WindowHold"},
+}
+
+
+def solved(name, samples=12):
+    """The problem of the last window, without a verdict of sets, and a trajectory near it."""
+    one = case(name)
+    mhe = one.estimator("python")
+    for sample in one.samples[:samples]:
+        mhe.update(**sample)
+    problem = copy(mhe._engine.solved().problem)
+    problem.constrained = False
+    generator = np.random.default_rng(samples)
+    x = problem.candidate.trajectory
+    away = 0.05 * generator.standard_normal(x.shape) * (1.0 + np.abs(x))
+    return problem, x + away, away
+
+
+def at(problem, x):
+    trial = problem.evaluate(x, roll_out=False)
+    assert np.isfinite(trial.cost)
+    return trial
+
+
+def model_of(problem, term, trial):
+    """Band and gradient of one term."""
+    count, n = trial.trajectory.shape[0] - 1, trial.trajectory.shape[1]
+    qp = QP(count + 1, n, 0)
+    qp.band[...] = qp.gradient[...] = 0.0
+    model = QuadraticModel(qp)
+    model.span, model.is_candidate, model.slopes = linearised(problem, trial), False, None
+    term.add_model(model, trial)
+    return qp.band, qp.gradient
+
+
+def linearised(problem, trial):
+    states, count = trial.trajectory[:-1], len(trial.residuals)
+    p = trial.residuals.shape[1] - states.shape[1]
+    terms = StageTerms(count, states.shape[1], p)
+    terms.linear[:, :, 0] = trial.residuals
+    terms.linear[:, :, 1:] = -jacobian(problem, states)
+    terms.set_all(count, trial.weights)
+    return Span(terms, 0, count)
+
+
+def jacobian(problem, states):
+    both = problem.model.f_jacobian, problem.model.h_jacobian
+    return np.concatenate([np.asarray(one.batch(states, problem.inputs)) for one in both], axis=1)
+
+
+def derivatives(term, trial):
+    """The derivatives of one term along a trial."""
+    sums = Derivatives(len(trial.residuals), trial.trajectory.shape[1], trial.residuals.shape[1])
+    term.derivative(trial).add_to(sums)
+    return sums
+
+
+def difference(function, step):
+    """The derivative of a function of a number at 0, by differences of fourth order."""
+    near, far = (function(k * step) - function(-k * step) for k in (1, 2))
+    return (8.0 * near - far) / (12.0 * step)
+
+
+def slope(problem, term, x, d):
+    """The derivative of a term at x along d."""
+    return difference(lambda s: term.cost(at(problem, x + s * d)), 1e-3)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_models_and_derivatives_are_those_of_the_costs(name):
+    problem, x, d = solved(name)
+    assert {type(term).__name__ for term in problem.terms} == CASES[name]
+    trial, n = at(problem, x), x.shape[1]
+    assert trial.cost == pytest.approx(sum(term.cost(trial) for term in problem.terms), rel=1e-14)
+    slopes = jacobian(problem, x[:-1])
+    for term in problem.terms:
+        expected = slope(problem, term, x, d)
+        band, gradient = model_of(problem, term, trial)
+        size = 1e-6 * (1e-3 + abs(expected))
+        assert 2.0 * np.vdot(gradient, d) == pytest.approx(expected, rel=1e-6, abs=size)
+        # The derivative by states and residuals is the same, and so is the model's Hessian.
+        sums = derivatives(term, trial)
+        moved = -np.einsum("kqn,kn->kq", slopes, d[:-1])
+        moved[:, :n] += d[1:]
+        found = np.vdot(sums.on_states, d) + np.vdot(sums.on_residuals, moved)
+        assert found == pytest.approx(2.0 * np.vdot(gradient, d), rel=1e-9, abs=size)
+        own = sums.majorised_states.copy()
+        own[:-1] += slopes.transpose(0, 2, 1) @ sums.majorised_residuals @ slopes
+        own[1:] += sums.majorised_residuals[:, :n, :n]
+        columns = np.concatenate((own, np.zeros_like(own)), axis=1)
+        columns[:-1, n:] = -(sums.majorised_residuals @ slopes)[:, :n]
+        np.testing.assert_allclose(
+            2.0 * band, band_of(columns), rtol=1e-9, atol=1e-11 * np.abs(band).max()
+        )
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_second_derivatives_are_those_of_the_first_ones(name):
+    problem, x, d = solved(name)
+    for term in problem.terms:
+        def first(s, term=term):
+            trial = at(problem, x + s * d)
+            sums = derivatives(term, trial)
+            return np.append(sums.on_states.ravel(), sums.on_residuals.ravel()), trial.residuals
+
+        sums = derivatives(term, at(problem, x))
+        moved = difference(lambda s: first(s)[1], 1e-3)
+        expected = difference(lambda s: first(s)[0], 1e-3)
+        found = np.append(
+            np.einsum("kij,kj->ki", sums.bent_states, d).ravel(),
+            np.einsum("kij,kj->ki", sums.bent_residuals, moved).ravel(),
+        )
+        np.testing.assert_allclose(
+            found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max(), err_msg=name
+        )
+
+
+def test_the_weight_of_the_first_state_is_that_of_prior_and_hold():
+    problem, x, _ = solved("held with gaps")
+    trial = at(problem, x)
+    expected = problem.prior.weight.copy()
+    held = np.ix_(problem.hold.components, problem.hold.components)
+    expected[held] += problem.hold.weight
+    np.testing.assert_allclose(weight_of_first(problem.terms, trial), expected, rtol=1e-14)
+
+
+def test_soft_rows_are_a_term():
+    soft = qpmhe.Box([-0.1], [0.2]).soften(linear=3.0, quadratic=5.0)
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1, noises=soft)
+    cost = qpmhe.QuadraticCost(prior=1.0, disturbance=10.0, noise=1.0)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.3]), cost, horizon=3, initial_state=[0.0], engine="python"
+    )
+    for y in (0.3, -0.4, 0.1):
+        mhe.update([y])
+    problem = mhe._engine.solved().problem
+    trial = at(problem, np.zeros((4, 1)))  # so that each noise is its measurement
+    penalty = problem.terms[-1]
+    missed = np.array([0.3 - 0.2, 0.4 - 0.1, 0.0])
+    assert penalty.cost(trial) == pytest.approx(np.sum(3.0 * missed + 5.0 * missed**2), rel=1e-14)
+    (rows,) = penalty.soft_rows(trial)
+    np.testing.assert_array_equal(rows.values[:, 0], [0.3, -0.4, 0.1])
+    assert trial.penalty == penalty.cost(trial)
