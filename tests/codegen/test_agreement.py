@@ -123,6 +123,22 @@ def test_the_same_runs(name):
     assert (found.costs <= found.candidate_costs).all()
 
 
+def test_the_same_derivatives_behind_a_change():
+    """Of the window as the compiled step has it, which a second run of the observer misses."""
+    one, found = case("angles across the seam"), []
+    for engine in ("python", "compiled"):
+        mhe = one.estimator(engine)
+        for t, sample in enumerate(one.samples[:17]):
+            mhe.update(**sample)
+            if t in one.changes:
+                mhe.set(**one.changes[t])
+        found.append(mhe.sensitivity())
+    for name in ("prior_weight", "discount", "measurements"):
+        expected, compiled = (getattr(each, name) for each in found)
+        same(np.asarray(compiled), np.asarray(expected), 1e-9, name)
+    assert np.abs(found[0].discount).max() > 0.01
+
+
 def test_vanishing_weights():
     """Where a loss leaves a singular QP, its flat directions are arbitrary; both engines step."""
     one = vanishing()
