@@ -114,21 +114,24 @@ class BatchEstimator:
 
     def _checked(self, states: Array) -> Array:
         """The initial states, if a single estimator takes each of them."""
-        own = self.system.copy(_scales(self.system, self.cost, self.observer))
+        own = self._own().as_written()
         _, first, which = np.unique(states, axis=0, return_index=True, return_inverse=True)
         checked = [
-            check_start(own, self.observer, self.cost, states[k], f"initial_states[{k}]")
+            check_start(own, self.observer, self.cost, states[k], f"initial_states[{k}]")[0]
             for k in first.tolist()
         ]
         return np.array(checked)[which.ravel()]
+
+    def _own(self) -> System:
+        """The system as a single estimator evaluates it."""
+        return _evaluated(self.system, self.cost, self.observer)
 
     def _made(self, states: Array) -> _Looped | CompiledMembers:
         parts = self.system, self.observer, self.cost, self.settings
         if self.settings.engine == "compiled":
             from .codegen.members import CompiledMembers  # late: most programs do without it
 
-            system = self.system.copy(_scales(self.system, self.cost, self.observer), traced=True)
-            return CompiledMembers(system, *parts[1:], states, self._threads)
+            return CompiledMembers(self._own(), *parts[1:], states, self._threads)
         return _Looped(*parts, states)
 
     def _leave_compiled(self, error: Exception) -> None:
@@ -300,10 +303,11 @@ class _Looped:
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array,
         traced: bool = True,
     ) -> None:
-        scaled = system.copy(_scales(system, cost, observer), traced=traced)
+        own = _evaluated(system, cost, observer)
+        if not traced:
+            own = own.as_written()
         self.engines = [
-            PythonEngine(scaled.copy(traced=traced), observer, cost, settings, state.copy())
-            for state in states
+            PythonEngine(own, observer, cost, settings, state.copy()) for state in states
         ]
 
     @property
@@ -463,11 +467,12 @@ class BatchRun:
         return float(has.mean()) if has.size else 0.0
 
 
-def _scales(system: System, cost: object, observer: Observer) -> Array | None:
-    """What a single estimator's copy of the system has for `System.scales`."""
-    if not isinstance(cost, Cost):  # which the single estimator refuses
-        return None
-    return cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
+def _evaluated(system: System, cost: object, observer: Observer) -> System:
+    """The system as a single estimator evaluates it."""
+    scales = None
+    if isinstance(cost, Cost):  # the single estimator refuses any other
+        scales = cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
+    return system.evaluated_by(system.model(scales))
 
 
 def _starts(value: ArrayLike, members: int, n: int) -> Array:

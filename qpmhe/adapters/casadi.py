@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import warnings
+from dataclasses import replace
 from functools import partial
 from typing import Any, Unpack
 
@@ -27,6 +28,7 @@ from ..model.evaluation import (
 )
 from ..model.expressions import CasadiModel, casadi_model, import_casadi
 from ..model.functions import Trusted
+from ..model.model import Origin
 from ..model.sets import ConvexSet
 from ..model.system import System, SystemOptions, checked_set, timed_options
 
@@ -92,28 +94,6 @@ def from_casadi(
             model, checked_set("states", options.get("states"), model.n), compiled is True
         )
 
-    def made(timed: bool) -> System:
-        maker = (
-            VirtualMachine(model, timed) if library is None
-            else partial(_compiled, model, library, timed)
-        )
-        evaluator = Evaluator(maker)
-        one = {name: Trusted(partial(evaluator.one, name)) for name in NAMES}
-        system = System(
-            one["f"], one["h"], n=model.n, p=model.p, m=model.m + timed,
-            f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"],
-            **(timed_options(options) if timed else options),
-        )
-        system.f_jacobian.method = system.h_jacobian.method = "casadi"
-        system.kernel = evaluator
-        return system
-
-    system = made(False)
-    system.symbolic, system.dt = model, model.dt
-    system.method = None if model.dt is None else method
-    if model.dt is not None:
-        system.make_timed = lambda: made(True)
-
     def augmented(change: Augmentation, others: SystemOptions) -> System:
         join = import_casadi().vertcat
         return from_casadi(
@@ -122,14 +102,31 @@ def from_casadi(
             n=change.n, p=model.p, m=change.m, dt=dt, method=method, compiled=compiled, **others,
         )
 
-    system.make_augmented = augmented
-    system.recipe = (
-        from_casadi,
-        {
-            "f": model.f, "h": model.h, "dt": dt, "method": method, "compiled": compiled, **options,
-        },
-    )
-    return system
+    recipe = {
+        "f": model.f, "h": model.h, "dt": dt, "method": method, "compiled": compiled, **options,
+    }
+
+    def made(timed: bool) -> System:
+        maker = (
+            VirtualMachine(model, timed) if library is None
+            else partial(_compiled, model, library, timed)
+        )
+        evaluator = Evaluator(maker)
+        one = {name: Trusted(partial(evaluator.one, name)) for name in NAMES}
+        origin = Origin(kernel=evaluator, jacobians="casadi", symbolic=model, is_timed=timed)
+        if not timed:
+            origin = replace(
+                origin, dt=model.dt, method=model.method, make_augmented=augmented,
+                make_timed=None if model.dt is None else lambda _: made(True),
+                recipe=(from_casadi, recipe),
+            )
+        return System.made(
+            one["f"], one["h"], origin, n=model.n, p=model.p, m=model.m + timed,
+            f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"],
+            **(timed_options(options) if timed else options),
+        )
+
+    return made(False)
 
 
 def _library(

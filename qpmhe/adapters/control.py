@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from .._checks import need, numbers, positive
 from ..errors import ModelError, OptionError
 from ..model.functions import Trusted
-from ..model.system import System, SystemOptions, probe_points
+from ..model.points import FEW, points
+from ..model.system import System, SystemOptions
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -79,10 +80,8 @@ def from_control(
         return _linear(**matrices, dt=length, method=method, options=options)
     made = _nonlinear(system, length, method, options)
     _check_no_time(system, made, dt)
-    made.recipe = (
-        from_control, {"system": system, "dt": dt, "method": method, **options}
-    )
-    return made
+    arguments = {"system": system, "dt": dt, "method": method, **options}
+    return made.with_origin(recipe=(from_control, arguments))
 
 
 def _real(name: str, matrix: Any) -> Array:
@@ -135,8 +134,7 @@ def _linear(
 def _with_recipe(system: System, *arguments: Any) -> System:
     names = ("A", "B", "C", "D", "dt", "method", "options")
     # A control.StateSpace does not pickle, its matrices do.
-    system.recipe = (_linear, dict(zip(names, arguments, strict=True)))
-    return system
+    return system.with_origin(recipe=(_linear, dict(zip(names, arguments, strict=True))))
 
 
 def _affine(of_state: Array, of_input: Array, m: int) -> tuple[Trusted, Trusted]:
@@ -186,7 +184,7 @@ def _check_no_time(system: Any, made: System, dt: float | None) -> None:
     if system.isctime():
         times.append(unit * _FRACTIONS)  # what has the sampling time as its period, too
     for name, function in (("dynamics", system.dynamics), ("output", system.output)):
-        for x, u in probe_points(made.states, made.n, made.m):
+        for x, u in points(FEW, made.n, made.m, made.states):
             first = _value(function, 0.0, x, u)
             if first is None:
                 continue

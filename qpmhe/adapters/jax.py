@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, Unpack
 
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from .._checks import dimension, need, positive
 from ..model.augmentation import Augmentation
 from ..model.functions import Trusted, takes_input
-from ..model.system import System, SystemOptions, checked_set, probe_points, timed_options
-from ..model.traces import ModelTrace
+from ..model.model import Origin
+from ..model.points import FEW, points
+from ..model.system import System, SystemOptions, checked_set, timed_options
 from .jax_programs import Programs
 
 Array = NDArray[np.float64]
@@ -112,39 +114,33 @@ def from_jax(
     """
     n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
     length = None if dt is None else positive("dt", dt)
-    probes = probe_points(checked_set("states", options.get("states"), n), n, m)
+    probes = points(FEW, n, m, checked_set("states", options.get("states"), n))
     programs = Programs(f, h, n, p, m, method, length is not None, probes)
-    system = _assembled(_Model(programs, length), m, options)
-    sources = {name: programs.as_numpy(name) for name in ("f", "h")}
-    system.tracing = ModelTrace(
-        system.f, system.h, n, p, m, system.states, length,
-        None if length is None else method, sources,
+
+    def timed(_: System) -> System:
+        own = Origin(is_timed=True)
+        return _assembled(_Model(programs, None), m + 1, own, timed_options(options))
+
+    origin = Origin(
+        dt=length, method=None if length is None else method,
+        sources={name: programs.as_numpy(name) for name in ("f", "h")},
+        make_timed=None if length is None else timed,
+        make_augmented=partial(_augmented, f, h, p, m, dt, method),
+        recipe=(
+            from_jax,
+            {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **options},
+        ),
     )
-    if length is not None:
-        system.dt, system.method = length, method
-        system.make_timed = partial(
-            _assembled, _Model(programs, None), m + 1, timed_options(options)
-        )
-    system.make_augmented = partial(_augmented, f, h, p, m, dt, method)
-    system.recipe = (
-        from_jax,
-        {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **options},
-    )
-    return system
+    return _assembled(_Model(programs, length), m, origin, options)
 
 
-def _assembled(model: _Model, m: int, options: SystemOptions) -> System:
+def _assembled(model: _Model, m: int, origin: Origin, options: SystemOptions) -> System:
     f, h, f_jacobian, h_jacobian = (Trusted(partial(model.evaluate, part)) for part in range(4))
-    system = System(
-        f, h, n=model.n, p=model.p, m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian, **options
+    remedy = "It is JAX's: look for stop_gradient or a custom derivative within {name}."
+    return System.made(
+        f, h, replace(origin, kernel=model, jacobians="jax", remedy=remedy), n=model.n, p=model.p,
+        m=m, f_jacobian=f_jacobian, h_jacobian=h_jacobian, **options,
     )
-    for name, jacobian in (("f", system.f_jacobian), ("h", system.h_jacobian)):
-        jacobian.method = "jax"
-        jacobian.remedy = (
-            f"It is JAX's: look for stop_gradient or a custom derivative within {name}."
-        )
-    system.kernel = model
-    return system
 
 
 def _augmented(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..errors import ModelError
-from ..model.functions import Probes
+from ..model.points import Points
 
 # What moves its window back into the array, or skips the entry, where an index is out of range.
 _INDEXING = ("gather", "scatter", "dynamic_slice", "dynamic_update_slice")
@@ -18,7 +18,7 @@ _FOUND = re.compile(
 )
 
 
-def check_indices(jax: Any, name: str, function: Callable[..., Any], probes: Probes) -> None:
+def check_indices(jax: Any, name: str, function: Callable[..., Any], probes: Points) -> None:
     """Reject a function that indexes an array out of range at a probe.
 
     Only indices in the user's code are checked, not those within compiled functions of JAX's

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from .._checks import need
 from ..errors import InvalidInputError, ModelError
 from ..model.discretize import discretize
-from ..model.functions import Probes, check_inputs, takes_input
+from ..model.functions import check_inputs, takes_input
+from ..model.points import Points
 from ..model.stand_ins import without_symbols
 from .jax_expressions import numpy_function
 from .jax_indices import check_indices
@@ -43,7 +44,7 @@ class Programs:
         m: int,
         method: str,
         timed: bool,
-        probes: Probes,
+        probes: Points,
     ) -> None:
         self.n, self.p, self.m, self.timed = n, p, m, timed
         self._jax, self._double, self._device = _imported()
@@ -139,7 +140,7 @@ class Programs:
             costs = self._jax.jit(function).lower(*arguments).cost_analysis()
         return float(costs["flops"]) if costs and "flops" in costs else math.inf
 
-    def _checked(self, name: str, function: Function, size: int, probes: Probes) -> Function:
+    def _checked(self, name: str, function: Function, size: int, probes: Points) -> Function:
         """The user's function as one of (x, u) to (size,), tried to see that it is."""
         if not callable(function):
             raise ModelError(f"{name} is {function!r}; expected a function of the state.")

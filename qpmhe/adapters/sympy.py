@@ -104,12 +104,10 @@ def from_sympy(
             **others,
         )
 
-    system.make_augmented = augmented
-    system.recipe = (from_sympy, {
+    return system.with_origin(make_augmented=augmented, recipe=(from_sympy, {
         "f": rates, "h": outputs, "x": state, "u": given, "dt": dt, "method": method,
         **options,
-    })
-    return system
+    }))
 
 
 def _flat(value: Any) -> Iterator[Any]:

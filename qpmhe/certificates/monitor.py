@@ -368,8 +368,9 @@ def _costs(certificate: Certificate, estimate: Estimate, u: Array) -> tuple[floa
     system, cost = certificate.system, certificate.cost
     x, z = estimate.trajectory, estimate.candidate
     try:
-        outputs = (system.h.batch(each[:-1], u) for each in (x, z))
-        ahead = (system.f.batch(each[:-1], u) for each in (x, z))
+        model = system.model()
+        outputs = (model.output(each[:-1], u) for each in (x, z))
+        ahead = (model.step(each[:-1], u) for each in (x, z))
         (h_x, h_z), (f_x, f_z) = outputs, ahead
     except Exception:  # a model that is not defined here: the hypothesis does not hold
         return math.nan, math.nan

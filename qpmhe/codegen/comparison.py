@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..model.evaluation import Buffers, fixed_call
 from ..model.expressions import CasadiModel, import_casadi
+from ..model.points import Magnitude, states_at
 from ..model.sets import ConvexSet
 
 Array = NDArray[np.float64]
@@ -23,12 +24,11 @@ ROUNDING = 1e-9
 _NUDGE, _WEIGHT = 1e-11, 300.0
 # States at once: vectorised loops treat remainders in code of their own.
 _COUNTS = (1, 2, 3, 4, 5, 8, 11)
-# Magnitude of the points, and the least share of it: positive ones first, where most models
-# are defined.
-_SCALES = (
+# Positive ones first, where most models are defined.
+_MAGNITUDES = tuple(Magnitude(*one) for one in (
     (1.0, 0.2), (1.0, -1.0), (10.0, 0.2), (0.1, 0.2), (10.0, -1.0), (100.0, 0.2), (0.01, 0.2),
     (1e3, 0.2), (1e-3, -1.0), (1e5, 0.2), (1e-5, 0.2),
-)
+))
 _ALL = ("f", "h", "f_jacobian", "h_jacobian")
 
 
@@ -92,16 +92,11 @@ def points(interpreter: Interpreter, states: ConvexSet | None, seed: int) -> Ite
     for batch, count in enumerate(_COUNTS):
         best: Batch | None = None
         most = -1
-        for trial in range(len(_SCALES)):
-            last = (last + (trial > 0)) % len(_SCALES)
-            scale, least = _SCALES[last]
-            xs = scale * generator.uniform(least, 1.0, (count, model.n))
-            if states is not None:
-                low, high = states.lower, states.upper
-                both = np.isfinite(low) & np.isfinite(high)
-                share = generator.uniform(0.2, 0.8, xs.shape)
-                xs = np.where(both, low + share * (high - low), np.clip(xs, low, high))
-            us = generator.uniform(least, 1.0, (count, model.m))
+        for trial in range(len(_MAGNITUDES)):
+            last = (last + (trial > 0)) % len(_MAGNITUDES)
+            one = _MAGNITUDES[last]
+            xs = states_at(generator, one, (count, model.n), states)
+            us = generator.uniform(one.least, 1.0, (count, model.m))
             steps = np.full(count, model.dt or 0.0)
             if batch % 2:
                 steps *= generator.uniform(0.3, 1.0, count)

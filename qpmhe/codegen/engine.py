@@ -100,8 +100,10 @@ class CompiledEngine:
         self._traces = WatchedFunctions(system, observer, cost)
         self._next_check: float = 0 if self._traces else math.inf
 
-    def reset(self, initial_state: Array) -> None:
+    def reset(self, initial_state: Array, system: System | None = None) -> None:
         """Forget all measurements and start at this state."""
+        if system is not None:
+            self._system = self._system.evaluated_like(system)
         tools = self._tools
         self._replace(self._library.estimators(initial_state[None], tools.record), tools)
 
@@ -225,9 +227,9 @@ class CompiledEngine:
             return
         if before is not None:
             self._memory[...] = before
-        self._system.use_functions()
+        system = self._system.as_written()
         record, state = self._memory[0], self._memory[0]["z_end"].copy()
-        parts = self._system, self._observer, self._given_cost, self._settings
+        parts = system, self._observer, self._given_cost, self._settings
         engine = PythonEngine(*parts, state)
         hand_over(record, self._library.layout, self._directions, self.usual, engine, True)
         raise EngineChangeError(engine, fault)
@@ -309,7 +311,7 @@ class CompiledEngine:
         if not record["has_trajectory"]:
             raise InvalidInputError("there is no estimate yet; call update first.")
         if self._mirror is None:
-            parts = self._system.copy(traced=True), self._observer, self._given_cost
+            parts = self._system, self._observer, self._given_cost
             self._mirror = PythonEngine(*parts, self._settings, self.state)
         with np.errstate(all="ignore"):
             hand_over(

@@ -31,6 +31,7 @@ from ..estimation.problem import Problem
 from ..estimation.settings import Settings
 from ..model.evaluation import NAMES, RESIDUALS, Buffers, Evaluator, results_of
 from ..model.functions import Trusted
+from ..model.model import Functions, Origin
 from ..model.system import System
 from ..observers import Observer
 from ..terms.base import Trial
@@ -114,23 +115,17 @@ def estimator_fault(
 def _interpreted_system(system: System, interpreter: Interpreter) -> System:
     """The system with its functions evaluated by CasADi's virtual machine."""
 
-    def changed(given: System, timed: bool) -> System:
+    def functions(timed: bool) -> Functions:
         evaluator = Evaluator(partial(_looped, interpreter, timed))
         one = {name: Trusted(partial(evaluator.one, name)) for name in NAMES}
-        bare = System(
-            one["f"], one["h"], n=given.n, p=given.p, m=given.m, f_jacobian=one["f_jacobian"],
-            h_jacobian=one["h_jacobian"],
-        )
-        other = given.with_sets({})  # a copy
-        for name in NAMES:
-            setattr(other, name, getattr(bare, name))
-        other.kernel = evaluator
-        return other
+        return System.made(
+            one["f"], one["h"], Origin(kernel=evaluator), n=system.n, p=system.p,
+            m=system.m + timed, f_jacobian=one["f_jacobian"], h_jacobian=one["h_jacobian"],
+        ).evaluation.functions
 
-    other = changed(system, False)
-    if system.make_timed is not None:
-        other.make_timed = lambda: changed(system.timed, True)
-    return other
+    return system.evaluated_by(replace(
+        system.evaluation, functions=functions(False), timed_functions=partial(functions, True)
+    ))
 
 
 def _looped(
@@ -254,7 +249,7 @@ class _Rehearsal:
         first = next(islice(batches, attempt, None))[0][0]
         start = first * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
         with suppress(ModelError):  # of a model that has no finite values there
-            start = check_start(system, observer, cost, start)
+            start, system = check_start(system, observer, cost, start)
         # Relative changes without a pattern: equal ones would leave differences as they are.
         nudge_x, self._nudge_y = (
             1 + _NUDGE * self._generator.uniform(-1.0, 1.0, size) for size in (n, p)

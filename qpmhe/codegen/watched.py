@@ -38,7 +38,7 @@ class WatchedFunctions:
             self._others["the correction"] = own.correction(system.n, system.p)
 
     def __bool__(self) -> bool:
-        return self.system.is_traced or bool(self._others)
+        return self.system.evaluation.is_traced or bool(self._others)
 
     def fault(self, z: Array, u: Array) -> str:
         """Which function differs from its trace, and how; blank if none does.
@@ -46,7 +46,7 @@ class WatchedFunctions:
         f and h are compared at the observer's state, the others at one of the points of the first
         comparison, a different one each time.
         """
-        fault = self.system.trace_fault(z, u)
+        fault = self.system.evaluation.fault(z, u)
         for name, one in self._others.items():
             text = one.fault(self._count)
             if text and not fault:

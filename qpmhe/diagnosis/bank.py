@@ -88,8 +88,9 @@ class FilterBank:
         #: The first thing that the model has raised.
         self.error: Exception | None = None
         #: Takes the length of the step as its last input where it can.
-        self.model = system if system.make_timed is None else system.timed
-        self._is_timed = self.model is not system
+        own = system.evaluated_by(system.model())
+        self.model = own.timed if system.has_timed else own
+        self._is_timed = system.has_timed
         if self._is_timed and steps is None:
             self.steps = np.array([float(system.dt or 1.0)])
         self._tried = False
@@ -99,12 +100,11 @@ class FilterBank:
         self._tried = True
         if "looped" not in (self.model.f.mode, self.model.h.mode):
             return
-        self.model = model = self.model.copy(traced=True)
         generator, count = np.random.default_rng(0), 2 * self.system.n + 7
         spread = 0.1 * np.sqrt(prior.diagonal())
         x = self._bounded(start + spread * generator.standard_normal((count, self.system.n)))
-        for one in (model.f, model.h, model.f_jacobian, model.h_jacobian):
-            one.try_batched(x, inputs[np.arange(count) % len(inputs)])
+        found = self.model.evaluation.batched_at(x, inputs[np.arange(count) % len(inputs)])
+        self.model = self.model.evaluated_by(found)
 
     def _bounded(self, x: Array) -> Array:
         states = self.system.states

@@ -65,8 +65,7 @@ def window_covariances(
     """
     states, n, count = trajectory[:-1], trajectory.shape[1], trajectory.shape[0] - 1
     try:
-        a = np.asarray(model.f_jacobian.batch(states, inputs))
-        c = np.asarray(model.h_jacobian.batch(states, inputs))
+        a, c = (np.asarray(one) for one in model.evaluation.linear(states, inputs))
     except Exception as error:
         raise InvalidInputError(
             f"the model has no Jacobians along the estimate: {error}"

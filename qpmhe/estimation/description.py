@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ..costs import Cost
 from ..costs.contracts import spare
 from ..memory.snapshot import mismatch
-from ..model.functions import Probes
+from ..model.points import FEW, Points, points
 from ..model.residuals import Residual
-from ..model.system import System, probe_points
+from ..model.system import System
 from ..observers import Observer, Sample
 from ..terms.base import read_only
 from .settings import Settings
@@ -57,11 +57,11 @@ def described(
     _describe("cost", cost, found)
     for name in ("prior", "disturbance", "noise", "discount"):
         _describe(f"cost.{name}", getattr(cost, name), found)
-    points = probe_points(None, system.n, system.m)
+    where = points(FEW, system.n, system.m)
     for name, function in (("f", system.f), ("h", system.h)):
-        found[f"model ({name})"] = _values_at(points, function.shape, function)
+        found[f"model ({name})"] = _values_at(where, function.shape, function)
     if not observer.needs_jacobians:
-        found["observer (its correction)"] = _corrections(system, observer, points)
+        found["observer (its correction)"] = _corrections(system, observer, where)
     sizes = np.ldexp(1.0, np.arange(-4, 5, 2))[:, None]
     residuals = [(one, cost.stage_weight) for one in sizes * np.ones(len(cost.stage_weight))]
     found["cost (its values)"] = _values_at(
@@ -82,7 +82,7 @@ def _values_at(points: Sequence[tuple[Any, ...]], shape: tuple[int, ...], functi
     return values
 
 
-def _corrections(system: System, observer: Observer, points: Probes) -> Array:
+def _corrections(system: System, observer: Observer, points: Points) -> Array:
     """The corrections of an observer without Jacobians, at fitting errors of all sizes."""
     errors = np.ldexp(1.0, np.arange(-4, 5, 2))[:, None] * np.linspace(1.0, 2.0, system.p)
     observer, covariance = spare(observer), observer.initial_covariance()

@@ -63,6 +63,7 @@ class PythonEngine:
     """
 
     name = "python"
+    _system: System
 
     def __init__(
         self,
@@ -74,8 +75,11 @@ class PythonEngine:
     ) -> None:
         if not (settings.qp_limit or observer.needs_jacobians):
             # A trace saves little here, and the observer is the user's to the last bit.
-            system.use_functions()
-        self._system, self._observer, self._given_cost = system, observer, cost
+            system = system.as_written()
+        system.evaluation.prepare(settings.horizon)
+        self._use_system(system)
+        system = self._system
+        self._observer, self._given_cost = observer, cost
         self._cost = cost = lifted(cost, system.disturbance_matrix, observer.initial_covariance())
         self._to_disturbances = None if cost.space is None else cost.space.to_disturbances
         self._disturbances = system.r
@@ -87,10 +91,8 @@ class PythonEngine:
         )
         if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)
-        if system.kernel is not None:
-            system.kernel.prepare(settings.horizon)
         if system.constraints is not None:
-            self._scale_constraints(initial_state)
+            self._system = system = self._with_scaled_constraints(initial_state)
         self._reader = ConditionReader(system, self._given_cost)
         self._tools = self._tools_for(usual_conditions(settings))
         penalties = self._tools.formulation.sum.penalties
@@ -101,16 +103,19 @@ class PythonEngine:
         self._smoothed = settings.arrival == "smoothed"
         self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
-        self._known_modes = system.call_modes()  # as found at construction
-        self._nearby = system.f_jacobian.nearby, system.h_jacobian.nearby
         # The time of the next comparison of the trace with the functions that it stands for.
         self._next_check: float = 0 if system.is_traced else math.inf
         self._undo_point: Mark
 
-    def _scale_constraints(self, initial_state: Array) -> None:
-        """Give the nonlinear constraints the standard deviations of what they are functions of."""
-        cost, functions = self._cost, self._system.constraints
-        assert functions is not None
+    def _use_system(self, system: System) -> None:
+        """Take a system, with a model of this engine's own, which notes what is taken nearby."""
+        self._system = system = system.evaluated_by(system.evaluation.copy())
+        self._nearby = system.f_jacobian.nearby, system.h_jacobian.nearby
+
+    def _with_scaled_constraints(self, initial_state: Array) -> System:
+        """The system, its constraints in standard deviations of what they are functions of."""
+        assert self._system.constraints is not None
+        cost, functions = self._cost, self._system.constraints.copy()
         deviations = self._given_cost.prior_deviations(
             self._observer.initial_covariance(), self._system.disturbance_matrix
         )
@@ -118,6 +123,7 @@ class PythonEngine:
             initial_state, deviations, inverse(cost.disturbance), inverse(cost.noise),
             self._to_disturbances,
         )
+        return self._system.with_constraints(functions)
 
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""
@@ -202,7 +208,7 @@ class PythonEngine:
         """Compare trace and functions at z(t); take the functions for good where they differ."""
         window = self._window
         self._next_check = next_check(window.time, self._settings.horizon)
-        fault = self._system.trace_fault(window.candidate[-1], u)
+        fault = self._system.fault(window.candidate[-1], u)
         if fault:
             self.leave_trace()
             warn_of(fault, 5)
@@ -210,7 +216,7 @@ class PythonEngine:
     def leave_trace(self) -> None:
         """Evaluate the original functions, along the window and from now on."""
         self._next_check = math.inf
-        self._system.use_functions()
+        self._use_system(self._system.as_written())
         self.set(USUAL, None)
 
     def _warn(self) -> None:
@@ -342,11 +348,19 @@ class PythonEngine:
         self._tools.subproblem.forget()
         self._solver.forget()
 
-    def reset(self, initial_state: Array) -> None:
+    def reset(self, initial_state: Array, system: System | None = None) -> None:
         """Forget all measurements and start at this state."""
         self._solver.forget()
-        window = self._fresh_window(initial_state, self._tools)
-        self.replace(Memory(self._tools, window))
+        before, tools = self._system, self._tools
+        try:
+            if system is not None and system.evaluation is not before.evaluation:
+                self._use_system(before.evaluated_like(system))
+                tools = self._tools_for(tools.usual)
+            window = self._fresh_window(initial_state, tools)
+            self.replace(Memory(tools, window))
+        except BaseException:
+            self._use_system(before)
+            raise
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
         """Change the conditions of all samples in the window and of later ones."""
@@ -444,7 +458,6 @@ class PythonEngine:
 
     def state_dict(self) -> dict[str, Any]:
         """The memory as plain arrays and numbers; a solver's warm start is not among them."""
-        modes, methods = self._system.call_modes()
         return {
             "problem": self._size(),
             "engine": self.name,
@@ -452,9 +465,6 @@ class PythonEngine:
             "linearized": self._with_terms,
             "usual": self._tools.usual.state_dict(),
             "window": self._window.state_dict(),
-            # How the model is called: another way would round differently.
-            "modes": list(modes),
-            "methods": list(methods),
         }
 
     def forget_warm_start(self) -> None:
@@ -477,18 +487,11 @@ class PythonEngine:
                 "one runs the Python step; create it with that engine, which needs a C "
                 "compiler, or take the snapshot with engine='python'."
             )
-        before = self._system.call_modes()
-        try:
-            with reading():
-                check_description(state["estimator"], self._description())
-                modes = self._checked_modes(state["modes"], state["methods"])
-                self._system.use_call_modes(modes)
-                memory = self._checked_memory(state)
-                self._solver.forget()
-            self.replace(memory)
-        except BaseException:
-            self._system.use_call_modes(before)
-            raise
+        with reading():
+            check_description(state["estimator"], self._description())
+            memory = self._checked_memory(state)
+            self._solver.forget()
+        self.replace(memory)
 
     def _checked_memory(self, state: dict[str, Any]) -> Memory:
         """The memory in a state."""
@@ -499,7 +502,7 @@ class PythonEngine:
         window = self._fresh_window(np.zeros(self._system.n), tools)
         window.load_state_dict(
             state["window"], lambda own: self._reader.load(own, tools.usual),
-            may_be_irregular=self._system.make_timed is not None, is_smoothed=self._smoothed,
+            may_be_irregular=self._system.has_timed, is_smoothed=self._smoothed,
             # The trajectory may be that of a surrogate, whose end is no estimate.
             ends_alike=self._cost.graduation == 1.0,
         )
@@ -507,31 +510,3 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 window.restate()
         return Memory(tools, window)
-
-    def _checked_modes(
-        self, modes: Any, methods: Any
-    ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """How a state's estimator called the model; raises if it cannot be called so here."""
-        known_modes, known_methods = self._known_modes
-        if len(modes) == 4:
-            if self._system.make_timed is None:
-                raise ValueError("the system has no steps of other lengths")
-            timed = self._system.make_timed().call_modes()
-            known_modes, known_methods = known_modes + timed[0], known_methods + timed[1]
-        for name, found, known, slowest in (
-            ("modes", modes, known_modes, "looped"),
-            ("methods", methods, known_methods, "finite differences"),
-        ):
-            if not isinstance(found, (list, tuple)) or len(found) != len(known):
-                raise ValueError(f"{name} is {found!r}; expected {len(known)} of them")
-            traced = zip(methods, known_methods, strict=False)
-            for one, mine, both in zip(found, known, traced, strict=False):
-                # What is traced on one side alone is called in another way there.
-                if both[0] != both[1] and "traced" in both:
-                    continue
-                # The saved estimator may have found another way to call the model, at other states.
-                # Computing the stages again shows whether it gives the same here.
-                other = {"unknown": ("batched", "columns"), slowest: ("complex step",)}
-                if not isinstance(one, str) or one not in (mine, slowest, *other.get(mine, ())):
-                    raise ValueError(f"{name} is {found!r}; expected {known}")
-        return tuple(modes), tuple(methods)

@@ -52,8 +52,11 @@ class Engine(Protocol):
     def length(self) -> int:
         """Number of samples in the window."""
 
-    def reset(self, initial_state: Array) -> None:
-        """Forget all measurements and start at this state."""
+    def reset(self, initial_state: Array, system: System | None = None) -> None:
+        """Forget all measurements and start at this state.
+
+        From now on with the functions as they are evaluated by this system, if one is given.
+        """
 
     @property
     def usual(self) -> Conditions:

@@ -23,7 +23,6 @@ from .._linalg import inverse
 from ..costs import Cost
 from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
 from ..memory.snapshot import read, written
-from ..model.second_derivatives import SecondDerivatives
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.traces import warn_of
@@ -194,11 +193,9 @@ class MovingHorizonEstimator:
         check_cost(system, cost)
         check_observer(system, observer)
         check_prior(observer, cost, warns=not is_copy and self.settings.max_qps != 0)
-        # A copy: this estimator may change how f and h are called (batched, or one by one).
-        self._own_system = system.copy(
-            cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix),
-            traced=True,
-        )
+        own = system.evaluated_by(system.model(
+            cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
+        ))
         nominal = self.settings.parameters
         if len(nominal) > system.m:
             raise ShapeError(
@@ -210,16 +207,19 @@ class MovingHorizonEstimator:
         self._full_input = self._usual_input.copy()  # each sample's, overwritten
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._sensors = (system.p,)
-        self._initial_state: Array = self._checked_start(initial_state, self._own_system)
+        self._takes_steps = False  # whether a step of another length has been tried
+        # The system as this estimator evaluates it.
+        self._initial_state: Array
+        self._initial_state, self._own_system = self._checked_start(initial_state, own)
         if not is_copy:
             check_correction(
                 self._own_system, observer, cost, self._initial_state, self._usual_input
             )
             error = step_error(
-                system, cost, observer.initial_covariance(), self._initial_state, self._usual_input
+                self._own_system, cost, observer.initial_covariance(), self._initial_state,
+                self._usual_input,
             )
             warn_of_step(error, system, 3)
-        self._second: SecondDerivatives | None = None
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -231,7 +231,9 @@ class MovingHorizonEstimator:
             ) from error
 
 
-    def _checked_start(self, initial_state: ArrayLike, system: System) -> Array:
+    def _checked_start(
+        self, initial_state: ArrayLike, system: System
+    ) -> tuple[Array, System]:
         state = vector("initial_state", initial_state, system.n)
         return check_start(system, self.observer, self.cost, state, u=self._usual_input)
 
@@ -249,16 +251,16 @@ class MovingHorizonEstimator:
         InvalidInputError
             If the state is invalid; the estimator stays unchanged.
         """
-        before, modes = self._initial_state, self._own_system.call_modes()
+        before, state, system = self._initial_state, self._initial_state, None
+        if initial_state is not None:
+            state, system = self._checked_start(initial_state, self._engine.system)
         try:
-            if initial_state is not None:
-                self._initial_state = self._checked_start(initial_state, self._engine.system)
+            self._initial_state = state
             # X may be another one than that in which the former state is.
-            start, _ = _inside(self._engine.system, self.observer, self.cost, self._initial_state)
-            self._engine.reset(start)
+            start, _ = _inside(self._engine.system, self.observer, self.cost, state)
+            self._engine.reset(start, system)
         except BaseException:
             self._initial_state = before
-            self._own_system.use_call_modes(modes)
             raise
 
     @property
@@ -509,13 +511,9 @@ class MovingHorizonEstimator:
 
     def _check_step_length(self, dt: float) -> None:
         """Check once, before a sample is taken, that the model takes step lengths."""
-        own = self._own_system
-        if "timed" not in own.__dict__:
-            try:
-                own.timed.check(self._initial_state, np.append(self._usual_input, dt))
-            except BaseException:
-                own.__dict__.pop("timed", None)
-                raise
+        if not self._takes_steps:
+            self._engine.system.timed.at(self._initial_state, np.append(self._usual_input, dt))
+            self._takes_steps = True
 
     def amend(self, time: int, y: ArrayLike) -> Estimate:
         """Insert a late measurement, rerun the observer from there, and estimate again.
@@ -675,9 +673,7 @@ class MovingHorizonEstimator:
         return self._sensitivity_of(self._engine.solved())
 
     def _sensitivity_of(self, solved: Solved) -> Sensitivity:
-        system, second = solved.formulation.system, self._second
-        if second is None or second.system is not system or second.traced != system.is_traced:
-            self._second = second = SecondDerivatives(system)
+        second = solved.formulation.system.evaluation.second_derivatives
         with np.errstate(all="ignore"):
             return self.differentiate(
                 solved, second, self.settings.tolerance, len(self.settings.parameters)
@@ -740,9 +736,9 @@ class MovingHorizonEstimator:
         pinned = memory.get("engine")
         # Whole or, if interrupted, not at all.
         if isinstance(pinned, str) and self.engine != pinned and self.settings.engine == "auto":
+            own = self._own_system.evaluated_like(self._engine.system)
             engine = engine_of_snapshot(
-                pinned, self._own_system, self.observer, self.cost, self.settings,
-                self._initial_state,
+                pinned, own, self.observer, self.cost, self.settings, self._initial_state,
             )
             engine.load_state_dict(memory)
             self._engine = engine
@@ -831,8 +827,11 @@ def check_cost(system: System, cost: Cost) -> None:
 def check_start(
     system: System, observer: Observer, cost: Cost, state: Array, name: str = "initial_state",
     u: Array | None = None,
-) -> Array:
-    """Check that model and observer work at an initial state; return it, projected onto X."""
+) -> tuple[Array, System]:
+    """Check that model and observer work at an initial state.
+
+    Returns the state, projected onto X, and the system as it is evaluated from there on.
+    """
     try:
         start, is_moved = _inside(system, observer, cost, state)
         if is_moved:
@@ -843,13 +842,13 @@ def check_start(
                 stacklevel=4,
             )
         state = start
-        system.check(state, np.zeros(system.m) if u is None else u)
+        system = system.at(state, np.zeros(system.m) if u is None else u)
         observer.check(system, state)
     except ModelError as error:
         if name == "initial_state":
             raise
         raise ModelError(f"{name}: {error}") from error
-    return state
+    return state, system
 
 
 def _inside(

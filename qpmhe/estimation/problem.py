@@ -294,17 +294,7 @@ class Problem:
 
     def _residuals(self, trajectory: Array) -> Array:
         """Residuals w and v of each stage; raises what the model raises."""
-        model = self.model
-        if model.kernel is not None:
-            return model.kernel.residuals(trajectory, self.measurements, self.inputs)
-        states = trajectory[:-1]
-        # Concatenating contiguous differences is faster than writing into columns.
-        disturbances = trajectory[1:] - model.f.batch(states, self.inputs)
-        noises = self.measurements - model.h.batch(states, self.inputs)
-        residuals: Array = np.concatenate((disturbances, noises), axis=1)
-        if residuals.shape != self.candidate.residuals.shape or residuals.dtype != np.float64:
-            raise TypeError("f or h returned other than real numbers of the right shape")
-        return residuals
+        return self.model.evaluation.residuals(trajectory, self.measurements, self.inputs)
 
     def wrap(self, residuals: Array, trajectory: Array) -> None:
         """Turn the plain differences of a trajectory into residuals, in place."""

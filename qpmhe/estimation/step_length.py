@@ -67,7 +67,7 @@ def step_error(
     StepError or None
         None without a model in continuous time, and where no step is finite.
     """
-    if system.dt is None or system.make_timed is None:
+    if system.dt is None or not system.has_timed:
         return None
     try:
         prior = np.sqrt(inverse(cost.initial_weight(covariance)).diagonal())

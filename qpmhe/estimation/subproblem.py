@@ -80,8 +80,9 @@ class Subproblem:
         count = states.shape[0]
         model, linear = problem.model, terms.linear[:count]
         try:
-            np.negative(model.f_jacobian.batch(states, problem.inputs), out=linear[:, :n, 1:])
-            np.negative(model.h_jacobian.batch(states, problem.inputs), out=linear[:, n:, 1:])
+            a, c = model.evaluation.linear(states, problem.inputs)
+            np.negative(a, out=linear[:, :n, 1:])
+            np.negative(c, out=linear[:, n:, 1:])
         except Exception as error:  # a user's Jacobian outside its domain
             self.failure = raised_along(
                 error,

@@ -385,8 +385,9 @@ class Window(Record):
         try:
             if self._with_jacobians:
                 minus_jacobian, inputs, model = view.span.minus_jacobian, self.inputs, self.model
-                np.negative(model.f_jacobian.batch(states, inputs), minus_jacobian[:, :n])
-                np.negative(model.h_jacobian.batch(states, inputs), minus_jacobian[:, n:])
+                a, c = model.evaluation.linear(states, inputs)
+                np.negative(a, minus_jacobian[:, :n])
+                np.negative(c, minus_jacobian[:, n:])
             if self._quadratic:
                 view.costs[...] = checked = self.terms.set_all(self.length, weights, self.start)
             else:
@@ -537,7 +538,7 @@ class Window(Record):
         terms = view.terms
         self._evaluating = "the model"
         model, u = self._fill_sample(k, time, observed)
-        kernel = model.kernel if self._with_jacobians else None
+        kernel = model.evaluation.functions.kernel if self._with_jacobians else None
         if kernel is None:
             usual = model is self._system
             arguments = view.arguments if usual else (view.arguments[0], u)

@@ -95,15 +95,14 @@ def augmented(system: System, change: Augmentation, **options: Unpack[SystemOpti
             "an augmented model does not inherit; leave them out, or write the augmented model as "
             "a System with its own functions."
         )
-    if system.make_augmented is not None:
-        found = system.make_augmented(change, options)
+    if system.origin.make_augmented is not None:
+        found = system.origin.make_augmented(change, options)
     else:
         found = System(
             change.over_leading(system.f, 1.0), change.over_leading(system.h),
             n=change.n, p=system.p, m=change.m, **options,
         )
-    found.held = dict(system.held)
-    return found
+    return found.with_origin(held=system.held)
 
 
 def chosen(name: str, given: ArrayLike | None, size: int, kind: str) -> Index:

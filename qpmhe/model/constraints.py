@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
+from functools import cached_property
 from itertools import pairwise, product
 from typing import Any
 
@@ -17,9 +18,11 @@ from qpmhe_solvers.values import integer, shown
 
 from ..errors import ModelError, SetError, ShapeError
 from .derivatives import Jacobian
-from .functions import BatchedFunction, Probes, raised
+from .functions import BatchedFunction, raised
+from .points import ALL, FEW, USUAL, Points, points
 from .sets import Box, ConvexSet, penalties
-from .tracing import trace
+from .traces import depends, evaluated_alone, of_both
+from .tracing import Traced, difference, traced
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,8 +36,6 @@ _WANDERED = 30.0
 _MOVE = 2.0**-12
 # Points at which constraints are compared with another system's.
 _POINTS = 5
-# Labels of a trace are the bits of 64-bit integers.
-_MOST_LABELS = 62
 
 
 @report_unknown_options
@@ -138,7 +139,7 @@ class _Bound:
 
     def __init__(
         self, index: int, constraint: Constraint, sizes: dict[str, int],
-        bounds: dict[str, ConvexSet | None], probes_of: Callable[..., Probes],
+        bounds: dict[str, ConvexSet | None],
     ) -> None:
         self.size, self._names, self._written = constraint.size, constraint.names, constraint.g
         name, m = f"constraints[{index}]", sizes["u"]
@@ -158,10 +159,9 @@ class _Bound:
                 lower.append(-free if one is None else one.lower)
                 upper.append(free if one is None else one.upper)
         self._box = Box(np.concatenate(lower), np.concatenate(upper))
-        self._inputs, self._probes_of = m, probes_of
+        self._inputs = m
         self._takes_input = "u" in self._names
-        self._found: BatchedFunction | None = None
-        probes = probes_of(self._box, self._d, m)
+        probes = points(FEW, self._d, m, self._box)
         try:
             self.function = BatchedFunction(
                 name, self._with_input if self._takes_input else self._without_input,
@@ -169,8 +169,10 @@ class _Bound:
             )
         except ModelError as error:
             raise ModelError(f"{error} A constraint's size is the number of its rows.") from error
-        self._found = self.function
         self.jacobian = Jacobian(self.function, None, m, probes, self._box)
+        self._user = self.function, self.jacobian
+        #: The expression of g that is evaluated in its place; None where it is called as written.
+        self.trace: Traced | None = None
 
     def _without_input(self, s: Array) -> Any:
         return self._written(**self._split(s))
@@ -181,21 +183,15 @@ class _Bound:
     def _split(self, s: Array) -> dict[str, Array]:
         if len(self.parts) == 1:
             return dict.fromkeys(self.parts, s)
-        if s.ndim == 2 and self._by_columns(s):
-            return {name: s[part] for name, part in self.parts.items()}
-        return {name: s[..., part] for name, part in self.parts.items()}
-
-    def _by_columns(self, s: Array) -> bool:
-        """Whether the points are the columns of s; shapes do not say so where it is square."""
-        if self._found is None:
-            return bool(s.shape[-1] != self._d)
-        return self._found.mode == "columns"
+        return {name: s[part] for name, part in self.parts.items()}
 
     def copy(self) -> _Bound:
         """The same, whose functions may come to be called in other ways."""
         other = copy(self)
         other.function = self.function.copy()
         other.jacobian = self.jacobian.copy(other.function)
+        if self.trace is None:
+            other._user = other.function, other.jacobian
         return other
 
     def joined(self, values: dict[str, Array]) -> Array:
@@ -207,9 +203,34 @@ class _Bound:
     def use_scales(self, deviations: Array) -> None:
         """Take the typical magnitudes of s."""
         self._deviations = deviations
-        probes = self._probes_of(self._box, self._d, self._inputs, deviations)
-        self.function.try_again(probes)
-        self.jacobian.use_scales(deviations, None, probes)
+        function, jacobian = self._user
+        jacobian = jacobian.copy(function)
+        jacobian.use_scales(deviations, None, ())
+        self._user = self.function, self.jacobian = function, jacobian
+        where = points(USUAL, self._d, self._inputs, self._box, deviations)
+        self.trace = self._traced([*where, *points(ALL, self._d, self._inputs, self._box)])
+        if self.trace is not None:
+            self.function, self.jacobian = evaluated_alone(
+                function, jacobian, self.trace, self._d, self._inputs
+            )
+
+    def _traced(self, where: Points) -> Traced | None:
+        """The expression of g, if it has one that gives the same."""
+        found = traced(of_both(self.function), (self._d, self._inputs), where, name="g")
+        has_values = found.function is not None and found.function.numel_out(0) == self.size
+        return found if has_values else None
+
+    def fault(self, s: Array, u: Array) -> str:
+        """How g differs from its expression at a point; blank if it does not."""
+        if self.trace is None:
+            return ""
+        return difference(self.trace, of_both(self._user[0]), [(s, u)])
+
+    def as_written(self) -> _Bound:
+        """The same, with g called as it is written."""
+        other = copy(self)
+        (other.function, other.jacobian), other.trace = self._user, None
+        return other
 
     def scale(self, start: Array, deviations: Array, typical: Array, u: Array) -> Array:
         """The largest change (size,) of each row within a standard deviation around a start.
@@ -278,7 +299,7 @@ class _Bound:
 
     def probed(self, k: int) -> Array:
         """Values (size,) at a fixed point; infinity where it raises or is not finite."""
-        s, u = self._probes_of(None, self._d, self._inputs)[k]
+        s, u = points(FEW, self._d, self._inputs)[k]
         with np.errstate(all="ignore"):
             values: Array = self.values(s[None], u[None])[0]
         return values
@@ -287,16 +308,10 @@ class _Bound:
         """Which rows depend on each component of v (size, p); all where that is not known."""
         if "v" not in self.parts:
             return np.zeros((self.size, p), np.bool_)
-        labels = None
-        bits = np.left_shift(np.uint64(1), np.arange(1, p + 1, dtype=np.uint64))
-        if p <= _MOST_LABELS:
-            s = np.ones(self._d, np.uint64)
-            s[self.parts["v"]] = bits
-            arguments = [s, np.ones(self._inputs, np.uint64)][: 1 + self._takes_input]
-            labels = trace(self.function.function, arguments)
-        if labels is None or labels.size != self.size:
+        found = self._traced(points(USUAL, self._d, self._inputs, self._box))
+        if found is None:
             return np.ones((self.size, p), np.bool_)
-        touched: Mask = (labels.reshape(-1, 1) & bits) != 0
+        touched: Mask = depends(found)[:, self.parts["v"]]
         return touched
 
 
@@ -317,13 +332,13 @@ class ConstraintFunctions:
 
     def __init__(
         self, constraints: Sequence[Constraint], sizes: dict[str, int],
-        bounds: dict[str, ConvexSet | None], probes_of: Callable[..., Probes],
+        bounds: dict[str, ConvexSet | None],
     ) -> None:
         self._n, self._r, self._p, self._m = (sizes[name] for name in ("x", "w", "v", "u"))
         # Maps d = x+ - f(x) to w; None for the identity.
         self._through: Array | None = None
         self._bound = [
-            _Bound(k, one, sizes, bounds, probes_of) for k, one in enumerate(constraints)
+            _Bound(k, one, sizes, bounds) for k, one in enumerate(constraints)
         ]
         ends = np.cumsum([0, *(one.size for one in constraints)]).tolist()
         self._places = [slice(a, b) for a, b in pairwise(ends)]
@@ -334,7 +349,6 @@ class ConstraintFunctions:
         self.quadratic: Array = np.concatenate([one[1] for one in chosen])
         self.soft: Mask = np.repeat([one.penalty is not None for one in constraints], counts)
         self.on_state: Mask = np.repeat([one.on_state for one in self._bound], counts)
-        self._touched = np.vstack([one.touched(self._p) for one in self._bound])
         #: The unit (T,) in which a miss of a row is measured; see `use_scales`.
         self.scale: Array = np.ones(self.size)
 
@@ -343,6 +357,33 @@ class ConstraintFunctions:
         other = copy(self)
         other._bound = [one.copy() for one in self._bound]
         return other
+
+    def as_written(self) -> ConstraintFunctions:
+        """The same, with all functions called as they are written."""
+        other = copy(self)
+        other._bound = [one.as_written() for one in self._bound]
+        return other
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether some are evaluated by expressions that may become wrong."""
+        return any(one.trace is not None for one in self._bound)
+
+    def fault(self, x: Array, u: Array) -> str:
+        """Which one differs from its expression at a state and input, and how; blank if none does.
+
+        Compared without disturbance and noise.
+        """
+        for one in self._bound:
+            text = one.fault(one.joined(self._start(x)), u)
+            if text:
+                return f"{one.function.name} has changed since it was traced: {text}"
+        return ""
+
+    @cached_property
+    def _touched(self) -> Mask:
+        """Which rows depend on each component of v."""
+        return np.vstack([one.touched(self._p) for one in self._bound])
 
     def _along(
         self, trajectory: Array, inputs: Array, residuals: Array

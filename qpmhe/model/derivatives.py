@@ -1,10 +1,9 @@
-"""Jacobians of model functions: given, or by the complex step, or by finite differences."""
+"""Jacobians of model functions: given, or by finite differences."""
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from copy import copy
 from functools import partial
@@ -14,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from .functions import NO_INPUT, BatchedFunction, Probes, Trusted, missing_input
+from .functions import NO_INPUT, BatchedFunction, Trusted, missing_input
+from .points import Points
 from .residuals import Residual
 from .sets import ConvexSet
 
 Array = NDArray[Any]
 
-# Of a state's magnitude. No subtraction, hence no cancellation: any tiny step is exact.
-_COMPLEX_STEP = 2.0**-100
 _DIFFERENCE_STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 # Accuracy of differences: of each entry, of an entry beside the largest of its row, and of one
 # beside the function's value, where it is rounding.
@@ -76,7 +74,7 @@ class Jacobian:
     Attributes
     ----------
     method : str
-        ``given``, ``complex step`` or ``finite differences``.
+        ``given``, or another word of who gives it, or ``finite differences``.
     inner : (2, n) array
         Bounds a small step inside those of X, infinite where X has none.
     aside : (n,) array
@@ -95,9 +93,11 @@ class Jacobian:
         function: BatchedFunction,
         given: Callable[..., Any] | Trusted | None,
         inputs: int,
-        probes: Probes,
+        probes: Points,
         states: ConvexSet | None = None,
         residual: Residual | None = None,
+        method: str = "given",
+        remedy: str = "",
     ) -> None:
         self.function, self._inputs, self._residual = function, inputs, residual
         n = probes[0][0].size
@@ -115,9 +115,8 @@ class Jacobian:
         if given is not None:
             name = f"{function.name}_jacobian"
             self._given = BatchedFunction(name, given, (*function.shape, n), inputs, probes)
-            self.method, self.batch = "given", self._given_batch
-        else:
-            self._choose(probes)
+            self.method, self.batch = method, self._given_batch
+            self.remedy = remedy or self.remedy
 
     def __call__(self, x: Array, u: Array = NO_INPUT) -> Array:
         """The Jacobian (d, n) at one state and input, which may be left out if m is 0."""
@@ -140,8 +139,10 @@ class Jacobian:
         """A function of one state, and of the input where there are any."""
         return self if self._inputs else partial(self, u=NO_INPUT)
 
-    def use_scales(self, scales: Array, outputs: Array | None, probes: Probes) -> None:
-        """Take these magnitudes of states, and values if known; choose or compare anew.
+    def use_scales(
+        self, scales: Array, outputs: Array | None, probes: Iterable[tuple[Array, Array]]
+    ) -> None:
+        """Take these magnitudes of states, and values if known; compare a given Jacobian anew.
 
         The probes must be of these magnitudes.
         """
@@ -149,18 +150,12 @@ class Jacobian:
         if outputs is not None:
             self._outputs = outputs
         self._set_scales(scales)
-        if self._given is None:
-            self._choose(probes)
-        else:
-            self._given.try_again(probes)
-            self._compare(probes)
+        self._compare(probes)
 
     def _set_scales(self, scales: Array) -> None:
         # Powers of two: what a step divides by then costs no rounding, and depends on no other
         # digits of the scales.
         self._sizes = np.ldexp(1.0, np.frexp(scales)[1] - 1)
-        self._complex_steps = _COMPLEX_STEP * self._sizes
-        self._complex_moves = 1j * self._complex_steps * self._eye
         self.aside = _ASIDE * self._sizes * (-_GOLDEN) ** np.arange(len(self._eye))
         if self._bounds is not None and np.isfinite(self._bounds).any():
             lower, upper = self._bounds
@@ -194,13 +189,6 @@ class Jacobian:
         if np.isnan(found).all():  # with the error of the place itself
             return np.asarray(given(x, u), np.float64)
         return found
-
-    def _complex(self, x: Array, u: Array) -> Array:
-        moved = x[..., None, :] + self._complex_moves
-        u_all = np.broadcast_to(u[..., None, :], (*moved.shape[:-1], u.shape[-1]))
-        values = np.asarray(self.function.batch(moved, u_all))
-        slope: Array = np.swapaxes(values.imag, -1, -2) / self._complex_steps
-        return slope
 
     def _differences(self, x: Array, u: Array) -> Array:
         step = _DIFFERENCE_STEP * np.maximum(self._sizes, np.abs(x))
@@ -304,42 +292,13 @@ class Jacobian:
         reached = value + _FAR * _DIFFERENCE_STEP * scaled_slope
         return bool((self._residual.aligned(reached, value) != reached).any())
 
-    def _choose(self, probes: Probes) -> None:
-        works = self._complex_step_works(probes)
-        self._undecided = works is None
-        self.use("complex step" if works else "finite differences")
-
-    def _complex_step_works(self, probes: Probes) -> bool | None:
-        """Whether it agrees with differences at all probes; None if none can be used."""
-        usable = None
-        for x, u in probes:
-            measured = self._measured(x, u)
-            if measured is None or np.isnan(measured[1]).all():
-                continue
-            usable = True
-            try:
-                # A function that throws the imaginary part away warns, which raises here.
-                with np.errstate(all="ignore"), warnings.catch_warnings():
-                    warnings.simplefilter("error")
-                    found = self._complex(x[None], u[None])[0]
-            except Exception:  # comparisons, math.sin and the like do not take complex numbers
-                return False
-            if not np.isfinite(found).all() or self._wrong(found, x, *measured).any():
-                return False
-        return usable
-
     def check(self, x: Array, u: Array) -> None:
-        """Test the method at a state that will be used, and find the steps there."""
+        """Compare a given Jacobian at a state that will be used; find the steps of others there."""
         if self._given is not None:
             if self._scales is not None and self.method != "traced":
                 self._compare([(x, u)])
             return
-        works = self._complex_step_works([(x, u)])
-        if self.method == "complex step" and not works:
-            self.use("finite differences")
-        elif self._undecided and works:
-            self.use("complex step")
-        if self.method == "finite differences" and self._scales is not None:
+        if self._scales is not None:
             self._set_scales(self._scales)
             measured = self._measured(x, u)
             if measured is not None:
@@ -361,9 +320,8 @@ class Jacobian:
         """The same Jacobian, of a copy of its function; its method can change independently."""
         other = copy(self)
         other.function, other.nearby = function, Nearby()
-        if self._given is None:
-            other.use(self.method)
-        else:
+        other.batch = other._differences
+        if self._given is not None:
             other._given = self._given.copy()
             other.batch = other._given_batch
         return other
@@ -372,20 +330,11 @@ class Jacobian:
         """As `BatchedFunction.try_batched`."""
         (self.function if self._given is None else self._given).try_batched(x, u)
 
-    def use(self, method: str) -> None:
-        """Compute by this method from now on, unless the user gave the Jacobian."""
-        if self._given is None:
-            self.method = method
-            self.batch = self._complex if method == "complex step" else self._differences
-
     def follow(self, other: Jacobian) -> None:
-        """Compute as another Jacobian of the same function does, if it computes."""
+        """Note what is taken nearby where another one does."""
         self.nearby = other.nearby
-        if other._given is None:
-            self.use(other.method)
-            self._undecided = False
 
-    def _compare(self, probes: Probes) -> None:
+    def _compare(self, probes: Iterable[tuple[Array, Array]]) -> None:
         """Raise where a given Jacobian is not the derivative."""
         given = self._given
         if given is None:

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from qpmhe_solvers.values import shown
 
 from ..errors import InvalidInputError, ModelError, QpmheError
-from .tracing import trace, unmasked
+from .points import Points
+from .tracing import unmasked
 
 Array = NDArray[Any]
-Probes = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 #: The input of a system without inputs.
 NO_INPUT = np.zeros(0)
-# Relative change of a number in its last six bits.
-_LAST_DIGITS = 2.0**-46
+# So many points must have a value, where the shape of values is checked.
+_ENOUGH = 2
 
 
 class EvaluationError(QpmheError):
@@ -37,25 +37,6 @@ class Trusted(NamedTuple):
     """A function of this package that takes (..., n) as well as (n,) and modifies no argument."""
 
     function: Callable[..., Any]
-
-
-class Parametric(NamedTuple):
-    """A user's f(x, u, theta), or f(x, theta), as one of x and (u, theta)."""
-
-    function: Callable[..., Any]
-    inputs: int
-    takes_input: bool
-
-    def by_rows(self, x: Array, known: Array) -> Any:
-        """The value where the last axis counts components."""
-        return self._called(x, known[..., : self.inputs], known[..., self.inputs :])
-
-    def by_columns(self, x: Array, known: Array) -> Any:
-        """The value where the first axis does."""
-        return self._called(x, known[: self.inputs], known[self.inputs :])
-
-    def _called(self, x: Array, u: Array, theta: Array) -> Any:
-        return self.function(x, u, theta) if self.takes_input else self.function(x, theta)
 
 
 def contained(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -100,53 +81,49 @@ def raised_along(
 
 
 class BatchedFunction:
-    """g(x) or g(x, u), evaluated over leading dimensions however it was written.
+    """g(x) or g(x, u) of one state, evaluated over leading dimensions.
 
-    A function is called state by state (``looped``), with a copy of each argument, unless a
-    trace proves that it needs neither: called on symbols, it returns without asking for a
-    value, writes into no argument, and computes each state's value from this state alone.
-    Then it is called once for many states, as NumPy's own functions are (``batched``), or
-    with the states as columns (``columns``), which suits ``np.array([x[1], -x[0]])``.
+    A user's function is called state by state, with a copy of each argument. Only functions of this
+    package are called once for many states; so are expressions, which stand in the place of users'
+    functions in estimators.
 
     Attributes
     ----------
     mode : str
-        ``batched``, ``columns``, ``looped``, or ``unknown`` where no probe could be used.
+        ``batched`` or ``looped``.
     takes_input : bool
         Whether it is a function of u as well.
     reads_only : bool
-        Whether a trace proved that it writes into no argument and returns one kind of value.
+        Whether it writes into no argument, which a trace proves, so that it needs no copies.
     """
 
     def __init__(
         self,
         name: str,
-        function: Callable[..., Any] | Trusted | Parametric,
+        function: Callable[..., Any] | Trusted,
         shape: tuple[int, ...],
         inputs: int,
-        probes: Probes,
+        probes: Points,
     ) -> None:
-        self._trusted = isinstance(function, Trusted)
-        by_columns = None
+        self.reads_only = isinstance(function, Trusted)
+        self.mode = "batched" if self.reads_only else "looped"
         if isinstance(function, Trusted):
             function = function.function
-        elif isinstance(function, Parametric):
-            by_columns, function = contained(function.by_columns), function.by_rows
         if not callable(function):
             raise ModelError(f"{name} is {shown(function)}; expected a function of the state.")
         self.name, self.shape = name, shape
-        self._inputs = inputs
+        self._inputs, self.has_inputs = inputs, inputs > 0
         self.takes_input = takes_input(name, function, inputs)
         #: What is called: the user's function, contained.
         self.function = contained(function)
-        self._by_columns = by_columns or self.function
         # A scalar at one state is a value of shape (1,): p = 1 is written without brackets.
         self._short = False
-        self.reads_only = self._trusted
-        self._returns_array = True
-        self._is_odd = False  # returns objects, or masks
-        self.mode = "unknown"
-        self._detect(probes)
+        #: At how many points it had a value, so far.
+        self.known = 0
+        for x, u in probes:
+            self.known += self._try(x, u)
+            if self.known == _ENOUGH:
+                break
 
     def __call__(self, x: Array, u: Array = NO_INPUT) -> Array:
         """The value at one state x (n,) and input u (m,), which may be left out if m is 0."""
@@ -156,12 +133,14 @@ class BatchedFunction:
             value = self.function(x, u) if self.takes_input else self.function(x)
             return np.asarray(value).reshape(self.shape) if self._short else value
         raw = self.function(x.copy(), u.copy()) if self.takes_input else self.function(x.copy())
+        if type(raw) is np.ndarray and raw.dtype == np.float64 and raw.shape == self.shape:
+            return raw
         if x.dtype == np.object_:  # symbols of a trace come back as such
             return np.asarray(raw, np.object_).reshape(self.shape)
         return self._as_value(raw)
 
     def _as_value(self, raw: Any) -> Array:
-        """The checked value of a function that was not traced."""
+        """The checked value of a user's function."""
         value = np.asarray(unmasked(raw))
         if value.dtype == np.object_:
             value = np.array(value.tolist())
@@ -186,9 +165,6 @@ class BatchedFunction:
             value = np.asarray(self.function(x, u) if self.takes_input else self.function(x))
             if len(lead) == 1 and not self._short:
                 return value
-        elif self.mode == "columns":
-            value = self._by_columns(x.T, u.T) if self.takes_input else self._by_columns(x.T)
-            value = np.moveaxis(np.asarray(value), -1, 0)
         else:
             # Copied row by row: a function may return one and the same array every time.
             value = np.empty((x.shape[0], *self.shape), dtype=np.result_type(x, np.float64))
@@ -196,66 +172,6 @@ class BatchedFunction:
                 value[i] = self(x[i], u[i])
         shaped: Array = value.reshape(lead + self.shape)
         return shaped
-
-    def _detect(self, probes: Probes) -> None:
-        points, values = [], []
-        for x, u in probes:
-            value = self._probe(x, u)
-            if value is not None:
-                points.append((x, u))
-                values.append(value)
-        if not points:
-            return
-        states, inputs = points[0][0].size, self._inputs
-        self.reads_only = self._trusted or (
-            not self._is_odd and self._same_everywhere(states)
-        )
-        # All points, and more than any dimension of the value, so that axes cannot be mixed up.
-        size = max(len(points), 3, *(d + 1 for d in (*self.shape, states, inputs)))
-        x = np.array([points[i % len(points)][0] for i in range(size)])
-        u = np.array([points[i % len(points)][1] for i in range(size)])
-        expected = np.array([values[i % len(points)] for i in range(size)])
-        for mode in ("batched", "columns") if self.reads_only else ():
-            self.mode = mode
-            try:
-                with np.errstate(all="ignore"):
-                    found = np.asarray(self.batch(x.copy(), u.copy()), dtype=np.float64)
-            except Exception:  # a function of one state may do anything on many
-                continue
-            if found.shape != expected.shape:
-                continue
-            # A function of this package is believed.
-            if self._trusted or (
-                self._equal_but_for_rounding(found, expected, x, u)
-                and self._keeps_apart(mode, states)
-            ):
-                return
-        self.mode = "looped"
-
-    def _equal_but_for_rounding(self, found: Array, expected: Array, x: Array, u: Array) -> bool:
-        """Whether values at states x (K, n) agree, each beside its component's largest one.
-
-        In odd units a probe may be so large that the rounding of a sum of states shows in a sine
-        of it: also allowed is what a change of the states in the last digits makes.
-        """
-        room, off = 1e-9 * np.abs(expected).max(axis=0), np.abs(found - expected)
-        if (off <= room).all():
-            return True
-        signs = (-1.0) ** np.arange(x.shape[1])
-        try:
-            with np.errstate(all="ignore"):
-                for change in (_LAST_DIGITS, _LAST_DIGITS * signs):
-                    pairs = zip(x * (1.0 + change), u, strict=True)
-                    moved = np.array([self(*pair) for pair in pairs])
-                    room = np.maximum(room, np.abs(moved - expected))
-        except Exception:  # outside its domain
-            return False
-        return bool((off <= room).all())
-
-    def try_again(self, probes: Probes) -> None:
-        """Find out how it may be called, if probes of other magnitudes have not shown it."""
-        if self.mode == "unknown" or (self.mode == "looped" and self.reads_only):
-            self._detect(probes)
 
     def try_batched(self, x: Array, u: Array) -> None:
         """Call it once for many states from now on, if that gives the same at these (K, n).
@@ -273,40 +189,15 @@ class BatchedFunction:
             agrees = False
         self.mode = "batched" if agrees else "looped"
 
-    def _labelled(self, *labels: Array) -> list[Array]:
-        return list(labels if self.takes_input else labels[:1])
-
-    def _same_everywhere(self, states: int) -> bool:
-        """Whether it computes the same expression at every state, and writes into no argument."""
-        ones = (np.ones(size, np.uint64) for size in (states, self._inputs))
-        return trace(self.function, self._labelled(*ones)) is not None
-
-    def _keeps_apart(self, mode: str, states: int) -> bool:
-        """Whether, called in this mode, each value comes from its own state alone."""
-        # No other dimension must have the batch's length.
-        count = 7 + max(*self.shape, states, self._inputs)
-        bits = np.left_shift(np.uint64(1), np.arange(count, dtype=np.uint64) % np.uint64(64))
-        arguments = self._labelled(
-            *(np.repeat(bits[:, None], size, axis=1) for size in (states, self._inputs))
-        )
-        function = self.function
-        if mode == "columns":
-            arguments, function = [labels.T for labels in arguments], self._by_columns
-        found = trace(function, arguments)
-        if found is None or found.size != count * math.prod(self.shape):
-            return False
-        own = bits if mode == "columns" else bits.reshape(-1, *[1] * (found.ndim - 1))
-        return found.shape[-1 if mode == "columns" else 0] == count and not np.any(found & ~own)
-
-    def _probe(self, x: Array, u: Array) -> Array | None:
-        """The checked value at a probe; None where the function cannot be used there."""
+    def _try(self, x: Array, u: Array) -> bool:
+        """Check the function at a point; whether it has a finite value there."""
         x_given, u_given = x.copy(), u.copy()
         try:
             with np.errstate(all="ignore"):
                 raw = self.function(*((x_given, u_given) if self.takes_input else (x_given,)))
             value = np.array(unmasked(raw), dtype=np.float64)  # a copy: it may be one buffer
         except Exception:  # outside its domain; the estimator checks at the initial state
-            return None
+            return False
         if not (np.array_equal(x_given, x) and np.array_equal(u_given, u)):
             raise ModelError(
                 f"{self.name} changes its argument in place; copy x before writing to it."
@@ -318,11 +209,7 @@ class BatchedFunction:
                 f"expected {self.shape}. Check n, p, m and the order of the arguments."
             )
         self._short = value.shape != self.shape
-        self._returns_array = self._returns_array and isinstance(raw, np.ndarray)
-        self._is_odd |= (
-            isinstance(raw, np.ma.MaskedArray) or getattr(raw, "dtype", None) == np.object_
-        )
-        return value.reshape(self.shape) if np.isfinite(value).all() else None
+        return bool(np.isfinite(value).all())
 
     def evaluated_by(self, function: Trusted) -> BatchedFunction:
         """The same function, evaluated by other means that take (..., n)."""
@@ -341,16 +228,8 @@ class BatchedFunction:
             return self.function
         return self if self._inputs else partial(self, u=NO_INPUT)
 
-    @property
-    def plain(self) -> bool:
-        """Whether the user's function can be called directly, on (..., n) and all inputs."""
-        takes_all = self.takes_input or self._inputs == 0
-        return self.mode == "batched" and takes_all and self._returns_array and not self._short
-
     def check(self, x: Array, u: Array) -> None:
         """Check that the value is finite and of the right shape at a state that will be used."""
-        if self.mode == "unknown":
-            self._detect([(x, u), (x * (1 + 1e-6), u * (1 + 1e-3))])
         try:
             with np.errstate(all="ignore"):
                 value = np.asarray(self(x, u), dtype=np.float64)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InvalidInputError
 from .augmentation import Augmentation, augmented, chosen, extended_matrix, product
 from .functions import Trusted
+from .model import Origin
 from .residuals import extended
 from .system import System, SystemOptions, checked_system
 
@@ -78,9 +79,8 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
         "state_residual": extended(system.state_residual, n, n + noisy.size),
     }
     held = augmented(system, Augmentation(n, m, np.zeros(0), noisy), **options)
-    made = _without_memory(held, slice(n, n + noisy.size), options)
-    made.recipe = noisy_inputs, {"system": system, "inputs": noisy}
-    return made
+    recipe = noisy_inputs, {"system": system, "inputs": noisy}
+    return _without_memory(held, slice(n, n + noisy.size), options).with_origin(recipe=recipe)
 
 
 def _without_memory(held: System, errors: slice, options: SystemOptions) -> System:
@@ -103,19 +103,22 @@ def _without_memory(held: System, errors: slice, options: SystemOptions) -> Syst
         return evaluate
 
     # What is computed by small steps is better computed of the new functions, in their scales.
-    exact = [
-        one.method not in ("complex step", "finite differences")
-        for one in (held.f_jacobian, held.h_jacobian)
-    ]
-    made = System(
-        Trusted(zeroed(held.f)), Trusted(output(held.h)), n=held.n, p=held.p, m=held.m,
-        f_jacobian=Trusted(zeroed(held.f_jacobian)) if exact[0] else None,
-        h_jacobian=Trusted(output(held.h_jacobian)) if exact[1] else None, **options,
+    own = held.evaluation.functions
+    exact = [one.method != "finite differences" for one in (own.f_jacobian, own.h_jacobian)]
+
+    def timed(_: System) -> System:
+        return _without_memory(held.timed, errors, options)
+
+    def again(change: Augmentation, others: SystemOptions) -> System:
+        return _without_memory(augmented(held, change, **others), errors, others)
+
+    return System.made(
+        Trusted(zeroed(held.f)), Trusted(output(held.h)),
+        Origin(
+            dt=held.dt, method=held.method, held=held.held, make_augmented=again,
+            make_timed=timed if held.has_timed else None, is_timed=held.origin.is_timed,
+        ),
+        n=held.n, p=held.p, m=held.m,
+        f_jacobian=Trusted(zeroed(own.f_jacobian)) if exact[0] else None,
+        h_jacobian=Trusted(output(own.h_jacobian)) if exact[1] else None, **options,
     )
-    made.dt, made.method, made.held = held.dt, held.method, held.held
-    if held.make_timed is not None:
-        made.make_timed = lambda: _without_memory(held.timed, errors, options)
-    made.make_augmented = lambda change, others: _without_memory(
-        augmented(held, change, **others), errors, others
-    )
-    return made

@@ -40,9 +40,6 @@ _NUMBERS_ONLY = {"bitwise_and", "bitwise_or", "bitwise_xor", "invert"}
 class ExpressionRecord(MakingRecord):
     """Symbols carry scalar expressions (casadi.SX)."""
 
-    most_operations = 50_000
-    as_numbers = True
-
     def __init__(self, casadi: Any, watched: bool = False) -> None:
         super().__init__()
         self.casadi, self.watched = casadi, watched

@@ -14,10 +14,11 @@ from qpmhe_solvers.values import finite, shown
 from .._checks import dimension, flag, numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
 from .augmentation import Augmentation, augmented, chosen, extended_matrix, product
-from .functions import BatchedFunction, Parametric, Probes
+from .functions import BatchedFunction
+from .points import FEW, Points, points
 from .residuals import extended
 from .sets import Box, ConvexSet, SoftSet
-from .system import System, SystemOptions, checked_set, probe_points
+from .system import System, SystemOptions, checked_set
 
 Array = NDArray[Any]
 Index = NDArray[np.intp]
@@ -62,8 +63,7 @@ def augment_parameters(
     ----------
     f : callable or System
         f(x, u, theta), or f(x, theta): maps x (n,), u (m,) and all parameters theta (k,)
-        to (n,). Functions of (..., n), (..., m), (..., k) are called once for a whole window, as
-        with `System`. With dt, f is the rate, in units of x per unit of time. Or a system of m + k
+        to (n,). With dt, f is the rate, in units of x per unit of time. Or a system of m + k
         inputs, the last k of which are the parameters; it has its own sizes, sets and sampling
         time, so leave out h, n, p, m, dt, method and the sets.
     h : callable
@@ -89,7 +89,7 @@ def augment_parameters(
     noises : Box or Polytope, optional
         The set V, of dimension p.
     parameter_bounds : Box or Polytope, optional
-        Bounds of the estimated parameters, in their order. Probes of the model also stay within
+        Bounds of the estimated parameters, in their order. Points of the model also stay within
         them, which helps if it is not defined everywhere.
     hold : float, array_like or mapping, optional
         Number of prior standard deviations, such as 0.1, within which an estimated parameter is
@@ -167,9 +167,12 @@ def augment_parameters(
         system = _of_system(f, _other_inputs(arguments, values.size), parameters)
     else:
         system = _of_functions(arguments, parameters)
-    system.held |= {system.n - k + place: within for place, within in held.items()}
-    system.recipe = augment_parameters, arguments
-    return system
+    return system.with_origin(
+        held={
+            **system.held, **{system.n - k + place: within for place, within in held.items()},
+        },
+        recipe=(augment_parameters, arguments),
+    )
 
 
 class _Parameters(NamedTuple):
@@ -220,7 +223,7 @@ def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
     checked_set("disturbances", disturbances, n, alone)
     sets = parameters.sets(states, n, disturbances, n)  # raises for soft ones
     nominal, moved, bounds, _ = parameters
-    probes = _probes(probe_points(hard, n, m), nominal, moved, bounds)
+    probes = _probes(points(FEW, n, m, hard), nominal, moved, bounds)
     f, h = _function("f", given["f"], n, m, probes), _function("h", given["h"], p, m, probes)
     change, dt, method = parameters.change(n, m), given["dt"], given["method"]
     output = change.over_leading(h)
@@ -320,7 +323,7 @@ def _check_bounds(bounds: ConvexSet | None, nominal: Array) -> None:
         )
 
 
-def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> BatchedFunction:
+def _function(name: str, written: Any, size: int, m: int, probes: Points) -> BatchedFunction:
     """A user's function of x and (u, theta), tried at the nominal parameters and near them."""
     if not callable(written) or type(written).__module__.startswith("casadi"):
         raise ModelError(
@@ -344,9 +347,14 @@ def _function(name: str, written: Any, size: int, m: int, probes: Probes) -> Bat
             f"with {inputs} is, whether it uses all of them or not ({error})."
         ) from error
     x, known = probes[0]
-    parametric = Parametric(written, m, takes_input)
-    function = BatchedFunction(name, parametric, (size,), known.size, probes)
-    if function.mode == "unknown":
+
+
+    def joined(x: Array, known: Array) -> Any:
+        u, theta = known[:m], known[m:]
+        return written(x, u, theta) if takes_input else written(x, theta)
+
+    function = BatchedFunction(name, joined, (size,), known.size, probes)
+    if not function.known:
         try:
             with np.errstate(all="ignore"):
                 function(x, known)
@@ -370,10 +378,10 @@ def _is_of_state(signature: inspect.Signature) -> bool:
     )
 
 
-def _probes(probes: Probes, nominal: Array, moved: Index, bounds: ConvexSet | None) -> Probes:
+def _probes(probes: Points, nominal: Array, moved: Index, bounds: ConvexSet | None) -> Points:
     """The probes with parameters behind their inputs: nominal first, and then others."""
     generator = np.random.default_rng(20210829)
-    joined: Probes = []
+    joined: Points = []
     for i, (x, u) in enumerate(probes):
         theta = nominal.copy()
         if i > 0:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .evaluation import fixed_call
 from .expressions import CasadiModel, import_casadi
-from .system import System
+
+if TYPE_CHECKING:
+    from .model import Model
 
 Array = NDArray[np.float64]
 
@@ -40,28 +42,28 @@ class Curvature(NamedTuple):
 
 
 class SecondDerivatives:
-    """The second derivatives of a system's f and h.
+    """The second derivatives of a model's f and h.
 
-    They are exact where the system has an expression (see `System.symbolic`). Elsewhere they are
+    They are exact where the model is an expression (see `System.symbolic`). Elsewhere they are
     differences of the Jacobians; steps of an input are shares of its largest value among those
     given, or of 1 where it is zero throughout.
 
     Parameters
     ----------
-    system : System
+    model : Model
         The model; steps of other lengths are one more input of `at`.
     """
 
-    def __init__(self, system: System) -> None:
-        self.system, self.traced = system, system.is_traced
+    def __init__(self, model: Model) -> None:
+        self._model, self._system = model, model.system
         #: Typical magnitudes of the states, (n,).
-        self.scales: Array = np.ones(system.n) if system.scales is None else system.scales
+        self.scales: Array = np.ones(self._system.n) if model.scales is None else model.scales
         self._calls: dict[int, tuple[tuple[Array, ...], Curvature, Any]] = {}
         self._function: Any = None
-        model = system.symbolic
-        if model is not None:
+        symbolic = model.symbolic
+        if symbolic is not None:
             with suppress(Exception):  # an operation whose derivative CasADi does not know
-                self._function = _function(model)
+                self._function = _function(symbolic)
 
     @property
     def exact(self) -> bool:
@@ -80,7 +82,7 @@ class SecondDerivatives:
         """
         if self._function is None:
             return self._differences(states, inputs, forces)
-        count, m = len(states), self.system.m
+        count, m = len(states), self._system.m
         if count not in self._calls:
             if len(self._calls) >= _MOST_KEPT:
                 self._calls.clear()
@@ -89,13 +91,13 @@ class SecondDerivatives:
         x[...], p[...] = states, forces
         u[:, : inputs.shape[1]] = inputs
         if inputs.shape[1] == m:
-            u[:, m] = self.system.dt or 0.0
+            u[:, m] = self._system.dt or 0.0
         if not call():
             return Curvature(*(np.full_like(array, np.nan) for array in found))
         return Curvature(*(array.copy() for array in found))
 
     def _call(self, count: int) -> tuple[tuple[Array, ...], Curvature, Any]:
-        n, p, m = self.system.n, self.system.p, self.system.m
+        n, p, m = self._system.n, self._system.p, self._system.m
         arguments = tuple(np.zeros((count, size)) for size in (n, m + 1, n + p))
         found = Curvature(*(
             np.zeros((count, *shape)) for shape in ((n, n), (n, m), (n + p, m))
@@ -104,19 +106,18 @@ class SecondDerivatives:
         return arguments, found, fixed_call(function, arguments, found)
 
     def _differences(self, states: Array, inputs: Array, forces: Array) -> Curvature:
-        system, n, m = self.system, self.system.n, self.system.m
-        model = system.timed if inputs.shape[1] > m else system
+        system, n, m = self._system, self._system.n, self._system.m
+        model = self._model.timed if inputs.shape[1] > m else self._model
 
         def values(x: Array, u: Array) -> Array:
-            f, h = (np.asarray(one.batch(x, u)) for one in (model.f, model.h))
+            f, h = np.asarray(model.step(x, u)), np.asarray(model.output(x, u))
             return np.concatenate((f, h), axis=-1)
 
         def slopes(x: Array, u: Array) -> Array:
-            f, h = (one.batch(x, u) for one in (model.f_jacobian, model.h_jacobian))
-            joint = np.concatenate((np.asarray(f), np.asarray(h)), axis=1)
+            joint = np.concatenate([np.asarray(one) for one in model.linear(x, u)], axis=1)
             return np.asarray(np.einsum("kq,kqn->kn", forces, joint))
 
-        methods = {model.f_jacobian.method, model.h_jacobian.method}
+        methods = model.methods
         share = _OF_DIFFERENCES if "finite differences" in methods else _OF_EXACT
         sizes = np.maximum(np.abs(states), self.scales)
         largest = np.abs(inputs[:, :m]).max(axis=0, initial=0.0)

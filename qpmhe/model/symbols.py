@@ -2,7 +2,7 @@
 
 A function that returns when it is called on symbols has no branch on a value, no loop over
 values and no table look-up by one: it computes the same expression everywhere. What a symbol
-carries, labels or an expression, is up to the record of the trace.
+carries is up to the record of the trace.
 """
 
 from __future__ import annotations
@@ -57,9 +57,7 @@ class Record(ABC):
     """What happened during one trace, which all of its symbols share."""
 
     #: A function that does more with single symbols than this is not traced any further.
-    most_operations = 200_000
-    #: Whether arrays of symbols say that they hold numbers in double precision.
-    as_numbers = False
+    most_operations = 50_000
     #: Whether nothing may differ from a call with numbers: see `qpmhe.model.tracing.watched`.
     watched = False
 
@@ -150,7 +148,7 @@ def _value(asked: str) -> Callable[..., Any]:
 class Symbol:
     """A number without a value.
 
-    ``value`` is what the trace knows instead: labels, or an expression. ``logical`` says whether
+    ``value`` is what the trace knows instead: an expression. ``logical`` says whether
     NumPy would have a truth value there.
     """
 
@@ -233,9 +231,7 @@ class Symbol:
         return np.bool_ if self.logical else np.float64
 
     def __getattr__(self, name: str) -> Any:
-        if name == "dtype" and self.record.as_numbers and not sys._getframe(
-            1
-        ).f_code.co_filename.startswith(_MACHINERY):
+        if name == "dtype" and not sys._getframe(1).f_code.co_filename.startswith(_MACHINERY):
             return np.dtype(self.__class__)
         if name in _OF_ARRAYS:
             found = getattr(self.record.array(in_arrays(self)), name)
@@ -299,9 +295,7 @@ class SymbolArray(np.ndarray[Any, Any]):
     @property
     def dtype(self) -> Any:
         """Double precision, for the user's code, where that is what the array stands for."""
-        if self.record.as_numbers and not sys._getframe(1).f_code.co_filename.startswith(
-            _MACHINERY
-        ):
+        if not sys._getframe(1).f_code.co_filename.startswith(_MACHINERY):
             return np.dtype(np.float64)
         return np.ndarray.dtype.__get__(self)
 
@@ -360,9 +354,7 @@ def holds_symbols(value: Any) -> bool:
 def _is_mask(key: Any) -> bool:
     entries = np.asarray(plain(key), np.object_).ravel()
     return all(
-        # Labels do not tell truths, but numbers are no index.
-        one.logical or not one.record.as_numbers
-        if isinstance(one, Symbol) else isinstance(one, (bool, np.bool_))
+        one.logical if isinstance(one, Symbol) else isinstance(one, (bool, np.bool_))
         for one in entries
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,40 +15,17 @@ from ..errors import EngineWarning
 from .derivatives import Jacobian
 from .evaluation import Evaluator, VirtualMachine
 from .expressions import CasadiModel, import_casadi
-from .functions import BatchedFunction
+from .functions import BatchedFunction, Trusted
+from .points import ALL, USUAL, Points, points
 from .sets import ConvexSet
 from .tracing import Traced, difference, expressed
 
 Array = NDArray[np.float64]
-Points = list[tuple[Array, Array]]
 
-# Magnitudes of points and the least share of them, usual ones first.
-_USUAL = ((1.0, 0.2), (1.0, -1.0), (0.3, -1.0), (3.0, -1.0), (0.1, 0.2), (1.0, 0.2))
-_UNUSUAL = ((10.0, -1.0), (30.0, 0.2), (0.01, -1.0), (1e-3, 0.2), (1e-6, -1.0), (100.0, -1.0),
-            (1e3, 0.2), (1e4, -1.0))
 # The function takes longer in CasADi's virtual machine, and in a compiler, than it is worth.
 _MOST_OPERATIONS = 20_000
 # Entries of a given Jacobian are right where they differ by less than this share of their row's.
 _SAME = 1e-9
-
-
-def points(
-    states: ConvexSet | None, n: int, m: int, scales: Array | float = 1.0, usual: bool = False,
-) -> Points:
-    """Random points (x, u) of several magnitudes, within the bounds of X."""
-    generator = np.random.default_rng(20210829)
-    found: Points = []
-    for scale, least in (*_USUAL, *(() if usual else _UNUSUAL)):
-        for _ in range(2):
-            x = scales * (scale * generator.uniform(least, 1.0, n))
-            if states is not None:
-                low, high = states.lower, states.upper
-                both = np.isfinite(low) & np.isfinite(high)
-                share = generator.uniform(0.0, 1.0, n)
-                with np.errstate(invalid="ignore"):
-                    x = np.where(both, low + share * (high - low), np.clip(x, low, high))
-            found.append((x, min(scale, 100.0) * generator.uniform(least, 1.0, m)))
-    return found
 
 
 class Pinned:
@@ -116,7 +94,8 @@ class ModelTrace:
         sources: dict[str, Callable[[Array, Array], Any]] | None = None,
     ) -> None:
         self._sources = sources
-        self._functions = {"f": _of_both(f), "h": _of_both(h)}
+        self._batched = {"f": f, "h": h}
+        self._functions = {name: of_both(one) for name, one in self._batched.items()}
         self._n, self._p, self._m, self._states = n, p, m, states
         self.dt, self.method = dt, method
         self._lock = threading.RLock()
@@ -127,10 +106,12 @@ class ModelTrace:
         """The traces as they were found last."""
         with self._lock:
             if self._now is None:
-                where = points(self._states, self._n, self._m)
-                self._pin({name: self._traced(name, where) for name in ("f", "h")})
+                self._trace(points(ALL, self._n, self._m, self._states))
             assert self._now is not None
             return self._now
+
+    def _trace(self, where: Points) -> None:
+        self._pin({name: self._traced(name, where) for name in ("f", "h")})
 
     @property
     def model(self) -> CasadiModel | None:
@@ -164,6 +145,8 @@ class ModelTrace:
             return Traced(None, f"it returns shape {found.shape} of symbols; expected ({size},)")
         if count > _MOST_OPERATIONS:
             return Traced(None, f"it takes {count} operations, more than {_MOST_OPERATIONS}")
+        if self._sources is None:
+            self._batched[name].reads_only = True
         return found
 
     def _difference(self, name: str, found: Traced, where: Points) -> str:
@@ -182,11 +165,16 @@ class ModelTrace:
 
         Functions that have changed since they were traced are traced again, once.
         """
-        where = points(self._states, self._n, self._m, 1.0 if scales is None else scales, True)
+        units = 1.0 if scales is None else scales
+        where = points(USUAL, self._n, self._m, self._states, units)
         with self._lock:
+            if self._now is None:
+                self._trace([*points(ALL, self._n, self._m, self._states), *where])
+                return self.now
             for name, one in self.now.found.items():
                 if one.function and self._difference(name, one, where):
-                    again = self._traced(name, [*points(self._states, self._n, self._m), *where])
+                    all_points = [*points(ALL, self._n, self._m, self._states), *where]
+                    again = self._traced(name, all_points)
                     self._pin({**self.now.found, name: again})
             return self.now
 
@@ -199,14 +187,26 @@ class ModelTrace:
         """
         if jacobian.method != "given":
             return True
+        return self._same(jacobian, partial(pinned.evaluator().one, name), scales)
+
+    def is_rate(self, jacobian: Jacobian, pinned: Pinned, scales: Array | None) -> bool:
+        """Whether the Jacobian of a rate is that of its trace, up to rounding."""
+        ca, rate = import_casadi(), pinned.found["f"].function
+        x, u = ca.SX.sym("x", self._n), ca.SX.sym("u", self._m)
+        slope = ca.Function("slope", [x, u], [ca.densify(ca.jacobian(rate(x, u), x))])
+        return self._same(jacobian, lambda x, u: np.array(slope(x, u)), scales)
+
+    def _same(
+        self, jacobian: Jacobian, exact: Callable[[Array, Array], Array], scales: Array | None
+    ) -> bool:
         units, compared = 1.0 if scales is None else scales, 0
-        for x, u in points(self._states, self._n, self._m, units, usual=True):
+        for x, u in points(USUAL, self._n, self._m, self._states, units):
             try:
                 with np.errstate(all="ignore"):
                     given = np.asarray(jacobian(x, u), np.float64)
             except Exception:  # outside its domain
                 continue
-            mine = pinned.evaluator().one(name, x, u)
+            mine = exact(x, u)
             if not (np.isfinite(given).all() and np.isfinite(mine).all()):
                 continue
             size = np.maximum(np.abs(x), units)
@@ -237,7 +237,27 @@ def warn_of(fault: str, stacklevel: int = 6) -> None:
     )
 
 
-def _of_both(function: BatchedFunction) -> Callable[[Array, Array], Any]:
+def evaluated_alone(
+    function: BatchedFunction, jacobian: Jacobian, trace: Traced, n: int, m: int
+) -> tuple[BatchedFunction, Jacobian]:
+    """A function of x (n,) and u (m,), with its Jacobian, evaluated by its trace."""
+    found = {"f": Traced(None, "there is none"), "h": trace}
+    evaluator = Pinned(found, n, function.shape[0], m, None, None).evaluator()
+    value, slope = (Trusted(partial(evaluator.one, name)) for name in ("h", "h_jacobian"))
+    by_trace = function.evaluated_by(value)
+    return by_trace, jacobian.evaluated_by(by_trace, slope, "traced")
+
+
+def depends(trace: Traced) -> NDArray[np.bool_]:
+    """Which entries of a traced function (size,) depend on each entry of its first argument."""
+    ca = import_casadi()
+    columns = [ca.SX.sym("a", trace.function.numel_in(k)) for k in range(trace.function.n_in())]
+    sparsity = ca.jacobian(trace.function(*columns), columns[0]).sparsity()
+    found: NDArray[np.bool_] = np.array(ca.DM(sparsity, 1.0)) != 0.0
+    return found
+
+
+def of_both(function: BatchedFunction) -> Callable[[Array, Array], Any]:
     """The user's function as one of x and u."""
     called = function.function
     return called if function.takes_input else lambda x, u: called(x)  # noqa: ARG005

@@ -130,9 +130,9 @@ def linearize(
     if disturbance is not None:
         deviations = np.sqrt(disturbance.diagonal())
         sizes = np.where(point != 0.0, np.abs(point), 1.0)  # of states without disturbance
-        system = system.copy(np.where(deviations > 0.0, _STEPS * deviations, sizes))
-        for jacobian in (system.f_jacobian, system.h_jacobian):
-            jacobian.check(point, inputs)
+        scales = np.where(deviations > 0.0, _STEPS * deviations, sizes)
+        model = system.model(scales).differentiated_at(point, inputs)
+        system = system.evaluated_by(model)
     found = []
     for function, jacobian in ((system.f, system.f_jacobian), (system.h, system.h_jacobian)):
         try:
@@ -145,7 +145,7 @@ def linearize(
                 f"{type(error).__name__}: {error}. Choose a point where it is defined and "
                 "differentiable."
             ) from error
-        # The value too: outside of a function's domain a complex step may look like a slope.
+        # The value too: outside of a function's domain differences may look like a slope.
         if not (np.isfinite(value).all() and np.isfinite(slope).all()):
             raise ModelError(
                 f"{function.name} is {value.tolist()} at x = {point.tolist()}, its Jacobian "

@@ -436,10 +436,7 @@ def _jacobian(problem: Problem, states: Array) -> Array:
     """The Jacobians (K, n + p, n) of f and h along states."""
     model = problem.model
     try:
-        slopes = [
-            np.asarray(one.batch(states, problem.inputs))
-            for one in (model.f_jacobian, model.h_jacobian)
-        ]
+        slopes = [np.asarray(one) for one in model.evaluation.linear(states, problem.inputs)]
     except Exception as error:
         raise InvalidInputError(
             f"the model has no Jacobians along the estimate: {error}"

@@ -96,7 +96,7 @@ class Data:
             self.dt = vector(f"dt of {name}", given.dt, samples)
             if not (self.dt > 0.0).all():
                 raise InvalidInputError(f"dt of {name} has steps <= 0; sort the record by time.")
-            if system.make_timed is None:
+            if not system.has_timed:
                 raise InvalidInputError(
                     f"{name} has step lengths (dt), but the system is discrete; make it by "
                     "System.from_ode, or resample the record."

@@ -122,7 +122,9 @@ class _Filter:
     """The filter of one system, in CasADi where it is traced and in NumPy where it is not."""
 
     def __init__(self, system: System, weights: Weights, threshold: float | None) -> None:
-        self._system = system.copy(np.sqrt(weights.prior.diagonal().clip(1e-300)), traced=True)
+        self._system = system.evaluated_by(
+            system.model(np.sqrt(weights.prior.diagonal().clip(1e-300)))
+        )
         self._threshold = threshold if weights.threshold is None else weights.threshold
         self._clip = _bounds(system)
         self._sweeps: dict[int, tuple[Any, Any]] = {}

@@ -112,14 +112,15 @@ class Score:
         k, count = self.ahead, len(one) - self.ahead
         if count <= 0:
             return errors
-        reached, model, u = states[:count], system, one.inputs(system, weights.parameters)
+        reached, model = states[:count], system.model()
+        u = one.inputs(system, weights.parameters)
         if one.dt is not None:
-            model, u = system.timed, np.hstack((u, one.dt[:, None]))
+            model, u = model.timed, np.hstack((u, one.dt[:, None]))
         with np.errstate(all="ignore"):
             for j in range(1, k):
-                reached = model.f.batch(reached, u[j : count + j])
+                reached = model.step(reached, u[j : count + j])
             measured = one.y[k:]
-            errors[:count] = measured - model.h.batch(reached, u[k:])
+            errors[:count] = measured - model.output(reached, u[k:])
         if system.output_residual is not None:
             system.output_residual.wrap(errors[:count], measured)
         return errors

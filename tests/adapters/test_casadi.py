@@ -144,7 +144,7 @@ def test_an_evaluation_that_breaks_off_is_no_number_and_fails_a_step_only(case, 
         np.testing.assert_allclose(system.h(x, NONE), y, rtol=1e-9)
         assert np.isnan(system.h_jacobian(x, NONE)).any() == np.isnan(y)
         # What can be evaluated is, whatever is asked for beside it.
-        ahead, found, slope = system.kernel.stage(x, NONE)
+        ahead, found, slope = system.evaluation.functions.kernel.stage(x, NONE)
         np.testing.assert_allclose(ahead, 0.9 * x)
         np.testing.assert_allclose(found, y, rtol=1e-9)
         np.testing.assert_allclose(slope[:2], 0.9 * np.eye(2))
@@ -152,7 +152,7 @@ def test_an_evaluation_that_breaks_off_is_no_number_and_fails_a_step_only(case, 
     np.testing.assert_allclose(system.f.batch(xs, us), 0.9 * xs)
     slopes = system.h_jacobian.batch(xs, us)
     np.testing.assert_array_equal(np.isnan(slopes).any(axis=(1, 2)), bad)
-    residuals = system.kernel.residuals(np.vstack((xs, xs[:1])), np.zeros((5, 1)), us)
+    residuals = system.evaluation.residuals(np.vstack((xs, xs[:1])), np.zeros((5, 1)), us)
     np.testing.assert_allclose(residuals[:, 2:], -expected, rtol=1e-9)
     mhe = estimator(system)
     assert qpmhe.Status.IMPROVED in mhe.update([0.5]).status

@@ -128,9 +128,9 @@ def test_a_wrong_derivative_is_refused_and_a_kink_is_not():
 
     squared.defjvp(lambda x, dx: (x[0] ** 2, 3.0 * x[0] * dx[0]))
     with pytest.raises(ModelError, match=r"f_jacobian\[0, 0\] is .* It is JAX's: look for"):
-        from_jax(squared, lambda x: x, n=1, p=1).use_scales([1.0])
+        from_jax(squared, lambda x: x, n=1, p=1).model([1.0])
     with pytest.raises(ModelError, match=r"h_jacobian.* custom derivative within h"):
-        from_jax(lambda x: x, squared, n=1, p=1).use_scales([1.0])
+        from_jax(lambda x: x, squared, n=1, p=1).model([1.0])
     # Differences across it give the mean of both slopes, JAX one of them.
     bent = from_jax(
         lambda x: jnp.where(x > 1.0, 0.9 * x, 0.6 + 0.3 * x), lambda x, u: x + u, n=1, p=1, m=1

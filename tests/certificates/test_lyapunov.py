@@ -15,6 +15,7 @@ from qpmhe.certificates import Evidence, MismatchError, Sizes, design
 from qpmhe.cli.certify import certify
 from qpmhe.errors import OptionError, SetError, ShapeError
 from qpmhe.estimation.run import Run
+from qpmhe.model.model import Model
 
 from .helpers import box, linear
 
@@ -166,7 +167,7 @@ def true_cost(plan, estimate, x, w, v):
 )
 def test_no_run_exceeds_a_bound(make, pytestconfig, monkeypatch):
     """With --all, 10,000 adversarial runs of three systems."""
-    monkeypatch.setattr(qpmhe.System, "trace_fault", lambda *_: "")  # compared elsewhere
+    monkeypatch.setattr(Model, "fault", lambda *_: "")  # compared elsewhere
     system, region, sizes, gain = make()
     plan = design(system, region, sizes=sizes)
     assert plan.evidence is Evidence.PROVED

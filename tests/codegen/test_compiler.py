@@ -563,7 +563,7 @@ def is_right(one):
         x, y = rng.normal(size=(count + 1, 2)), rng.normal(size=(count, 2))
         if isinstance(one, qpmhe.System):
             found, expected = (
-                each.kernel.residuals(x, y, np.zeros((count, 0))) for each in (one, true)
+                each.evaluation.residuals(x, y, np.zeros((count, 0))) for each in (one, true)
             )
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
             continue

@@ -37,7 +37,7 @@ def estimator(sets=None, discount=1.0, robust=False, kalman=False, held=None, **
     observer = qpmhe.ExtendedKalman(**given) if kalman else qpmhe.Luenberger(gain)
     system = pendulum("traced", **(sets or {}))
     if held:  # as `augment_parameters` does
-        system.held = held
+        system = system.with_origin(held=held)
     mhe = qpmhe.MovingHorizonEstimator(
         system, observer, cost,
         **{"horizon": 4, "initial_state": start, "engine": "python"} | options,

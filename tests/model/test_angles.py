@@ -90,7 +90,7 @@ def test_jacobians_do_not_see_the_jump():
     options = {"n": 1, "p": 1} | {name: qpmhe.angles([0]) for name in NAMES}
     for h in (lambda x: np.arctan2(np.sin(x), np.cos(x)), lambda x: (x + PI) % (2.0 * PI) - PI):
         given = {"h_jacobian": lambda x: [[1.0]], "f_jacobian": lambda x: [[1.0]], "scales": [1.0]}
-        qpmhe.System(h, h, **options, **given).check(np.array([PI]), np.zeros(0))
+        qpmhe.System(h, h, **options, **given).at(np.array([PI]), np.zeros(0))
         bounded = qpmhe.System(h, h, states=Box([PI - 1e-9], [PI + 0.1]), **options)
         for system, at in (
             (bounded, PI - 1e-9),

@@ -1,4 +1,4 @@
-"""Jacobians: by complex steps, by differences, or the user's own, in any unit."""
+"""Jacobians: of expressions, by differences, or the user's own, in any unit."""
 
 import math
 
@@ -8,14 +8,17 @@ import pytest
 import qpmhe
 from qpmhe.errors import ModelError
 from tests.estimation.spoil import check
+from tests.estimation.untraced import untraced
 
 NONE = np.zeros(0)
-COMPLEX, DIFFERENCES = "complex step", "finite differences"
+DIFFERENCES = "finite differences"
 LINEAR = np.array([[1.0, 0.1], [-0.2, 0.9]])
 
 
 def system_of(f, jacobian=None, n=2, **options):
-    return qpmhe.System(f, lambda x: x[..., :1], n=n, p=1, f_jacobian=jacobian, **options)
+    """Of a function that is called as it is written."""
+    written = untraced(f)
+    return qpmhe.System(written, lambda x: x[..., :1], n=n, p=1, f_jacobian=jacobian, **options)
 
 
 def estimator(system, deviation, gain, start, noise=1.0):
@@ -51,17 +54,17 @@ def slopes(a, b, c):
     ]
 
 
-@pytest.mark.parametrize(("mode", "f"), [
-    ("batched", lambda x: np.stack(components(x[..., 0], x[..., 1], x[..., 2]), axis=-1)),
-    ("columns", lambda x: np.array(components(*x))),
-    ("looped", lambda x: components(
-        *(complex(s) if np.iscomplexobj(x) else float(s) for s in x))),
+@pytest.mark.parametrize("f", [
+    lambda x: np.stack(components(x[..., 0], x[..., 1], x[..., 2]), axis=-1),
+    lambda x: np.array(components(*x)), lambda x: components(*x),
 ])
-def test_complex_step_is_exact_to_rounding(mode, f):
-    system = system_of(f, n=3)
-    assert (system.f.mode, system.f_jacobian.method) == (mode, COMPLEX)
+def test_derivatives_of_expressions_are_exact_and_others_are_differences(f):
     points = np.random.default_rng(1).uniform(0.1, 4.0, (20, 3))
-    compare(system.f_jacobian, points, [slopes(*x) for x in points], rtol=1e-12, atol=1e-15)
+    expected = [slopes(*x) for x in points]
+    exact, written = qpmhe.System(f, lambda x: x[..., :1], n=3, p=1), system_of(f, n=3)
+    assert (exact.f_jacobian.method, written.f_jacobian.method) == ("traced", DIFFERENCES)
+    compare(exact.f_jacobian, points, expected, rtol=1e-12, atol=1e-15)
+    compare(written.f_jacobian, points, expected, rtol=1e-9, atol=1e-9)
 
 
 def real_array(x):
@@ -71,8 +74,7 @@ def real_array(x):
     return value
 
 
-def test_functions_that_break_the_complex_step():
-    """None of them can carry an imaginary part to its end."""
+def test_differences_of_functions_with_kinks_and_of_all_sizes():
     generator = np.random.default_rng(2)
     points = generator.uniform(0.2, 3.0, (10, 2)) * generator.choice([-1.0, 1.0], (10, 2))
     for f, jacobian in (
@@ -92,20 +94,19 @@ def test_functions_that_break_the_complex_step():
 
 
 def test_functions_that_are_others_at_the_probes_than_where_they_are_used():
-    for f, at, expected, *methods in (
+    for f, at, expected in (
         # A reaction rate is flat at one kelvin, and steep at the temperatures of use.
         (lambda x: [x[0] - 0.1 * x[0] * math.exp(10.0 - 3500.0 / x[1]), x[1]], [2.0, 350.0],
-         [[0.9, -0.2 * 3500.0 / 350.0**2], [0.0, 1.0]], DIFFERENCES),
-        (lambda x: np.sqrt(x - 10.0), [12.0, 14.0], np.diag([0.5 / 2**0.5, 0.25]),
-         DIFFERENCES, COMPLEX),  # no value at the probes
-        # Real functions of real arguments above a threshold that no probe reaches.
-        (lambda x: [math.exp(float(x[0]) - 100.0) if x[0].real > 90.0 else x[0] ** 2, x[1]],
-         [100.0, 1.0], np.eye(2), COMPLEX, DIFFERENCES),
+         [[0.9, -0.2 * 3500.0 / 350.0**2], [0.0, 1.0]]),
+        # No value at the probes.
+        (lambda x: np.sqrt(x - 10.0), [12.0, 14.0], np.diag([0.5 / 2**0.5, 0.25])),
+        # Another function above a threshold that no probe reaches.
+        (lambda x: [math.exp(float(x[0]) - 100.0) if x[0] > 90.0 else x[0] ** 2, x[1]],
+         [100.0, 1.0], np.eye(2)),
     ):
         system, x = system_of(f), np.array(at)
-        assert len(methods) == 1 or system.f_jacobian.method == methods[0]
-        system.check(x, NONE)
-        assert system.f_jacobian.method == methods[-1]
+        system = system.at(x, NONE)
+        assert system.f_jacobian.method == DIFFERENCES
         np.testing.assert_allclose(system.f_jacobian(x, NONE), expected, rtol=1e-6, atol=1e-8)
 
 
@@ -186,7 +187,7 @@ def test_right_jacobians_are_used_as_given():
         lambda x: np.array([[x[1], x[0]], [np.cos(x[0]), 2.0 + 0.0 * x[0]]]),
     ):
         system = system_of(spiral, jacobian)
-        assert (system.f_jacobian.method, system.h_jacobian.method) == ("given", COMPLEX)
+        assert (system.f_jacobian.method, system.h_jacobian.method) == ("given", "traced")
         compare(system.f_jacobian, x, [slope(xi) for xi in x], rtol=1e-14)
     linear = system_of(lambda x: x @ LINEAR.T, lambda x: LINEAR)
     compare(linear.f_jacobian, x, [LINEAR] * 5)

@@ -7,6 +7,7 @@ import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError
 from tests.estimation import spoil
 from tests.estimation.spoil import cost_of
+from tests.estimation.untraced import untraced
 
 YS = np.random.default_rng(2).normal(size=30)
 
@@ -132,3 +133,26 @@ def test_text_is_no_measurement(text):
     with pytest.raises(InvalidInputError, match=r"(?s)measurements is .*text; expected numbers"):
         mhe.run(np.array([text]).reshape(-1))
     assert mhe.time == 0
+
+
+@pytest.mark.parametrize(("change", "most"), [(lambda one: one, 20), (untraced, 20)])
+def test_constructors_call_a_model_a_few_times(change, most):
+    """An estimator finds the expression and compares it; or it finds the steps of differences."""
+    counts = {"f": 0, "h": 0}
+
+    def counted(name, function):
+        def call(x):
+            counts[name] += 1
+            return function(x)
+
+        return change(call)
+
+    system = qpmhe.System(
+        counted("f", lambda x: np.array([x[0] + 0.1 * x[1], x[1] - 0.1 * np.sin(x[0])])),
+        counted("h", lambda x: x[:1]), n=2, p=1,
+    )
+    assert max(counts.values()) <= 2
+    for most_now in (most, 16):  # another estimator of the same system takes less
+        counts.update(f=0, h=0)
+        estimator(system)
+        assert 0 < max(counts.values()) <= most_now

@@ -141,7 +141,7 @@ def test_models_of_the_zoo_are_traced_and_are_the_same(name):
     example = ZOO[name]()
     system, scenario = example.system, example.scenario
     assert system.derivatives == {"f": "traced", "h": "traced"}, system.explain()
-    record, own = scenario.simulate(1, 12), system.copy(traced=True)
+    record, own = scenario.simulate(1, 12), system.evaluated_by(system.model())
     for k, x in enumerate(record.states[:12]):
         u = record.inputs[k] if system.m else np.zeros(0)
         for which in ("f", "h"):
@@ -201,7 +201,7 @@ def test_a_closure_that_changes_is_found_and_no_sample_is_lost(call, engine):
     with has_changed():
         go_on(YS[40:120])
     assert (mhe.engine, mhe.time) == ("python", 120)
-    assert not mhe._own_system.is_traced
+    assert not mhe._engine.system.evaluation.is_traced
     for t in range(120, 140):
         estimate = mhe.update(YS[t])
         if t >= 125:
@@ -236,7 +236,7 @@ def test_what_a_compiled_estimator_hands_over_is_all_it_knew(options):
         expected, expectation = one.update(y, **own), contextlib.nullcontext()
         if t == 20:
             # As if its trace had failed, without any difference.
-            two._engine._system.trace_fault = lambda x, u: "no difference"
+            vars(two._engine._system.evaluation)["fault"] = lambda x, u: "no difference"
             two._engine._next_check = 0
             expectation = pytest.warns(EngineWarning, match="no difference")
         with expectation:
@@ -278,7 +278,7 @@ def test_a_batch_goes_on_in_python_where_a_closure_has_changed(call):
 
 def test_what_cannot_be_traced_is_used_as_it_is_written():
     system = qpmhe.System(branching, lambda x: np.sin(x[..., :1]), n=2, p=1)
-    assert system.derivatives == {"f": "complex step", "h": "traced"}
+    assert system.derivatives == {"f": "finite differences", "h": "traced"}
     assert system.symbolic is None
     line, text = branching.__code__.co_firstlineno + 1, system.explain()
     assert f"f: not traced: {__file__}:{line} asks for the truth of a comparison" in text

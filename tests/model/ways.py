@@ -46,14 +46,15 @@ def ellipsis(x):
     return value
 
 
+# The function, and whether it is traced.
 PENDULUMS = {
-    "ellipsis": (ellipsis, "batched"),
-    "stacked": (lambda x: np.stack(parts(np.moveaxis(x, -1, 0)), axis=-1), "batched"),
-    "array of components": (lambda x: np.array(parts(x)), "columns"),
-    "list": (lambda x: parts(x), "columns"),
-    "tuple": (lambda x: tuple(parts(x)), "columns"),
-    "math": (lambda x: np.array(parts(x, math.sin)), "looped"),
-    "list of math": (lambda x: parts(x, math.sin), "looped"),
-    "branch": (branching, "looped"),
-    "into zeros": (into_zeros, "looped"),
+    "ellipsis": (ellipsis, True),
+    "stacked": (lambda x: np.stack(parts(np.moveaxis(x, -1, 0)), axis=-1), True),
+    "array of components": (lambda x: np.array(parts(x)), True),
+    "list": (lambda x: parts(x), True),
+    "tuple": (lambda x: tuple(parts(x)), True),
+    "math": (lambda x: np.array(parts(x, math.sin)), True),
+    "list of math": (lambda x: parts(x, math.sin), True),
+    "branch": (branching, False),
+    "into zeros": (into_zeros, True),
 }

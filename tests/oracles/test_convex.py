@@ -148,7 +148,7 @@ def test_on_a_linear_system_the_minimum_is_that_of_the_convex_problem(
 @pytest.mark.parametrize("discount", [1.0, 0.8])
 def test_held_states_are_weighed_in(discount):
     system = qpmhe.System(lambda x: x @ A.T, lambda x: x @ C.T, n=2, p=2)
-    system.held = {0: 0.5, 1: 0.3}  # as `augment_parameters` does
+    system = system.with_origin(held={0: 0.5, 1: 0.3})  # as `augment_parameters` does
     cost = qpmhe.QuadraticCost(prior=P, disturbance=Q, noise=0.02 * R, discount=discount)
     mhe = qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger(np.zeros((2, 2))), cost, horizon=5, initial_state=[2.5, -3.5]

@@ -406,8 +406,7 @@ class Problem:
         elif self.writing == "jax":
             make = qpmhe.from_jax
         made = make(f, h, **sizes, **options)
-        made.held = dict(self.held)
-        return made
+        return made.with_origin(held=dict(self.held))
 
     def convex_sets(self, units):
         made = {}

@@ -15,7 +15,7 @@ from tests.estimation.untraced import untraced as untraced_function
 
 def untraced(system):
     """The same system, of whose functions there is no trace."""
-    make, arguments = system.recipe
+    make, arguments = system.origin.recipe
     return make(**{
         name: untraced_function(one) if name in ("rate", "f", "h") else one
         for name, one in arguments.items()
@@ -45,7 +45,8 @@ def by_hand(system, record, parts):
     observer = qpmhe.ExtendedKalman(
         **dict(zip(("prior", "disturbance", "noise"), parts, strict=True))
     )
-    own, z, covariance, total = system.copy(traced=True), record.initial_state, parts[0], 0.0
+    own = system.evaluated_by(system.model())
+    z, covariance, total = record.initial_state, parts[0], 0.0
     for t, y in enumerate(record.measurements):
         u = np.zeros(0) if record.inputs is None else record.inputs[t]
         there = np.isfinite(y)
