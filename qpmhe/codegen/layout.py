@@ -401,7 +401,7 @@ def _filled(
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
     initial = cost.initial_weight(observer.initial_covariance())
-    _, regular = prior_weights(observer.initial_covariance())
+    regular = prior_weights(observer.initial_covariance()).distance
     weights = form.disturbance, form.noise, regular
     for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = getattr(system, name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 
 import numpy as np
@@ -30,6 +31,7 @@ def window_covariances(
     weights: Array,
     prior_weight: Array,
     basis: Array,
+    prior_root: Array | None = None,
 ) -> Array:
     """Covariances (K + 1, n, n) of the states of a trajectory, given its window.
 
@@ -51,6 +53,8 @@ def window_covariances(
         initial error (n, n).
     basis : (n, k) array
         The directions in which there are disturbances.
+    prior_root : (j, n) array or None
+        Rows whose square is ``prior_weight``, where they alone have all digits.
 
     Raises
     ------
@@ -75,6 +79,10 @@ def window_covariances(
     q = weights.shape[-1]
     # In deviations of the prior, rounded to powers of two: the result then depends on no unit.
     prior_weight, units, whole = unit_diagonal(prior_weight)
+    if prior_root is None:
+        prior_rows = _factors(prior_weight[None])[0]
+    else:
+        prior_rows = np.ldexp(prior_root, -units) / math.sqrt(2.0**whole)
     a, c = np.ldexp(a, units[:, None] - units), np.ldexp(c, -units)
     unit = np.append(units, np.zeros(q - n, np.int32))
     weights = np.broadcast_to(
@@ -84,13 +92,13 @@ def window_covariances(
     basis = np.ldexp(basis, units[:, None])
     basis = np.ldexp(basis, 1 - np.frexp(np.abs(basis).max(axis=0, initial=0.0))[1])
     try:
-        covariance = _smoothed(a, c, weights, prior_weight, basis)
+        covariance = _smoothed(a, c, weights, prior_rows, basis)
     except np.linalg.LinAlgError as error:
         raise InvalidInputError(_LOST) from error
     return np.asarray(np.ldexp(covariance, -whole - units[:, None] - units))
 
 
-def _smoothed(a: Array, c: Array, weights: Array, prior_weight: Array, basis: Array) -> Array:
+def _smoothed(a: Array, c: Array, weights: Array, prior_rows: Array, basis: Array) -> Array:
     """Covariances from the factors of information backwards in time, and of covariances forwards.
 
     With disturbances B d(i), the outputs from i on and the disturbances' weights are rows
@@ -114,7 +122,7 @@ def _smoothed(a: Array, c: Array, weights: Array, prior_weight: Array, basis: Ar
     _check_regular(pivots, rows[:, :, :k])
     added = basis @ _inverse(pivots)
     moved = a - added @ turned[:, :, k:]
-    factor = _inverse(_pivoted(np.vstack((_factors(prior_weight[None])[0], later))))
+    factor = _inverse(_pivoted(np.vstack((prior_rows, later))))
     covariance = np.empty((count + 1, n, n))
     covariance[0] = factor @ factor.T
     wide = np.empty((n + k, n))

@@ -23,7 +23,7 @@ from ..model.residuals import difference
 from ..model.system import System
 from ..model.traces import next_check, warn_of
 from ..observers import Observer
-from ..terms.sum import weight_of_first
+from ..terms.sum import root_of_first, weight_of_first
 from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .description import check_description, described
@@ -261,7 +261,7 @@ class PythonEngine:
                     self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
                 )
             window.watched = self._watch.counted(
-                window.watched, offset, problem.prior.distance_weight, bool(outcome.dropped)
+                window.watched, problem.prior.distance(offset), bool(outcome.dropped)
             )
             if window.watched[0] >= settings.horizon:
                 status |= Status.OBSERVER_FAR
@@ -444,7 +444,7 @@ class PythonEngine:
             return window_covariances(
                 problem.model, trial.trajectory, problem.inputs, trial.weights,
                 weight_of_first(problem.terms, trial),
-                problem.constraints.basis,
+                problem.constraints.basis, root_of_first(problem.terms, trial),
             )
 
     def solved(self) -> Solved:

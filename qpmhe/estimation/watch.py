@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .limits import FAR
-
-Array = NDArray[np.float64]
 
 
 class ObserverWatch:
@@ -24,7 +19,7 @@ class ObserverWatch:
         self._warned = False
 
     def counted(
-        self, counts: tuple[int, int], offset: Array, prior_weight: Array, dropped_rows: bool
+        self, counts: tuple[int, int], distance: float, dropped_rows: bool
     ) -> tuple[int, int]:
         """The counts after a sample.
 
@@ -32,16 +27,14 @@ class ObserverWatch:
         ----------
         counts : (int, int)
             Consecutive samples with the observer far away, and with rows dropped, before it.
-        offset : (n,) array
-            The estimate minus the observer's state.
-        prior_weight : (n, n) array
-            Weight of an initial error of the observer.
+        distance : float
+            Of the estimate from the observer's state, squared, in deviations of the prior.
         dropped_rows : bool
             Whether the step dropped rows.
         """
         far, dropped = counts
         # A comparison with NaN is false.
-        far = far + 1 if offset.dot(prior_weight).dot(offset) > FAR**2 else 0
+        far = far + 1 if distance > FAR**2 else 0
         return far, (dropped + 1 if dropped_rows else 0)
 
     def warning(self, counts: tuple[int, int]) -> str | None:

@@ -208,6 +208,19 @@ class Window(Record):
         return None if self.covariance is None else self.covariance[self.start]
 
     @property
+    def prior_root(self) -> Array | None:
+        """A root of that covariance, where only the root has all digits."""
+        if self.root is None or not self.is_vague[self.start]:
+            return None
+        root: Array = self.root[self.start]
+        return root
+
+    @property
+    def last_covariance(self) -> Array | None:
+        """The observer's covariance at z(t), if it has one."""
+        return None if self.covariance is None else self.covariance[self.end]
+
+    @property
     def initial_state(self) -> Array:
         """The first state of the window."""
         state: Array = self.z[self.start].copy()

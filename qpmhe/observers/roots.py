@@ -33,10 +33,6 @@ def updated(
         \begin{bmatrix} U_R & 0 \\ X & F \\ 0 & U_Q \end{bmatrix}
         = \Theta \begin{bmatrix} U_S & U_S K^\top \\ 0 & U^+ \end{bmatrix}
 
-    The longest rows come first, each in the lengths of the columns: rounding in a row is then small
-    beside this row, however long others are (Cox and Higham, Stability of Householder QR
-    factorization for weighted least squares problems, 1998).
-
     Parameters
     ----------
     seen, ahead : (k, q) and (k, n) array
@@ -54,13 +50,23 @@ def updated(
     rows[q : q + k, :q], rows[q : q + k, q:] = seen, ahead
     if disturbance is not None:
         rows[q + k :, q:] = cholesky(disturbance).T
+    factor = triangle(rows)
+    gain: Array = np.linalg.solve(factor[:q, :q], factor[:q, q:]).T
+    root = factor[q:, q:]
+    return gain, np.where(root.diagonal() < 0.0, -1.0, 1.0)[:, None] * root
+
+
+def triangle(rows: Array) -> Array:
+    """An upper triangular R with R'R the square of some rows, no fewer than columns.
+
+    The longest rows come first, each in the lengths of the columns: rounding in a row is then small
+    beside this row, however long others are (Cox and Higham, Stability of Householder QR
+    factorization for weighted least squares problems, 1998).
+    """
     sizes = np.abs(rows)
     lengths = sizes.max(axis=0)
     longest = (sizes / np.where(lengths > 0.0, lengths, 1.0)).max(axis=1)
-    triangle = np.asarray(np.linalg.qr(rows[np.argsort(-longest, kind="stable")], mode="r"))
-    gain = np.linalg.solve(triangle[:q, :q], triangle[:q, q:]).T
-    root = triangle[q:, q:]
-    return gain, np.where(root.diagonal() < 0.0, -1.0, 1.0)[:, None] * root
+    return np.asarray(np.linalg.qr(rows[np.argsort(-longest, kind="stable")], mode="r"))
 
 
 def grown(root: Array, covariance: Array, larger: Array) -> Array:

@@ -101,6 +101,14 @@ class WindowData(Protocol):
     def prior_covariance(self) -> Array | None:
         """The observer's covariance (n, n) at its first state, if it has one."""
 
+    @property
+    def prior_root(self) -> Array | None:
+        """A root U (n, n) of that covariance U'U, where only the root has all digits."""
+
+    @property
+    def last_covariance(self) -> Array | None:
+        """The observer's covariance (n, n) at its last state, if it has one."""
+
 
 @dataclass(slots=True)
 class Trial:
@@ -285,6 +293,10 @@ class Term(ABC):
 
     def weight_of_first(self, trial: Trial) -> Array | None:
         """Weight (n, n) of the form that majorises a term in the first state; None of others."""
+        return None
+
+    def root_of_first(self, trial: Trial) -> Array | None:
+        """A root R (n, n) of that weight R'R, where only the root has all digits."""
         return None
 
     def derivative(self, trial: Trial) -> TermDerivative | None:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_of
 
-from .._linalg import inverse
+from .._linalg import cholesky, inverse
 from ..costs import Cost
 from ..model.functions import contained
 from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
+from ..observers.roots import triangle
 from .base import FirstStateDerivative, FirstStateTerm, Trial, WindowData, WindowView
 
 Array = NDArray[np.float64]
@@ -23,6 +25,26 @@ Array = NDArray[np.float64]
 #: A variance of the observer's below the first share of the typical one is none; in the prior's
 #: weight it counts as the second share.
 NO_VARIANCE, KNOWN = 1e-30, 1e-16
+
+
+#: The weight comes from a root of the covariance where this loses fewer digits. With r the least
+#: variance of a component given those before it, as a share of its variance, and d the largest
+#: factor by which the window's data reduce a variance, rounding of the weight has a share of
+#: eps / (r d) in a variance behind the window, and the least eigenvalue l of an inverse one of l d.
+_LOST = float(np.finfo(np.float64).eps)
+
+
+class InitialWeight(NamedTuple):
+    """The prior's weight, and one to judge its distance by.
+
+    A state that is known exactly has a large weight in the first, and the weight of its typical
+    magnitude in the second. The roots R are those of R'R, where only they have all digits.
+    """
+
+    weight: Array
+    distance: Array
+    root: Array | None = None
+    distance_root: Array | None = None
 
 
 class PriorWeights:
@@ -52,34 +74,61 @@ class PriorWeights:
             self.added = 2.0 / rule.kappa * first
             self.least = cost.initial_weight(first) / rule.kappa
 
-    def __call__(self, covariance: Array | None) -> tuple[Array, Array]:
-        """The prior's weight for an observer's covariance, and one to judge its distance by.
+    def __call__(
+        self, covariance: Array | None, root: Array | None = None, later: Array | None = None
+    ) -> InitialWeight:
+        """The weights for an observer's covariance.
 
-        A state that is known exactly has a large weight in the first, and the weight of its typical
-        magnitude in the second.
+        With a root of it where that has more digits, and the covariance behind the window.
         """
         cost = self._cost
         if covariance is None or not self._varies:
             weight = cost.initial_weight(covariance)
-            return weight, weight
+            return InitialWeight(weight, weight)
+        if root is not None and later is not None:
+            found = self._from_root(covariance, root, later)
+            if found is not None:
+                return found
         nearly, regular = self._regular(covariance + self.added)
         weight = cost.initial_weight(nearly) + self.least
         if regular is nearly:
-            return weight, weight
-        return weight, cost.initial_weight(regular) + self.least
+            return InitialWeight(weight, weight)
+        return InitialWeight(weight, cost.initial_weight(regular) + self.least)
+
+    def _from_root(self, covariance: Array, root: Array, later: Array) -> InitialWeight | None:
+        """From the root, unless the covariance's inverse is nearer: see `_LOST`."""
+        variances = self._variances(covariance + self.added)
+        wider = [
+            triangle(np.concatenate((root, cholesky(self.added + one).T)))
+            for one in variances or (0.0,)
+        ]
+        own, behind = (wider[0] ** 2).sum(axis=0), later.diagonal()
+        pivot = (wider[0].diagonal() ** 2 / own).min()
+        shrunk = (own / np.where(behind > 0.0, behind, np.inf)).max()
+        if not pivot * self._cost.least_correlation * shrunk * shrunk > _LOST:
+            return None
+        least = cholesky(self.least).T
+        near, *others = (triangle(np.concatenate((np.linalg.inv(one).T, least))) for one in wider)
+        far = others[0] if others else near
+        return InitialWeight(near.T @ near, far.T @ far, near, far)
 
     def _regular(self, covariance: Array) -> tuple[Array, Array]:
         """The covariance with a small and with a typical variance of states known exactly."""
+        variances = self._variances(covariance)
+        if variances is None:
+            return covariance, covariance
+        return covariance + variances[0], covariance + variances[1]
+
+    def _variances(self, covariance: Array) -> tuple[Array, Array] | None:
+        """Small and typical variances (n, n) of states known exactly; None where there is none."""
         typical = self.typical
-        if typical is not None:
-            known = covariance.diagonal() <= NO_VARIANCE * typical
-            if known.any():
-                one, other = (
-                    covariance + np.diag(np.where(known, each, 0.0))
-                    for each in (KNOWN * typical, typical)
-                )
-                return one, other
-        return covariance, covariance
+        if typical is None:
+            return None
+        known = covariance.diagonal() <= NO_VARIANCE * typical
+        if not known.any():
+            return None
+        small, usual = (np.diag(np.where(known, one, 0.0)) for one in (KNOWN * typical, typical))
+        return small, usual
 
 
 class PriorCost:
@@ -103,17 +152,16 @@ class PriorCost:
         self.weights = PriorWeights(system, observer, cost)
         covariance = observer.initial_covariance()
         #: Weight of the initial error of the first window, and one to judge its distance by.
-        self.first: Array
-        self.first, regular = self.weights(covariance)
-        self.first_band = band_of(self.first)
+        self.first: InitialWeight = self.weights(covariance)
+        self.first_band = band_of(self.first.weight)
         #: Covariance of the initial error, regular.
-        self.covariance = inverse(regular)
+        self.covariance = inverse(self.first.distance)
 
     def of_window(self, window: WindowData, view: WindowView) -> Prior:
         """The prior of a window."""
         prior = Prior(self, view)
         if self.follows and (covariance := window.prior_covariance) is not None:
-            prior.set_weights(*self.weights(covariance))
+            prior.set_weight(self.weights(covariance, window.prior_root, window.last_covariance))
         if self.discounted:
             prior.factor = float(window.discounts[0])
         if window.smoothed_prior is not None:
@@ -132,8 +180,6 @@ class Prior(FirstStateTerm):
         gamma^K.
     weight : (n, n) array
         Weight of the initial error, before discount and majorisation.
-    distance_weight : (n, n) array
-        Weight of a distance from the observer, regular where a state was known exactly.
     """
 
     # Class attributes as defaults: few of them change in most steps.
@@ -144,22 +190,30 @@ class Prior(FirstStateTerm):
         self._rule, self.mean = rule, view.prior
         # The trajectory that is known to start at the mean, if there is one.
         self._zero: Array | None = view.candidate
-        self.weight = self.distance_weight = rule.first
+        self._initial, self.weight = rule.first, rule.first.weight
         if rule.is_constant:
             self.band = rule.first_band
 
-    def set_weights(self, weight: Array, distance_weight: Array) -> None:
-        """Set other weights."""
-        self.weight, self.distance_weight = weight, distance_weight
+    def set_weight(self, initial: InitialWeight) -> None:
+        """Set another weight."""
+        self._initial, self.weight = initial, initial.weight
         if self._rule.is_constant:
-            self.band = band_of(weight)
+            self.band = band_of(initial.weight)
+
+    def distance(self, offset: Array) -> float:
+        """The squared distance of two states, in deviations of the prior."""
+        initial = self._initial
+        if initial.distance_root is None:
+            return float(offset.dot(initial.distance).dot(offset))
+        seen = initial.distance_root.dot(offset)
+        return float(seen.dot(seen))
 
     def move(self, mean: Array) -> None:
         """Take another mean, unless the candidate has no finite cost there."""
         rule = self._rule
         try:
             offset = difference(rule.residual, self.mean, mean)  # the candidate's
-            cost = rule.evaluate(offset, self.weight)
+            cost = self._lost(offset)
             self._majorised(offset)
         except Exception:  # a user's loss or residual
             return
@@ -174,20 +228,45 @@ class Prior(FirstStateTerm):
         offset: Array = first - self.mean
         return offset
 
+    def _lost(self, offset: Array) -> float:
+        """Gamma of an offset. With a root, of what the root makes of it: no digits cancel then."""
+        root, evaluate = self._initial.root, self._rule.evaluate
+        if root is None:
+            return float(evaluate(offset, self.weight))
+        return float(evaluate(root.dot(offset), np.eye(len(root))))
+
     def _majorised(self, offset: Array) -> Array:
         """The weight, discounted and majorised at an offset."""
+        root = self._root(offset)
+        if root is not None:
+            return root.T @ root
         weight, cost = self.weight, self._rule.cost
         if not cost.quadratic:
             weight = cost.majorise_prior(offset, weight)
         return weight if self.factor == 1.0 else self.factor * weight
 
+    def _root(self, offset: Array) -> Array | None:
+        """A root of `_majorised`, where the weight has one."""
+        root, cost = self._initial.root, self._rule.cost
+        if root is not None and not cost.quadratic:
+            root = cholesky(cost.majorise_prior(root.dot(offset), np.eye(len(root)))).T @ root
+        return root if root is None or self.factor == 1.0 else math.sqrt(self.factor) * root
+
+    def _force(self, offset: Array) -> Array:
+        """Half the derivative of the cost."""
+        root = self._root(offset)
+        force: Array = (
+            self._majorised(offset).dot(offset) if root is None else root.T.dot(root.dot(offset))
+        )
+        return force
+
     def cost(self, trial: Trial) -> float:
         """Gamma of the initial error; see `Term.cost`."""
         rule = self._rule
         offset = trial.trajectory[0] - self.mean if rule.residual is None else self.offset(trial)
-        if rule.quadratic:
+        if rule.quadratic and self._initial.root is None:
             return self.factor * float(offset.dot(self.weight).dot(offset))
-        return float(self.factor * rule.evaluate(offset, self.weight))
+        return float(self.factor * self._lost(offset))
 
     def cost_of_candidate(self, candidate: Trial) -> float:
         """0 exactly, where the mean is the candidate's first state."""
@@ -197,25 +276,30 @@ class Prior(FirstStateTerm):
         """See `FirstStateTerm.weight_of_first`."""
         return self._majorised(self.offset(trial))
 
+    def root_of_first(self, trial: Trial) -> Array | None:
+        """See `Term.root_of_first`."""
+        return self._root(self.offset(trial))
+
     def force(self, trial: Trial) -> Array | None:
         """See `FirstStateTerm.force`; None for a candidate that starts at the mean."""
         if trial.trajectory is self._zero:
             return None
-        offset = self.offset(trial)
-        force: Array = self._majorised(offset).dot(offset)
-        return force
+        return self._force(self.offset(trial))
 
     def magnitude(self, trial: Trial) -> float:
         """See `Term.magnitude`."""
-        offset = abs(self.offset(trial))
-        return float(offset @ abs(self.weight) @ offset)
+        offset, root = abs(self.offset(trial)), self._initial.root
+        if root is None:
+            return float(offset @ abs(self.weight) @ offset)
+        seen = abs(root) @ offset
+        return float(seen @ seen)
 
     def derivative(self, trial: Trial) -> PriorDerivative:
         """See `Term.derivative`."""
-        cost = self._rule.cost
+        cost, offset = self._rule.cost, self.offset(trial)
         return PriorDerivative(
-            cost, self.offset(trial), self.weight, self.factor,
-            self.weight_of_first(trial), len(trial.residuals) / cost.discount,
+            cost, offset, self.weight, self.factor, self._force(offset), self._majorised(offset),
+            len(trial.residuals) / cost.discount,
         )
 
 
@@ -225,11 +309,11 @@ class PriorDerivative(FirstStateDerivative):
     data = ("prior", "prior_weight")
 
     def __init__(
-        self, cost: Cost, offset: Array, weight: Array, factor: float, majorised: Array, age: float
+        self, cost: Cost, offset: Array, weight: Array, factor: float, force: Array,
+        majorised: Array, age: float,
     ) -> None:
-        majorised = 2.0 * majorised
         bent = factor * cost.prior_hessian(offset, weight)
-        super().__init__(majorised @ offset, bent, majorised, age)
+        super().__init__(2.0 * force, bent, 2.0 * majorised, age)
         self._cost, self._offset, self._weight, self._factor = cost, offset, weight, factor
 
     def _by_weight(self, directions: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .._linalg import cholesky
 from ..costs import Cost
 from ..errors import OptionError
 from ..model.system import System
@@ -107,3 +108,15 @@ def weight_of_first(terms: Sequence[Term], trial: Trial) -> Array:
         if weight is not None:
             found += weight
     return found
+
+
+def root_of_first(terms: Sequence[Term], trial: Trial) -> Array | None:
+    """Rows (k, n) whose square is `weight_of_first`, where that has lost digits; else None."""
+    roots = [term.root_of_first(trial) for term in terms]
+    if all(root is None for root in roots):
+        return None
+    weights = [term.weight_of_first(trial) for term in terms]
+    return np.concatenate([
+        cholesky(weight).T if root is None else root
+        for root, weight in zip(roots, weights, strict=True) if weight is not None
+    ])

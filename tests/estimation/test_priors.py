@@ -114,7 +114,7 @@ def test_weights_stay_within_kappa_of_the_first(units, kappa):
             factor = to @ rng.standard_normal((2, 2))
             covariance = 10.0**power * factor @ shape @ factor.T
             with np.errstate(under="ignore"):
-                weight, _ = weights(0.5 * (covariance + covariance.T))
+                weight = weights(0.5 * (covariance + covariance.T)).weight
             # Relative to the first: the identity.
             low, high = np.linalg.eigvalsh(root.T @ weight @ root)
             assert low >= -1e-9 * high

@@ -152,13 +152,26 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     const real factor = mhe_floored(k->factors[0]), *weight = k->prior.weight;
     real scale[NX], first[NX * NX];
     mhe_set_scale(&s->prior_loss, 1, NX, weight, offset, scale);
+    const real *root = mhe_root_of_prior(&k->prior);
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < NX; c++)
-            first[r * NX + c] = mhe_scaled(factor, scale, r) * weight[r * NX + c];
-    mhe_times(NX, first, offset, k->gradient);
+            first[r * NX + c] = root ? 0 : mhe_scaled(factor, scale, r) * weight[r * NX + c];
+    if (root) {
+        mhe_prior_force(&k->prior, offset, k->gradient);
+        for (int j = 0; j < NX; j++) k->gradient[j] *= factor;
+    } else
+        mhe_times(NX, first, offset, k->gradient);
     mhe_add_further(e, k, factor, first, NX);
     memcpy(k->prior_gradient, k->gradient, sizeof k->prior_gradient);
     mhe_root(NX, first, k->prior_root);
+#if MHE_PRIOR_ROOTS
+    if (root) {
+        real scaled[NX * NX];
+        for (int j = 0; j < NX * NX; j++) scaled[j] = sqrt(factor) * root[j];
+        mhe_join_roots(scaled, k->prior_root, first);
+        memcpy(k->prior_root, first, sizeof first);
+    }
+#endif
     for (int i = 0; i < count; i++) {
         const real next = mhe_floored(k->factors[i + 1]);
         const mhe_terms *t = k->at[i];

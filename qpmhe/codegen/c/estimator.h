@@ -76,6 +76,9 @@ $limits
 /* Whether the covariance is propagated by its root where it has lost digits. */
 #define MHE_ROOTS (MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED)
 
+/* Whether such a root gives one of the prior's weight. */
+#define MHE_PRIOR_ROOTS (MHE_ROOTS && MHE_OBSERVER_PRIOR)
+
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
     (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS) + \
@@ -315,6 +318,11 @@ typedef struct {
     mhe_real own_weight[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
     mhe_real own_distance[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
     const mhe_real *first; /* the first state of the trajectory around which the QP is */
+#if MHE_PRIOR_ROOTS
+    /* R with R'R the weights, where R alone has all digits; else none. */
+    const mhe_real *root, *distance_root;
+    mhe_real own_root[MHE_NX * MHE_NX], own_distance_root[MHE_NX * MHE_NX];
+#endif
 #if MHE_HELD
     /* Of the present window: the weight of held parameters, and how their trusted values follow. */
     mhe_real held[MHE_HELD * MHE_HELD], follow[MHE_HELD * MHE_HELD];

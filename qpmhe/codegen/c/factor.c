@@ -38,7 +38,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
             for (int c = NX; c < WIDTH; c++) row[c] = 0;
         }
         if (i == 0) {
-            mhe_times(NX, weight, offset, g);
+            mhe_prior_force(&k->prior, offset, g);
             for (int j = 0; j < NX; j++) g[j] *= mhe_scaled(factor, scale, j);
             mhe_add_further(e, k, factor, k->panels, WIDTH);
         } else {

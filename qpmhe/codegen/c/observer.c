@@ -180,6 +180,17 @@ static void mhe_triangle(int count, int width, real *rows)
     }
 }
 
+/* An upper triangle R with R'R the square of rows, no fewer than columns; the longest rows come first, so
+ * that rounding in a row is small beside this row. */
+static void mhe_ordered_triangle(int count, int width, const real *given, real *rows)
+{
+    int order[LINES];
+    mhe_order_rows(count, width, given, order);
+    for (int i = 0; i < count; i++)
+        memcpy(rows + i * WIDE, given + order[i] * WIDE, sizeof(real) * (size_t)width);
+    mhe_triangle(count, width, rows);
+}
+
 /* The columns of the gain of least mean square error as rows, and a root of the covariance that it
  * leaves, by one factorisation of [root of R, 0; deviations of outputs and of states; 0, root of Q];
  * no Q in a measurement update. */
@@ -188,7 +199,6 @@ static void mhe_update_root(const mhe_seen *seen, const real *outputs, const rea
 {
     const int q = seen->count, width = q + NX, count = q + DEVIATIONS + (Q ? NX : 0);
     real given[LINES * WIDE] = {0}, rows[LINES * WIDE], factor[NX * NX], noise[NY * NY];
-    int order[LINES];
     mhe_root(q, seen->noise, noise);
     for (int i = 0; i < q; i++)
         memcpy(given + i * WIDE, noise + i * q, sizeof(real) * (size_t)q);
@@ -202,10 +212,7 @@ static void mhe_update_root(const mhe_seen *seen, const real *outputs, const rea
         for (int i = 0; i < NX; i++)
             memcpy(given + (q + DEVIATIONS + i) * WIDE + q, factor + i * NX, sizeof(real) * NX);
     }
-    mhe_order_rows(count, width, given, order);
-    for (int i = 0; i < count; i++)
-        memcpy(rows + i * WIDE, given + order[i] * WIDE, sizeof(real) * (size_t)width);
-    mhe_triangle(count, width, rows);
+    mhe_ordered_triangle(count, width, given, rows);
     for (int i = q - 1; i >= 0; i--)
         for (int j = 0; j < NX; j++) {
             real sum = rows[i * WIDE + q + j];
@@ -217,6 +224,21 @@ static void mhe_update_root(const mhe_seen *seen, const real *outputs, const rea
         for (int j = 0; j < NX; j++) root[i * NX + j] = j < i ? 0 : sign * row[j];
     }
 }
+
+#if MHE_PRIOR_ROOTS
+/* out = an upper triangle R with R'R = A'A + B'B. */
+static void mhe_join_roots(const real *A, const real *B, real *out)
+{
+    real given[LINES * WIDE], rows[LINES * WIDE];
+    for (int i = 0; i < NX; i++) {
+        memcpy(given + i * WIDE, A + i * NX, sizeof(real) * NX);
+        memcpy(given + (NX + i) * WIDE, B + i * NX, sizeof(real) * NX);
+    }
+    mhe_ordered_triangle(2 * NX, NX, given, rows);
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) out[i * NX + j] = j < i ? 0 : rows[i * WIDE + j];
+}
+#endif
 
 /* The covariance of a root. */
 static void mhe_square(const real *root, real *P)

@@ -62,6 +62,59 @@ static void mhe_weight_plus(const mhe_covariances *o, const real *covariance, co
 }
 #endif
 
+#if MHE_PRIOR_ROOTS
+/* out = U'^-1 for an upper triangular U. */
+static void mhe_invert_root(const real *U, real *out)
+{
+    for (int i = 0; i < NX; i++)
+        for (int c = 0; c < NX; c++) {
+            real sum = i == c;
+            for (int l = c; l < i; l++) sum -= U[l * NX + i] * out[l * NX + c];
+            out[i * NX + c] = c > i ? 0 : sum / U[i * NX + i];
+        }
+}
+
+/* out = a root of the covariance with the variances of some states increased. */
+static void mhe_widen_root(const mhe_covariances *o, const real *root, const real *plus,
+                           real factor, real *out)
+{
+    real added[NX * NX], other[NX * NX];
+    memcpy(added, o->added, sizeof added);
+    for (int j = 0; j < NX; j++) added[j * NX + j] += factor * plus[j];
+    mhe_root(NX, added, other);
+    mhe_join_roots(root, other, out);
+}
+
+/* The weight and a root of it, from a root of the covariance. */
+static void mhe_weight_from_root(const mhe_covariances *o, const real *covariance_root, real *out,
+                                 real *root)
+{
+    real inverse[NX * NX], least[NX * NX];
+    mhe_invert_root(covariance_root, inverse);
+    mhe_root(NX, o->least_weight, least);
+    mhe_join_roots(inverse, least, root);
+    mhe_square(root, out);
+}
+
+/* Whether the weight loses fewer digits by a root of the covariance than by its inverse. With r the least
+ * variance of a component given those before it, as a share of its variance, and d the largest factor
+ * by which the window's data reduce a variance, rounding of the weight has a share of eps / (r d) in a
+ * variance behind the window, and the least eigenvalue l of an inverse one of l d. */
+static int mhe_root_is_better(const mhe_covariances *o, const real *root, const real *later)
+{
+    real pivot = 1, shrunk = 0;
+    for (int j = 0; j < NX; j++) {
+        real own = 0;
+        for (int i = 0; i <= j; i++) own += root[i * NX + j] * root[i * NX + j];
+        const real share = root[j * NX + j] * root[j * NX + j] / own;
+        const real behind = later[j * NX + j];
+        if (!(share >= pivot)) pivot = share;
+        if (behind > 0) shrunk = mhe_max(own / behind, shrunk);
+    }
+    return pivot * o->least * shrunk * shrunk > EPSILON;
+}
+#endif
+
 /* The prior of the present window, before the candidate's cost is known. */
 static void mhe_set_prior(mhe_estimator *e, mhe_workspace *k)
 {
@@ -81,12 +134,26 @@ static void mhe_set_prior(mhe_estimator *e, mhe_workspace *k)
         count += is_known;
     }
     prior->weight = prior->distance_weight = prior->own_weight;
-    mhe_weight_plus(o, covariance, known, MHE_KNOWN, prior->own_weight);
-    if (count) {
-        /* A state that is known exactly is judged by its typical magnitude. */
-        mhe_weight_plus(o, covariance, known, 1, prior->own_distance);
-        prior->distance_weight = prior->own_distance;
+    /* A state that is known exactly is judged by its typical magnitude. */
+    if (count) prior->distance_weight = prior->own_distance;
+#if MHE_PRIOR_ROOTS
+    prior->root = prior->distance_root = 0;
+    if (first->is_vague) {
+        real wider[NX * NX];
+        mhe_widen_root(o, first->root, known, MHE_KNOWN, wider);
+        if (mhe_root_is_better(o, wider, mhe_next_covariance(e, e->length - 1))) {
+            prior->root = prior->distance_root = prior->own_root;
+            mhe_weight_from_root(o, wider, prior->own_weight, prior->own_root);
+            if (!count) return;
+            prior->distance_root = prior->own_distance_root;
+            mhe_widen_root(o, first->root, known, 1, wider);
+            mhe_weight_from_root(o, wider, prior->own_distance, prior->own_distance_root);
+            return;
+        }
     }
+#endif
+    mhe_weight_plus(o, covariance, known, MHE_KNOWN, prior->own_weight);
+    if (count) mhe_weight_plus(o, covariance, known, 1, prior->own_distance);
 #endif
 }
 

@@ -7,7 +7,8 @@ static void mhe_watch(mhe_estimator *e, const mhe_workspace *k, mhe_outcome *o)
     for (int j = 0; j < NX; j++)
         offset[j] = o->best->x[e->length * NX + j] - o->candidate->x[e->length * NX + j];
     mhe_wrap_state(e->settings, o->best->x + e->length * NX, offset);
-    const int far = mhe_form(NX, k->prior.distance_weight, offset) > MHE_FAR * MHE_FAR;
+    const int far = mhe_rooted_form(k->prior.distance_root, k->prior.distance_weight, offset) >
+                    MHE_FAR * MHE_FAR;
     const int counted[] = {far, o->rows_dropped};
     for (int i = 0; i < 2; i++)
         e->watched[i] = counted[i] ? e->watched[i] + (e->watched[i] < INT32_MAX) : 0;
