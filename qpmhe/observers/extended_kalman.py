@@ -113,12 +113,7 @@ class ExtendedKalman(KalmanType):
             c, r, v = c[there], r[np.ix_(there, there)], v[there]
         if self._innovation is None:
             return c, r, v, UNJUDGED
-        root = sample.root
-        if root is None:
-            cross = covariance @ c.T
-            prediction = Prediction(covariance, cross, c @ cross, lambda larger: c @ larger @ c.T)
-        else:
-            prediction = _predicted(root, c, covariance)
+        prediction = self._predicted(c, r, covariance, sample)
         verdict = self._judge(prediction, r, v, sample)
         kept = verdict.kept
         r = r if verdict.noise is None else verdict.noise
@@ -126,16 +121,30 @@ class ExtendedKalman(KalmanType):
             return c, r, v, verdict
         return c[kept], r[np.ix_(kept, kept)], v[kept], verdict
 
+    def _predicted(self, c: Array, r: Array, covariance: Array, sample: Sample) -> Prediction:
+        """The prediction of the outputs with these rows of C; from a root of P if there is one."""
+        root = sample.root
 
-def _predicted(root: Array, c: Array, covariance: Array) -> Prediction:
-    """The prediction from a root of the covariance."""
-    seen: Array = root @ c.T
+        def deviations_of(larger: Array) -> tuple[Array, Array]:
+            own = cholesky(larger).T if root is None else grown(root, covariance, larger)
+            return own @ c.T, own
 
-    def spread_of(larger: Array) -> Array:
-        outputs: Array = grown(root, covariance, larger) @ c.T
-        return np.asarray(outputs.T @ outputs)
+        def spread_of(larger: Array) -> Array:
+            if root is None:
+                return c @ larger @ c.T
+            outputs = deviations_of(larger)[0]
+            return outputs.T @ outputs
 
-    return Prediction(covariance, root.T @ seen, seen.T @ seen, spread_of)
+        if root is None:
+            cross = covariance @ c.T
+            spread = c @ cross
+        else:
+            seen = root @ c.T
+            cross, spread = root.T @ seen, seen.T @ seen
+        return Prediction(
+            covariance, cross, spread, spread_of, deviations_of,
+            lambda innovation: self._is_vague(innovation, r, sample),
+        )
 
 
 def _given(sample: Sample) -> tuple[Array, Array, Array]:

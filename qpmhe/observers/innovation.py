@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from qpmhe_solvers.values import finite, integer, shown
 
 from .._checks import Array, count, positive
-from .._linalg import solve, unit_diagonal
+from .._linalg import cholesky, solve, unit_diagonal
 from ..errors import OptionError
+from .roots import triangle, whitened
 
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int64]
@@ -36,23 +37,65 @@ class Prediction:
     ----------
     covariance, cross, spread : (n, n), (n, q) and (q, q) array
         P, :math:`P C'` and :math:`C P C'`.
-    spread_of : callable
-        The latter, from another P.
+    spread_of, deviations_of : callable
+        The latter, and deviations X (k, q) and F (k, n) of outputs and states with the squares
+        :math:`X'X = C P C'` and :math:`F'F = P`, from another P.
+    is_hidden : callable
+        Whether an innovation's covariance hides what the noise has in it; see `factor`.
     """
 
     covariance: Array
     cross: Array
     spread: Array
     spread_of: Callable[[Array], Array]
+    deviations_of: Callable[[Array], tuple[Array, Array]]
+    is_hidden: Callable[[Array], bool]
 
     def shares(self, places: list[int], noise: Array) -> Array:
         """By which share these outputs would reduce each variance, over the largest share."""
-        cross = self.cross[:, places]
-        reduced = cross.T * solve((self.spread + noise)[np.ix_(places, places)], cross.T)
+        cross, innovation = self.cross[:, places], self.spread + noise
+        if len(places) > 1 and self.is_hidden(innovation):
+            reduced = self.factor(self.covariance, places, noise)[:, len(places) :] ** 2
+        else:
+            reduced = cross.T * solve(innovation[np.ix_(places, places)], cross.T)
         variances = self.covariance.diagonal()
         found: Array = reduced.sum(axis=0) / np.where(variances > 0.0, variances, np.inf)
         most = found.max()
         return found / most if most > 0.0 else np.zeros_like(found)
+
+    def factor(self, covariance: Array, places: list[int], noise: Array) -> Array:
+        """U_S and U_S K', with the innovation's covariance U_S' U_S and gain K of some outputs.
+
+        They come from another P, by roots: S itself may have no digit of the noise.
+        """
+        seen, states = self.deviations_of(covariance)
+        q = len(places)
+        rows = np.zeros((q + len(seen), q + states.shape[1]))
+        rows[:q, :q] = cholesky(noise[np.ix_(places, places)]).T
+        rows[q:, :q], rows[q:, q:] = seen[:, places], states
+        return triangle(rows)[:q]
+
+    def distance(
+        self, innovation: Array, covariance: Array, noise: Array, v: Array, known: list[int],
+        part: list[int],
+    ) -> float:
+        """The squared norm of a part of v in its covariance, given others; infinity if singular.
+
+        ``innovation`` is the covariance of v that belongs to a P, ``covariance``.
+        """
+        if not known and len(part) == 1:
+            return float(v[part[0]] * v[part[0]] / innovation[part[0], part[0]])
+        both, count = known + part, len(known)
+        if self.is_hidden(innovation):
+            tail = whitened(self.factor(covariance, both, noise)[:, : len(both)], v[both])[count:]
+            return float(tail @ tail)
+        scaled, units, whole = unit_diagonal(innovation[np.ix_(both, both)])
+        try:
+            root = np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            return math.inf
+        tail = np.linalg.solve(root, np.ldexp(v[both], -units))[count:]
+        return float(np.ldexp(tail @ tail, -whole))
 
     def grown(self, growth: Array) -> Array:
         """P whose variances have grown by these factors (n,)."""
@@ -126,9 +169,10 @@ class Innovation(ABC):
     ) -> _Judged:
         """Test each sensor, and find those that are due and how P would have to grow for each."""
         parts, limits, least = self._parts(observed)
-        innovation = prediction.spread + noise
+        innovation, covariance = prediction.spread + noise, prediction.covariance
         passes = np.array([
-            not part or _distance(innovation, v, [], part) <= limit
+            not part
+            or prediction.distance(innovation, covariance, noise, v, [], part) <= limit
             for part, limit in zip(parts, limits, strict=True)
         ])
         counts = np.where(passes, 0, rejections + 1)
@@ -156,19 +200,19 @@ class Innovation(ABC):
         """Factors (n,) of the variances with which a sensor passes; None if there are none."""
         shares, factor = prediction.shares(part, noise), 1.0
 
-        def innovation(factor: float) -> Array:
+        def innovation(factor: float) -> tuple[Array, Array]:
             larger = prediction.grown(1.0 + (factor - 1.0) * shares)
-            return prediction.spread_of(larger) + noise
+            return prediction.spread_of(larger) + noise, larger
 
         for _ in range(MOST_GROWTH):
             factor *= GROWTH
-            variances = innovation(factor).diagonal()[part]
+            variances = innovation(factor)[0].diagonal()[part]
             if (v[part] ** 2 <= least * variances).all():
                 break
         else:
             return None
         factor *= GROWTH
-        if not _distance(innovation(factor), v, given, part) <= limit:
+        if not prediction.distance(*innovation(factor), noise, v, given, part) <= limit:
             return None
         growth: Array = 1.0 + ((factor if self.rejects else GROWTH) - 1.0) * shares
         return growth
@@ -388,20 +432,6 @@ class HuberInnovation(Innovation):
 
 def _checked_reopen(reopen: Any) -> int:
     return count("reopen", reopen, 1, most=2**31 - 2)
-
-
-def _distance(innovation: Array, v: Array, known: list[int], part: list[int]) -> float:
-    """The squared norm of a part of v in its covariance, given others; infinity if singular."""
-    if not known and len(part) == 1:
-        return float(v[part[0]] * v[part[0]] / innovation[part[0], part[0]])
-    both = known + part
-    scaled, units, whole = unit_diagonal(innovation[np.ix_(both, both)])
-    try:
-        root = np.linalg.cholesky(scaled)
-    except np.linalg.LinAlgError:
-        return math.inf
-    whitened = np.linalg.solve(root, np.ldexp(v[both], -units))[len(known) :]
-    return float(np.ldexp(whitened @ whitened, -whole))
 
 
 def _checked_groups(groups: Any) -> tuple[tuple[int, ...], ...] | None:

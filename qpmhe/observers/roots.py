@@ -51,7 +51,7 @@ def updated(
     if disturbance is not None:
         rows[q + k :, q:] = cholesky(disturbance).T
     factor = triangle(rows)
-    gain: Array = np.linalg.solve(factor[:q, :q], factor[:q, q:]).T
+    gain = np.asarray(np.linalg.solve(factor[:q, :q], factor[:q, q:]), np.float64).T
     root = factor[q:, q:]
     return gain, np.where(root.diagonal() < 0.0, -1.0, 1.0)[:, None] * root
 
@@ -67,6 +67,14 @@ def triangle(rows: Array) -> Array:
     lengths = sizes.max(axis=0)
     longest = (sizes / np.where(lengths > 0.0, lengths, 1.0)).max(axis=1)
     return np.asarray(np.linalg.qr(rows[np.argsort(-longest, kind="stable")], mode="r"))
+
+
+def whitened(factor: Array, v: Array) -> Array:
+    """The solution w of U'w = v, for an upper triangle U."""
+    found = np.empty_like(v)
+    for j, value in enumerate(v):
+        found[j] = (value - factor[:j, j].dot(found[:j])) / factor[j, j]
+    return found
 
 
 def grown(root: Array, covariance: Array, larger: Array) -> Array:

@@ -165,12 +165,21 @@ class UnscentedKalman(KalmanType):
         if self._innovation is None:
             return sigma, seen, r, v, UNJUDGED
 
+        def deviations_of(larger: Array) -> tuple[Array, Array]:
+            if larger is covariance:
+                return seen, sigma.moves * sigma.roots
+            own = self._sigma(z, larger, sample)
+            return self._outputs(own, sample), own.moves * own.roots
+
         def spread_of(larger: Array) -> Array:
-            outputs = self._outputs(self._sigma(z, larger, sample), sample)
+            outputs = deviations_of(larger)[0]
             return outputs.T @ outputs
 
         cross = (sigma.moves * sigma.roots).T @ seen
-        prediction = Prediction(covariance, cross, seen.T @ seen, spread_of)
+        prediction = Prediction(
+            covariance, cross, seen.T @ seen, spread_of, deviations_of,
+            lambda innovation: self._is_vague(innovation, r, sample),
+        )
         verdict = self._judge(prediction, r, v, sample)
         kept = verdict.kept
         r = r if verdict.noise is None else verdict.noise

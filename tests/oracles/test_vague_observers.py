@@ -158,3 +158,56 @@ def test_a_root_that_is_not_the_covariances_is_refused(kind):
     state["window/root"] *= 2.0
     with pytest.raises(qpmhe.errors.InvalidInputError, match="its digest is another"):
         mhe.load_state_dict(state)
+
+
+PAIR = np.array([[1.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_a_group_is_judged_by_what_its_outputs_say_of_each_other(kind, engine):
+    """Two sensors of one state: beside the prior their covariance S has no digit of the noise.
+
+    With P = s^2 their squared distance is (y1 + y2)^2 / (4 s^2 + 2) + (y1 - y2)^2 / 2.
+    """
+    gate, model = qpmhe.Gate(groups=[[0, 1], [2]], reopen=3), (MOVE, PAIR, 0.01 * np.eye(3))
+    limit = np.sqrt(2.0 * gate.limits(3)[1])
+    rejected = qpmhe.Status.SENSORS_REJECTED
+    for deviation in (1e2, 1e4, 1e6, 1e8, 1e10):
+        for apart in (0.99 * limit, 1.01 * limit):
+            mhe = estimator(model, kind, deviation, engine, innovation=gate)
+            status = mhe.update([0.5 * apart, -0.5 * apart, 0.0]).status
+            assert bool(status & rejected) == (apart > limit)
+            if apart > limit:
+                # They contradict each other: no larger P explains that, now or later.
+                for _ in range(8):
+                    assert mhe.update([0.5 * apart, -0.5 * apart, 0.0]).status & rejected
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("kind", OBSERVERS)
+def test_groups_that_pass_change_nothing(kind, engine):
+    """However vague the prior is, and whichever outputs the groups have; one opens again, too."""
+    rng, model = np.random.default_rng(0), (MOVE, PAIR, 0.01 * np.eye(3))
+    times = np.arange(SAMPLES)
+    ys = np.stack((10.0 + times, 10.0 + times, np.ones(SAMPLES)), axis=1)
+    ys += 0.3 * rng.normal(size=ys.shape)
+    for groups in ([[0, 1]], [[0, 2], [1]], [[0, 1, 2]]):
+        gate = qpmhe.Gate(groups=groups, reopen=2)
+        for deviation in (1e5, 1e8, 1e10):
+            plain, judged = (
+                estimator(model, kind, deviation, engine, innovation=rule).run(ys)
+                for rule in (None, gate)
+            )
+            np.testing.assert_allclose(
+                judged.observer_states, plain.observer_states, rtol=1e-9, atol=1e-9
+            )
+        # A jump of all outputs: the observer, sure of the place before, is to follow it.
+        jump = ys + 1e4 * (times > 8)[:, None] * np.array([1.0, 1.0, 0.0])
+        run = estimator(model, kind, 1e8, engine, innovation=gate).run(jump)
+        rejected = [bool(one & qpmhe.Status.SENSORS_REJECTED) for one in run.statuses]
+        assert rejected[9]
+        assert not any(rejected[:9])
+        if groups == [[0, 1, 2]]:
+            assert not rejected[-1]
+            assert abs(run.observer_states[-1, 0] - jump[-1, 0]) < 10.0

@@ -425,6 +425,51 @@ static void mhe_predict_outputs(const mhe_settings *s, const mhe_stage *stage,
 #endif
 }
 
+/* The rows [U_S, U_S K'] in `rows`, with the innovation's covariance U_S' U_S and the gain K of some outputs:
+ * by roots of P and of the noise, as S itself may have no digit of the noise. */
+static void mhe_factor_innovation(const mhe_settings *s, const mhe_stage *stage,
+                                  const mhe_seen *seen, const real *P, const real *root,
+                                  int count, const int *at, real *rows)
+{
+    real given[LINES * WIDE] = {0}, noise[NY * NY], factor[NY * NY], outputs[DEVIATIONS * NY];
+    const real *states;
+#if MHE_OBSERVER == MHE_EXTENDED
+    real own[NX * NX], C[NY * NX];
+    mhe_rows_of(seen, stage->terms.h_jacobian, C);
+    if (!root) mhe_root(NX, P, own);
+    states = root ? root : own;
+    mhe_multiply_transposed(NX, NX, seen->count, states, C, outputs);
+    (void)s;
+#else
+    mhe_sigma sigma;
+    mhe_sigma_points(s, stage, P, root, &sigma);
+    mhe_sigma_outputs(s, stage, seen, &sigma, outputs);
+    for (int i = 0; i < POINTS * NX; i++) sigma.moves[i] *= sigma.roots[i / NX % NX];
+    states = sigma.moves;
+#endif
+    for (int i = 0; i < count; i++)
+        for (int j = 0; j < count; j++)
+            noise[i * count + j] = seen->noise[at[i] * seen->count + at[j]];
+    mhe_root(count, noise, factor);
+    for (int i = 0; i < count; i++)
+        memcpy(given + i * WIDE, factor + i * count, sizeof(real) * (size_t)count);
+    for (int i = 0; i < DEVIATIONS; i++) {
+        real *to = given + (count + i) * WIDE;
+        for (int j = 0; j < count; j++) to[j] = outputs[i * seen->count + at[j]];
+        memcpy(to + count, states + i * NX, sizeof(real) * NX);
+    }
+    mhe_ordered_triangle(count + DEVIATIONS, count + NX, given, rows);
+}
+
+/* Whether S = spread + R hides what the noise has in it. */
+static int mhe_hides_noise(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                           const real *spread)
+{
+    real S[NY * NY];
+    for (int i = 0; i < seen->count * seen->count; i++) S[i] = spread[i] + seen->noise[i];
+    return mhe_is_hidden(s, stage, seen, S);
+}
+
 /* Sensors by their outputs' places among those that are there, and how they passed. */
 typedef struct {
     int size[MHE_SENSORS], at[MHE_SENSORS][NY];
@@ -433,8 +478,10 @@ typedef struct {
     real growth[NX];            /* of the variances of P */
 } mhe_sensors;
 
-/* The squared norm of a part of v in its covariance, given others; infinite if singular. */
-static real mhe_distance(const mhe_seen *seen, const real *spread, int known_count,
+/* The squared norm of a part of v in its covariance, given others; infinite if singular. `spread`
+ * belongs to P, and that to its root if there is one. */
+static real mhe_distance(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                         const real *P, const real *root, const real *spread, int known_count,
                          const int *known, int count, const int *part)
 {
     const int size = known_count + count;
@@ -448,6 +495,16 @@ static real mhe_distance(const mhe_seen *seen, const real *spread, int known_cou
             S[i * size + j] = spread[place] + seen->noise[place];
         }
     }
+    if (size > 1 && mhe_hides_noise(s, stage, seen, spread)) {
+        real rows[LINES * WIDE];
+        mhe_factor_innovation(s, stage, seen, P, root, size, at, rows);
+        for (int i = 0; i < size; i++) {
+            for (int j = 0; j < i; j++) white[i] -= rows[j * WIDE + i] * white[j];
+            white[i] /= rows[i * WIDE + i];
+            if (i >= known_count) sum += white[i] * white[i];
+        }
+        return sum;
+    }
     if (!mhe_decompose(size, S)) return INFINITY;
     for (int i = 0; i < size; i++) {
         const real *row = S + i * size;
@@ -458,7 +515,8 @@ static real mhe_distance(const mhe_seen *seen, const real *spread, int known_cou
 }
 
 /* By which share a sensor would reduce each variance, over the largest share. */
-static void mhe_find_shares(const mhe_seen *seen, int count, const int *at, const real *P,
+static void mhe_find_shares(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
+                            int count, const int *at, const real *P, const real *root,
                             const real *cross, const real *spread, real *shares)
 {
     real S[NY * NY], rows[NY * NX], solved[NY * NX], most = 0;
@@ -470,8 +528,18 @@ static void mhe_find_shares(const mhe_seen *seen, int count, const int *at, cons
         memcpy(rows + i * NX, cross + at[i] * NX, sizeof(real) * NX);
     }
     memcpy(solved, rows, sizeof(real) * (size_t)(count * NX));
-    const int regular = mhe_decompose(count, S);
-    if (regular) mhe_solve_for(count, S, NX, solved);
+    int regular = 1;
+    if (count > 1 && mhe_hides_noise(s, stage, seen, spread)) {
+        real factor[LINES * WIDE];
+        mhe_factor_innovation(s, stage, seen, P, root, count, at, factor);
+        for (int i = 0; i < count; i++) {
+            memcpy(rows + i * NX, factor + i * WIDE + count, sizeof(real) * NX);
+            memcpy(solved + i * NX, factor + i * WIDE + count, sizeof(real) * NX);
+        }
+    } else {
+        regular = mhe_decompose(count, S);
+        if (regular) mhe_solve_for(count, S, NX, solved);
+    }
     for (int j = 0; j < NX; j++) {
         real reduced = 0;
         for (int i = 0; i < count; i++) reduced += rows[i * NX + j] * solved[i * NX + j];
@@ -494,12 +562,12 @@ static void mhe_grow(const real *P, const real *root, const real *growth, real *
         }
 }
 
-/* C P C' with a P that has grown by a factor. */
+/* A P that has grown by a factor, its root if P has one, and C P C'. */
 static void mhe_spread_grown(const mhe_settings *s, const mhe_stage *stage, const mhe_seen *seen,
                              const real *P, const real *root, const real *shares, real factor,
-                             real *spread)
+                             real *larger, real *larger_root, real *spread)
 {
-    real growth[NX], larger[NX * NX], larger_root[NX * NX], cross[NY * NX];
+    real growth[NX], cross[NY * NX];
     for (int j = 0; j < NX; j++) growth[j] = 1 + (factor - 1) * shares[j];
     mhe_grow(P, root, growth, larger, larger_root);
     mhe_predict_outputs(s, stage, seen, larger, root ? larger_root : 0, cross, spread);
@@ -511,12 +579,12 @@ static int mhe_explain(const mhe_settings *s, const mhe_stage *stage, const mhe_
                        const real *spread, int known_count, int k)
 {
     const int size = sensors->size[k], *part = sensors->at[k];
-    real shares[NX], larger[NY * NY], factor = 1;
+    real shares[NX], wider[NX * NX], wider_root[NX * NX], larger[NY * NY], factor = 1;
     int alone = 0;
-    mhe_find_shares(seen, size, part, P, cross, spread, shares);
+    mhe_find_shares(s, stage, seen, size, part, P, root, cross, spread, shares);
     for (int i = 0; !alone && i < MHE_MOST_GROWTH; i++) {
         factor *= MHE_GROWTH;
-        mhe_spread_grown(s, stage, seen, P, root, shares, factor, larger);
+        mhe_spread_grown(s, stage, seen, P, root, shares, factor, wider, wider_root, larger);
         alone = 1;
         for (int l = 0; l < size; l++) {
             const int at = part[l] * seen->count + part[l];
@@ -526,9 +594,9 @@ static int mhe_explain(const mhe_settings *s, const mhe_stage *stage, const mhe_
     }
     if (!alone) return 0;
     factor *= MHE_GROWTH;
-    mhe_spread_grown(s, stage, seen, P, root, shares, factor, larger);
-    if (!(mhe_distance(seen, larger, known_count, sensors->known, size, part) <=
-          s->innovation.limits[size - 1]))
+    mhe_spread_grown(s, stage, seen, P, root, shares, factor, wider, wider_root, larger);
+    if (!(mhe_distance(s, stage, seen, wider, root ? wider_root : 0, larger, known_count,
+                       sensors->known, size, part) <= s->innovation.limits[size - 1]))
         return 0;
     if (MHE_INNOVATION != MHE_GATED) factor = MHE_GROWTH;
     for (int j = 0; j < NX; j++)
@@ -552,8 +620,9 @@ static int mhe_test(const mhe_settings *s, const mhe_stage *stage, const mhe_see
     for (int k = 0; k < MHE_SENSORS; k++) {
         const int size = sensors->size[k];
         const int32_t before = stage->rejections[k];
-        sensors->passes[k] = !size || mhe_distance(seen, spread, 0, 0, size, sensors->at[k]) <=
-                                          s->innovation.limits[size - 1];
+        sensors->passes[k] =
+            !size || mhe_distance(s, stage, seen, P, root, spread, 0, 0, size, sensors->at[k]) <=
+                         s->innovation.limits[size - 1];
         next[k] = !size ? before : sensors->passes[k] ? 0 : before + (before < INT32_MAX);
         if (!sensors->passes[k] && before >= reopen) {
             doubted += size;
