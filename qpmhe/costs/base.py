@@ -115,7 +115,9 @@ class ObserverPrior:
     With D the standard deviations and C the correlations of a covariance, its inverse is
     :math:`D^{-1} C^{-1} D^{-1}`, where eigenvalues of C below 1e-12, which are rounding, are raised
     to 1e-12, or to 3e-9 if the disturbance has fewer directions than the state, so that C may be
-    singular. States that are known exactly in P(0) count with the typical variance of
+    singular. Where a Kalman filter continues from a root of its covariance, and the window's data
+    determine what a vague prior leaves open, the weight comes from this root instead, unraised.
+    States that are known exactly in P(0) count with the typical variance of
     `Cost.prior_variances` in the bounds.
 
     Parameters
