@@ -216,7 +216,7 @@ class _Bound:
 
     def _traced(self, where: Points) -> Traced | None:
         """The expression of g, if it has one that gives the same."""
-        found = traced(of_both(self.function), (self._d, self._inputs), where, name="g")
+        found = traced(of_both(self._user[0]), (self._d, self._inputs), where, name="g")
         has_values = found.function is not None and found.function.numel_out(0) == self.size
         return found if has_values else None
 

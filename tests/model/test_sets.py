@@ -211,3 +211,39 @@ def test_bad_input_is_refused():
     for make_it, error, text in WRONG:
         with np.errstate(all="ignore"), pytest.raises(error, match=re.escape(text)):
             make_it()
+
+
+@pytest.mark.parametrize("penalty", [{}, {"quadratic": 20.0}], ids=["hard", "soft"])
+def test_a_constraint_is_evaluated_as_an_expression_where_it_has_one(penalty):
+    """With the values and derivatives of the function, also with sensors missing."""
+    def g(x, v):
+        return x[0] - 1.1 + 0.1 * v[0] * x[1]
+
+    def written(x, v):
+        np.isnan(x)  # has no form in CasADi
+        return g(x, v)
+
+    one, other = (make({"constraints": [Constraint(each, **penalty)]}) for each in (g, written))
+    own = one._engine.system.constraints
+    assert own.is_traced
+    assert not other._engine.system.constraints.is_traced
+    np.testing.assert_array_equal(own._touched, [[True, False]])  # of v
+    for t, y in enumerate(record(16)):
+        y = np.where([t % 5 == 2, False], np.nan, y)
+        found, expected = one.update(y), other.update(y)
+        np.testing.assert_allclose(found.trajectory, expected.trajectory, 0.0, 1e-5)
+        assert found.cost == pytest.approx(expected.cost, rel=1e-5)
+        assert found.cost <= found.candidate_cost
+
+
+def test_a_constraint_that_changes_is_found():
+    most = [1.1]
+    mhe = make({"constraints": [Constraint(lambda x: x[0] - most[0])]})
+    ys = record(24)
+    mhe.run(ys[:6])
+    most[0] = 0.7
+    words = r"constraints\[0\] has changed since it was traced"
+    with pytest.warns(qpmhe.errors.EngineWarning, match=words):
+        mhe.run(ys[6:])
+    assert mhe.time == 24
+    assert not mhe._engine.system.constraints.is_traced
