@@ -154,17 +154,6 @@ static real mhe_stage_cost(const mhe_settings *s, const mhe_workspace *k, const 
            mhe_lost(&s->noise_loss, mhe_v_widening(k), NY, stage->noise_weight, v);
 }
 
-/* The root of the prior's weight, where it has one. */
-static const real *mhe_root_of_prior(const mhe_prior *prior)
-{
-#if MHE_PRIOR_ROOTS
-    return prior->root;
-#else
-    (void)prior;
-    return 0;
-#endif
-}
-
 #if MHE_PRIOR_ROOTS
 /* a' W a; |R a|^2 where W has a root R: no digits cancel then. */
 static real mhe_rooted_form(const real *root, const real *W, const real *a)

@@ -143,6 +143,17 @@ static void mhe_set_roots(mhe_estimator *e, mhe_workspace *k, int i)
     mhe_root(NY, V, k->noise_root);
 }
 
+/* The root of the prior's weight, where it has one. */
+static const real *mhe_root_of_prior(const mhe_prior *prior)
+{
+#if MHE_PRIOR_ROOTS
+    return prior->root;
+#else
+    (void)prior;
+    return 0;
+#endif
+}
+
 /* The gradient, in the increments as if all of them were free, around a trajectory that starts at
  * the given offset from the prior; and the root of the first state's weight. */
 static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)

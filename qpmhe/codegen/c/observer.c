@@ -485,7 +485,7 @@ static real mhe_distance(const mhe_settings *s, const mhe_stage *stage, const mh
                          const int *known, int count, const int *part)
 {
     const int size = known_count + count;
-    real S[NY * NY], white[NY], sum = 0;
+    real S[NY * NY], white[NY] = {0}, sum = 0; /* compilers cannot tell */
     int at[NY];
     for (int i = 0; i < size; i++) at[i] = i < known_count ? known[i] : part[i - known_count];
     for (int i = 0; i < size; i++) {
