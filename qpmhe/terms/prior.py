@@ -161,7 +161,9 @@ class PriorCost:
         """The prior of a window."""
         prior = Prior(self, view)
         if self.follows and (covariance := window.prior_covariance) is not None:
-            prior.set_weight(self.weights(covariance, window.prior_root, window.last_covariance))
+            root = window.prior_root
+            later = None if root is None else window.last_covariance
+            prior.set_weight(self.weights(covariance, root, later))
         if self.discounted:
             prior.factor = float(window.discounts[0])
         if window.smoothed_prior is not None:
