@@ -405,7 +405,8 @@ class Model:
         if not self.names:
             return replace(self, functions=self.written)
         assert self.trace is not None
-        evaluator = self.trace.evaluator(self.system.origin.is_timed)
+        # A system with steps of another length has a trace of its own, or that of the usual one.
+        evaluator = self.trace.evaluator(timed=self.system.m > self.trace.m)
         return replace(self, functions=self.written.evaluated_by(evaluator, self.names))
 
     def at(self, x: Array, u: Array) -> Model:

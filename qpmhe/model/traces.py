@@ -43,7 +43,7 @@ class Pinned:
         self, found: dict[str, Traced], n: int, p: int, m: int, dt: float | None,
         method: str | None,
     ) -> None:
-        self.found = found
+        self.found, self.m = found, m
         self._evaluators: dict[bool, Evaluator] = {}
         # True of the functions that are traced, with zeros for others.
         self._partial: CasadiModel | None = None
