@@ -221,9 +221,9 @@ class CompiledEngine:
         From an earlier memory, if there is one.
         """
         record = self._memory[0]
-        self._next_check = next_check(int(record["time"]), self._sizes[2])
         fault = self._traces.fault(record["z_end"], u)
         if not fault:
+            self._next_check = next_check(int(record["time"]), self._sizes[2])
             return
         if before is not None:
             self._memory[...] = before
