@@ -102,10 +102,10 @@ class CompiledEngine:
 
     def reset(self, initial_state: Array, system: System | None = None) -> None:
         """Forget all measurements and start at this state."""
-        if system is not None:
-            self._system = self._system.evaluated_like(system)
         tools = self._tools
         self._replace(self._library.estimators(initial_state[None], tools.record), tools)
+        if system is not None:
+            self._system, self._mirror = self._system.evaluated_like(system), None
 
     def _replace(self, memory: NDArray[Any], tools: Tools) -> None:
         """Remember this in place of all that was; whole or, if interrupted, not at all."""
