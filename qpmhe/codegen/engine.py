@@ -102,10 +102,10 @@ class CompiledEngine:
 
     def reset(self, initial_state: Array, system: System | None = None) -> None:
         """Forget all measurements and start at this state."""
-        if system is not None:
-            self._system = self._system.evaluated_like(system)
         tools = self._tools
         self._replace(self._library.estimators(initial_state[None], tools.record), tools)
+        if system is not None:
+            self._system, self._mirror = self._system.evaluated_like(system), None
 
     def _replace(self, memory: NDArray[Any], tools: Tools) -> None:
         """Remember this in place of all that was; whole or, if interrupted, not at all."""
@@ -221,9 +221,9 @@ class CompiledEngine:
         From an earlier memory, if there is one.
         """
         record = self._memory[0]
-        self._next_check = next_check(int(record["time"]), self._sizes[2])
         fault = self._traces.fault(record["z_end"], u)
         if not fault:
+            self._next_check = next_check(int(record["time"]), self._sizes[2])
             return
         if before is not None:
             self._memory[...] = before

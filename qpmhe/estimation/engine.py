@@ -19,6 +19,7 @@ from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..memory.record import Mark, Record
 from ..memory.snapshot import reading
+from ..model.derivatives import Nearby
 from ..model.residuals import difference
 from ..model.system import System
 from ..model.traces import next_check, warn_of
@@ -52,6 +53,7 @@ class Tools(NamedTuple):
 class Memory(NamedTuple):
     """All that an estimator remembers, and how it goes on from there."""
 
+    system: System
     tools: Tools
     window: Window
 
@@ -110,7 +112,7 @@ class PythonEngine:
     def _use_system(self, system: System) -> None:
         """Take a system, with a model of this engine's own, which notes what is taken nearby."""
         self._system = system = system.evaluated_by(system.evaluation.copy())
-        self._nearby = system.f_jacobian.nearby, system.h_jacobian.nearby
+        self._nearby = _nearby(system)
 
     def _with_scaled_constraints(self, initial_state: Array) -> System:
         """The system, its constraints in standard deviations of what they are functions of."""
@@ -207,17 +209,22 @@ class PythonEngine:
     def _check_trace(self, u: Array) -> None:
         """Compare trace and functions at z(t); take the functions for good where they differ."""
         window = self._window
-        self._next_check = next_check(window.time, self._settings.horizon)
         fault = self._system.fault(window.candidate[-1], u)
+        self._next_check = next_check(window.time, self._settings.horizon)
         if fault:
             self.leave_trace()
             warn_of(fault, 5)
 
     def leave_trace(self) -> None:
         """Evaluate the original functions, along the window and from now on."""
+        before = self.memory
+        try:
+            self._use_system(self._system.as_written())
+            self.set(USUAL, None)
+        except BaseException:  # an interrupt: the trace is still there, and compared again
+            self.replace(before)
+            raise
         self._next_check = math.inf
-        self._use_system(self._system.as_written())
-        self.set(USUAL, None)
 
     def _warn(self) -> None:
         text = self._watch.warning(self._window.watched)
@@ -351,15 +358,15 @@ class PythonEngine:
     def reset(self, initial_state: Array, system: System | None = None) -> None:
         """Forget all measurements and start at this state."""
         self._solver.forget()
-        before, tools = self._system, self._tools
+        before, tools = self.memory, self._tools
         try:
-            if system is not None and system.evaluation is not before.evaluation:
-                self._use_system(before.evaluated_like(system))
+            if system is not None and system.evaluation is not self._system.evaluation:
+                self._use_system(self._system.evaluated_like(system))
                 tools = self._tools_for(tools.usual)
             window = self._fresh_window(initial_state, tools)
-            self.replace(Memory(tools, window))
+            self.replace(Memory(self._system, tools, window))
         except BaseException:
-            self._use_system(before)
+            self.replace(before)
             raise
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
@@ -392,7 +399,7 @@ class PythonEngine:
     @property
     def memory(self) -> Memory:
         """What `replace` restores."""
-        return Memory(self._tools, self._window)
+        return Memory(self._system, self._tools, self._window)
 
     def replace(self, memory: Memory) -> None:
         """Replace the memory: all of it or, if interrupted, nothing."""
@@ -404,7 +411,8 @@ class PythonEngine:
             raise
 
     def _use(self, memory: Memory) -> None:
-        self._tools, self._window = memory
+        self._system, self._tools, self._window = memory
+        self._nearby = _nearby(self._system)
         self._next_check = 0 if self._system.is_traced else math.inf
 
     def adopt(
@@ -426,7 +434,7 @@ class PythonEngine:
                 window.replay(window.length)
                 if self._reinitialized and window.length:
                     window.reinitialize(window.history[window.start : window.end])
-        self.replace(Memory(tools, window))
+        self.replace(Memory(self._system, tools, window))
 
     def run(self, ys: Array, us: Array | None) -> None:
         """None: this engine only takes one sample at a time."""
@@ -509,4 +517,8 @@ class PythonEngine:
         if window.has_terms and not with_terms:
             with np.errstate(all="ignore"):
                 window.restate()
-        return Memory(tools, window)
+        return Memory(self._system, tools, window)
+
+
+def _nearby(system: System) -> tuple[Nearby, Nearby]:
+    return system.f_jacobian.nearby, system.h_jacobian.nearby

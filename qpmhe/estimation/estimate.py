@@ -118,9 +118,10 @@ _TEXTS = {
         "'auto'; or in place of a loss with a kink, as Power(1), a Huber loss."
     ),
     Status.OBSERVER_RESET: (
-        "The observer's covariance was lost: it was not finite, or not positive semidefinite. The "
-        "observer predicted without the sample (a constant gain corrected), and its covariance is "
-        "the initial one again. Bound the states, or scale the model: no derivative is huge then."
+        "The observer's covariance was lost: it was not finite or not positive semidefinite, or "
+        "the model had no value at a sigma point. The observer predicted without the sample (a "
+        "constant gain corrected), and its covariance is the initial one again. Bound the states, "
+        "or scale the model: no derivative is huge then."
     ),
     Status.DERIVATIVE_NEARBY: (
         "A derivative of the model, or its square, is not finite where it was needed; its row was "

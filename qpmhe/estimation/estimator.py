@@ -211,6 +211,7 @@ class MovingHorizonEstimator:
         # The system as this estimator evaluates it.
         self._initial_state: Array
         self._initial_state, self._own_system = self._checked_start(initial_state, own)
+        self._first_state = self._initial_state  # which `reset` does not change
         if not is_copy:
             check_correction(
                 self._own_system, observer, cost, self._initial_state, self._usual_input
@@ -771,6 +772,7 @@ class MovingHorizonEstimator:
         return {
             "arguments": (self.system, self.observer, self.cost),
             "settings": self.settings,
+            "first_state": self._first_state,
             "initial_state": self.initial_state,
             "engine": self.engine,
             "state": self.state_dict(),
@@ -781,10 +783,14 @@ class MovingHorizonEstimator:
         options = vars(saved["settings"]) | {"engine": saved["engine"]}
         self.settings = saved["settings"]  # what the first construction warned of is known
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
-            *saved["arguments"], initial_state=saved["initial_state"], **options
+            *saved["arguments"], initial_state=saved["first_state"], **options
         )
         self.settings = saved["settings"]
         self.load_state_dict(saved["state"])
+        if not np.array_equal(saved["initial_state"], saved["first_state"]):
+            # How the model is called and scaled depends on both; X is that of `set` by now.
+            self.reset(saved["initial_state"])
+            self.load_state_dict(saved["state"])
 
 
 _UPDATE = MovingHorizonEstimator.update.__code__

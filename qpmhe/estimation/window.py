@@ -424,6 +424,7 @@ class Window(Record):
             small = np.abs(y) < LARGEST
             if not small.all():  # a huge component may be the reason: without it
                 self._advanced_to = min(self._advanced_to, time)
+                self.unusual = True
                 self.is_observed[k] = observed = small
                 self._set_weight(k, time)
                 cost = self._evaluate_stage(k, time, observed)
@@ -491,6 +492,7 @@ class Window(Record):
         """Mark the missing components of y at stage k; return which are there, or None for all."""
         y = self._stage_views[k].y
         if not math.isfinite(y.dot(y)):
+            self.unusual = True  # first: `roll_back` makes usual again what an interrupt leaves
             self.is_observed[k] = np.abs(y) < LARGEST  # False for NaN, too
             self._set_weight(k, time)
         elif not self.unusual or False not in self.is_observed[k].tolist():

@@ -179,3 +179,28 @@ def test_an_interrupted_step_was_not_taken(name, stride):
             np.testing.assert_array_equal(mhe.covariances(), twin.covariances())
         if t in actions:
             both(actions[t])
+
+
+@pytest.mark.parametrize("missing", [np.nan, 1e200])
+def test_an_interrupt_leaves_no_missing_components_behind_the_window(missing):
+    class Interrupting(qpmhe.QuadraticCost):
+        is_ready = False
+
+        def partial_weight(self, *arguments):
+            if self.is_ready:
+                self.is_ready = False
+                raise KeyboardInterrupt
+            return super().partial_weight(*arguments)
+
+    cost = Interrupting(prior=1.0, disturbance=10.0, noise=np.eye(2))
+    mhe, twin = (
+        qpmhe.MovingHorizonEstimator(
+            qpmhe.System(lambda x: 0.9 * x, lambda x: np.repeat(x, 2), n=1, p=2),
+            qpmhe.Luenberger([[0.3, 0.1]]), cost, horizon=5, initial_state=[1.0],
+        ) for _ in range(2)
+    )
+    cost.is_ready = True
+    with pytest.raises(KeyboardInterrupt):
+        mhe.update([missing, 1.0])
+    for y in ([1.0, 1.0], [1.0, np.nan]):
+        assert_same(mhe.update(y), twin.update(y))

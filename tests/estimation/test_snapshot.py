@@ -1,5 +1,6 @@
 """Snapshots continue bit for bit, and those of other estimators or damaged ones are refused."""
 
+import copy
 import json
 import pickle
 
@@ -337,3 +338,40 @@ def test_a_loss_with_other_values_is_another():
     assert same_loss.time == 6
     with pytest.raises(InvalidInputError, match=r"another cost \(its values\)"):
         another.load_state_dict(one.state_dict())
+
+
+def square_of(value):
+    return qpmhe.Box([-value] * 2, [value] * 2)
+
+
+@pytest.mark.parametrize("form", ["traced", "opaque"])
+def test_a_copy_after_set_and_reset_goes_on_as_the_estimator(form):
+    """It has the new initial state, and calls and scales the model as the original does."""
+    def f(x):
+        x = x if form == "traced" else [float(one) for one in x]
+        return np.stack([0.9 * x[0] + 0.1 * np.sin(x[1]), 0.8 * x[1] + 0.1 * x[0]])
+
+    def g(x, v):
+        return x[0] ** 2 + v[0] - 4.5
+
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(
+            f, lambda x: x[0] + 0.1 * x[1] ** 2, n=2, p=1, states=square_of(1.0),
+            constraints=[qpmhe.Constraint(g)],
+        ),
+        qpmhe.Luenberger([0.3, 0.1]),
+        qpmhe.QuadraticCost(prior=1e-8 * np.eye(2), disturbance=10.0 * np.eye(2), noise=20.0),
+        horizon=4, initial_state=[0.1, 0.1], max_qps=2, engine="python",
+    )
+    mhe.set(bounds={"states": square_of(3.0)})
+    mhe.reset([2.0, 0.5])
+    for y in (2.1, 1.9, 1.6):
+        mhe.update(y)
+    mhe.forget_warm_start()
+    copied = copy.deepcopy(mhe)
+    np.testing.assert_array_equal(copied.initial_state, [2.0, 0.5])
+    for y in np.random.default_rng(0).normal(1.0, 0.3, 12):
+        assert_same(copied.update(y), mhe.update(y))
+    for one in (mhe, copied):
+        one.reset()
+        np.testing.assert_array_equal(one.state, [2.0, 0.5])

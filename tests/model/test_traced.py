@@ -1,6 +1,7 @@
 """Functions of NumPy as CasADi expressions: the same numbers, or no trace and the reason."""
 
 import contextlib
+import itertools
 import math
 import warnings
 
@@ -223,6 +224,37 @@ def test_a_warning_as_an_error_takes_no_sample(engine):
         assert mhe.time == 1
         estimate = mhe.update(0.4)
     assert estimate.cost == pytest.approx(cost_by_hand(plant, estimate, [0.5, 0.4]), rel=1e-12)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_interrupt_while_a_trace_is_left_does_not_keep_it(engine):
+    """At each of the calls of f until the sample is taken."""
+    class Interrupting(Plant):
+        left = np.inf
+
+        def f(self, x):
+            self.left -= 1
+            if self.left < 0 and type(x) is np.ndarray and x.dtype == np.float64:
+                self.left = np.inf
+                raise KeyboardInterrupt
+            return super().f(x)
+
+    plant = Interrupting()
+    for calls in itertools.count():
+        plant.gain, plant.left = 0.1, np.inf
+        mhe = estimator(plant.system(), engine)
+        mhe.update(0.5)
+        plant.gain, plant.left = 0.3, calls
+        with has_changed():
+            try:
+                mhe.update(0.4)
+                break
+            except KeyboardInterrupt:
+                assert mhe.time == 1
+                estimate = mhe.update(0.4)
+        by_hand = cost_by_hand(plant, estimate, [0.5, 0.4])
+        assert estimate.cost == pytest.approx(by_hand, rel=1e-12)
+    assert calls > 4
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
