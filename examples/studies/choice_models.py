@@ -6,7 +6,6 @@ here is a model of its own each, ``choice_models.py:observed(model='cstr', obser
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -88,9 +87,7 @@ def without_states(model: str) -> Example:
         Its name in the catalogue.
     """
     example = catalogue()[model]()
-    system = copy.copy(example.system)
-    system.states = None
-    return example._replace(system=system)
+    return example._replace(system=example.system.with_sets({"states": None}))
 
 
 def one_sided(model: str, known: bool) -> Example:
@@ -105,8 +102,7 @@ def one_sided(model: str, known: bool) -> Example:
     """
     example = catalogue()[model]()
     n = example.system.n
-    bounded = copy.copy(example.system)
-    bounded.disturbances = qpmhe.Box(np.zeros(n), np.full(n, np.inf))
+    bounded = example.system.with_sets({"disturbances": qpmhe.Box(np.zeros(n), np.full(n, np.inf))})
     return example._replace(
         system=bounded if known else example.system,
         scenario=replace(example.scenario, system=bounded),

@@ -261,7 +261,7 @@ class System:
     def __setattr__(self, name: str, value: Any) -> NoReturn:
         raise AttributeError(
             f"a System does not change: {name} cannot be set. Make another one with the arguments "
-            "that it should have."
+            "that it should have, or with other sets by with_sets."
         )
 
     def __delattr__(self, name: str) -> NoReturn:
@@ -587,18 +587,20 @@ class System:
         soft = self.soft.get(name)
         return getattr(self, name) if soft is None else soft.convex
 
-    def with_sets(self, sets: Mapping[str, ConvexSet]) -> System:
-        """The same system, its functions shared, with other sides of its sets, by name."""
+    def with_sets(self, sets: Mapping[str, ConvexSet | None]) -> System:
+        """The same system, its functions shared, with other sets by name; None is no set."""
         changed: dict[str, Any] = {}
         for name, one in sets.items():
             soft = self.soft.get(name)
             if soft is None:
                 changed[name] = one
+                continue
+            others = {**changed.get("soft", self.soft)}
+            if one is None:
+                del others[name]
             else:
-                changed["soft"] = {
-                    **changed.get("soft", self.soft),
-                    name: SoftSet(one, soft.linear, soft.quadratic),
-                }
+                others[name] = SoftSet(one, soft.linear, soft.quadratic)
+            changed["soft"] = others
         return self._changed(**changed)
 
     def _check_soft_angles(self) -> None:

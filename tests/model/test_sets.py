@@ -247,3 +247,18 @@ def test_a_constraint_that_changes_is_found():
         mhe.run(ys[6:])
     assert mhe.time == 24
     assert not mhe._engine.system.constraints.is_traced
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_system_with_other_sets_leaves_the_first_as_it_is(soft):
+    box = qpmhe.Box([-1.0], [1.0])
+    given = box.soften(linear=3.0) if soft else box
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1, states=given)
+    other = system.with_sets({"states": None})
+    assert other.states is None
+    assert not other.soft
+    wider = system.with_sets({"states": qpmhe.Box([-2.0], [2.0])})
+    found = [one.soft["states"].convex if one.soft else one.states for one in (system, wider)]
+    assert [one.upper.tolist() for one in found] == [[1.0], [2.0]]
+    with pytest.raises(AttributeError, match="with_sets"):
+        system.states = None
