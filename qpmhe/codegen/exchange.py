@@ -50,6 +50,7 @@ def record_of(memory: Any, layout: Layout, directions: Directions) -> Record:
     record.start, record.end, record.time, record.unusual = 0, length, time, True
     far, dropped = memory["watched"].tolist()
     record.watched, record.last_good = (far, dropped), memory["last_good"].copy()
+    record.damping = float(memory["damping"])
     if memory["has_trajectory"]:
         record.trajectory = memory["trajectory"][: length + 1].copy()
     if memory["has_smoothed"]:
@@ -88,6 +89,7 @@ def write(memory: Any, sizes: Sizes, record: Record, own: dict[str, Any]) -> Non
         if field.rows == "state":
             memory[f"{field.name}_end"] = array[length]
     memory["watched"], memory["last_good"] = record.watched, record.last_good
+    memory["damping"] = record.damping
     memory["has_trajectory"] = record.trajectory is not None
     if record.trajectory is not None:
         memory["trajectory"][: length + 1] = record.trajectory

@@ -181,7 +181,8 @@ class _Guide:
         self.nudge = nudge
 
     def improve(
-        self, problem: Problem, shifted: Callable[[], Array | None], deadline: float = math.inf
+        self, problem: Problem, shifted: Callable[[], Array | None], deadline: float = math.inf,
+        damping: float = 0.0,
     ) -> Outcome:
         """C's trajectory, evaluated by the problem."""
         found, outcome = self.found, Outcome(problem.candidate)

@@ -204,9 +204,8 @@ def estimator_files(
     parts = (
         "algebra.c", "residuals.c", "conditions.c", "cost.c", "observer.c", "projection.c",
         "window.c", "prior.c", *(f"{term}.c" for term, _ in layout.terms), _FURTHER, "sets.c",
-        "trial.c",
-        "factor.c" if layout.free is None else "elimination.c", "budget.c", "inequalities.c",
-        "optimizer.c", "step.c",
+        "trial.c", "damping.c", "factor.c" if layout.free is None else "elimination.c",
+        "budget.c", "inequalities.c", "optimizer.c", "step.c",
     )
     single = layout.real == "float"
     further = _further_terms([term for term, _ in layout.terms])

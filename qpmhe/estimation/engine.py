@@ -237,7 +237,8 @@ class PythonEngine:
         tools = self._tools
         problem = tools.formulation.problem(window)
         deadline = math.inf if settings.time_budget is None else began + settings.time_budget
-        outcome = tools.optimizer.improve(problem, self._shifted, deadline)
+        outcome = tools.optimizer.improve(problem, self._shifted, deadline, window.damping)
+        window.damping = outcome.damping
         trial, candidate, message = outcome.trial, problem.candidate, outcome.message
         status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
         if outcome.events:

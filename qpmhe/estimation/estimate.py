@@ -41,6 +41,7 @@ class Status(enum.Flag):
     UNCONVERGED = enum.auto()
     OBSERVER_RESET = enum.auto()
     DERIVATIVE_NEARBY = enum.auto()
+    CAP_REACHED = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what to do about it, in sentences."""
@@ -53,8 +54,10 @@ _TEXTS = {
     Status.NO_QPS: "No QP was requested; raise max_qps to improve on the observer.",
     Status.CONVERGED: "The sequence of QPs converged.",
     Status.NO_DECREASE: (
-        "The last trial did not lower the true cost at any step length and was rejected; "
-        "raise max_solver_iterations or use another backend if this happens often."
+        "No step lowered the true cost, however short or damped: rounding hides what is left to "
+        "gain, or derivatives or QPs are inaccurate (or no trial satisfied the sets). If this "
+        "happens often, check the model's derivatives, raise max_solver_iterations, or use another "
+        "backend."
     ),
     Status.SOLVER_FAILED: (
         "The QP solver returned no usable iterate; see the estimate's message."
@@ -129,6 +132,10 @@ _TEXTS = {
         "inside the bounds or a tiny step aside. If this happens often, write the function so "
         "that its derivative is finite there, as sqrt(x**2 + small**2) for abs(x), or bound the "
         "states."
+    ),
+    Status.CAP_REACHED: (
+        "The last trial did not lower the true cost and was rejected, and max_qps left no QP for a "
+        "more damped step; raise max_qps if this happens often."
     ),
 }
 

@@ -29,6 +29,15 @@ STALLED = 1e3
 #: Largest number of second-order corrections of a step that leaves a curved set.
 CORRECTIONS = 2
 
+#: Damping of the first damped QP, unless an earlier rejection has left a larger one; by what it
+#: grows at the first rejection, and by twice as much at each further one; the least share of it
+#: that is left by a step as good as predicted (Nielsen, IMM-REP-1999-05), and the share that is
+#: left by a step without damping.
+DAMPING, MORE_DAMPING, LESS_DAMPING, OLD_DAMPING = 1e-4, 4.0, 1.0 / 3.0, 0.1
+
+#: With more damping than this, a step is rounding beside the one without.
+MOST_DAMPING = 1e16
+
 #: A sequence without a cap ends at this many QPs in a row that the solver, at its own cap, has not
 #: solved to its tolerance: further ones cost as much, and approach no minimum.
 PATIENCE = 3
@@ -66,7 +75,9 @@ def c_definitions(prefix: str, real: str) -> str:
         "ROUNDING": ROUNDING, "NEARLY": NEARLY, "STALLED": STALLED, "BEYOND": BEYOND,
         "FEASIBLE": FEASIBLE, "LARGEST": LARGEST, "FAR": FAR, "NEARER": NEARER,
         "NO_VARIANCE": NO_VARIANCE, "KNOWN": KNOWN, "SAME_COVARIANCE": SAME_COVARIANCE,
-        "IN_RANGE": IN_RANGE, "GROWTH": GROWTH, "VAGUE": VAGUE,
+        "IN_RANGE": IN_RANGE, "GROWTH": GROWTH, "VAGUE": VAGUE, "DAMPING": DAMPING,
+        "MOST_DAMPING": MOST_DAMPING, "MORE_DAMPING": MORE_DAMPING,
+        "LESS_DAMPING": LESS_DAMPING, "OLD_DAMPING": OLD_DAMPING,
     }
     if real == "float":
         values |= _SINGLE

@@ -18,11 +18,16 @@ from .estimate import DroppedRow, Status
 from .limits import (
     ALONG,
     CORRECTIONS,
+    DAMPING,
     FEASIBLE,
     LENGTHS,
+    LESS_DAMPING,
+    MORE_DAMPING,
+    MOST_DAMPING,
     NEARER,
     NEAREST_POINTS,
     NEARLY,
+    OLD_DAMPING,
     ROUNDING,
     STALLED,
 )
@@ -40,7 +45,7 @@ _ENDS = (
 )
 
 # What no longer holds where another sequence begins.
-_OUTDATED = Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED
+_OUTDATED = Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED | Status.CAP_REACHED
 
 
 class Outcome:
@@ -57,6 +62,8 @@ class Outcome:
         Why the sequence stopped, and what happened.
     followed : array or None
         The minimiser of a surrogate of the cost, from which the next step starts.
+    damping : float
+        The damping with which a search for a shorter step begins, at least; 0 for none.
     unsolved : int
         Number of the last QPs that were not solved to the solver's tolerance.
     dropped, message, qps, corrections, nearest_points, solver_iterations, solve_time
@@ -76,8 +83,10 @@ class Outcome:
     dropped: tuple[DroppedRow, ...] = ()
     followed: Array | None = None
 
-    def __init__(self, candidate: Trial, deadline: float = math.inf) -> None:
-        self.trial, self.deadline = candidate, deadline
+    def __init__(
+        self, candidate: Trial, deadline: float = math.inf, damping: float = 0.0
+    ) -> None:
+        self.trial, self.deadline, self.damping = candidate, deadline, damping
 
     def time_is_up(self) -> bool:
         """Whether the deadline has passed; adds it to the events."""
@@ -108,7 +117,8 @@ class Optimizer:
     """Gauss-Newton steps from the candidate, each judged by the true problem.
 
     A step that does not lower J below the best so far is shortened, and rejected if no length
-    helps. So J of the result is never above the candidate's, whatever the solver returns.
+    helps; the next QP is damped then (Levenberg and Marquardt), more and more until its step lowers
+    J. So J of the result is never above the candidate's, whatever the solver returns.
 
     Where the candidate satisfies all rows, so does the result. Where it does not, the result is
 
@@ -136,6 +146,7 @@ class Optimizer:
         problem: Problem,
         shifted: Callable[[], Array | None],
         deadline: float = math.inf,
+        damping: float = 0.0,
     ) -> Outcome:
         """Run the sequence; never raises, whatever solver and model do.
 
@@ -149,9 +160,11 @@ class Optimizer:
             candidate fails.
         deadline : float
             Time, by `time.perf_counter`, after which no QP begins.
+        damping : float
+            What the last step has left in `Outcome.damping`.
         """
         candidate = problem.candidate
-        outcome = Outcome(candidate, deadline)
+        outcome = Outcome(candidate, deadline, damping)
         feasible = candidate.violation <= FEASIBLE
         if not feasible:
             outcome.events |= Status.CANDIDATE_OUTSIDE
@@ -245,7 +258,8 @@ class Optimizer:
         Any trajectory is an estimate that (i) satisfies the constraints, and (ii) has a cost J no
         greater than the candidate's (eq:estimator). The candidate itself is the first one. Each QP,
         built around the best trajectory so far, leads to trials; the true problem gives those that
-        violate (i) an infinite J, and the first trial whose J is lower is the next best.
+        violate (i) an infinite J, and the first trial whose J is lower is the next best. Where
+        there is none, the next QP is around the same trajectory, and damped.
         """
         best = outcome.trial
         if start is not None:
@@ -255,14 +269,20 @@ class Optimizer:
         outcome.unsolved = 0
         if outcome.events:
             outcome.events &= ~Status.UNCONVERGED
+        damping, growth, qp = 0.0, MORE_DAMPING, None
+        # Second-order corrections and searches for feasible points overwrite a QP with rows.
+        kept = not (problem.constrained or self._extended)
         for _ in range(limit):
             if outcome.time_is_up():
                 return
-            qp = self._subproblem.at(problem, best)
+            if not (damping and kept):
+                qp = self._subproblem.at(problem, best)
             if qp is None:
                 outcome.events |= Status.MODEL_FAILED
                 outcome.message = self._subproblem.failure
                 return
+            if damping:
+                self._subproblem.damp(qp, problem, best, damping)
             solution = self._solution(qp, outcome)
             if solution is None:
                 return
@@ -284,16 +304,33 @@ class Optimizer:
                 predicted = abs(float(np.vdot(qp.gradient, step)))
             # At a minimum no step lowers J by more than rounding: it is not shortened.
             useless, target = solved and predicted <= negligible, _target(best)
-            for trial in self._trials(problem, qp, outcome, step, useless):
+            shorten = not (useless or damping)
+            for trial in self._trials(problem, qp, outcome, step, not useless, shorten):
                 if trial.cost < target:
                     break
             if not trial.cost < target:
                 little = problem.rounding_cost(best) if best.cost < math.inf else -1.0
-                at_minimum = solved and predicted <= max(STALLED * negligible, little)
-                outcome.events |= Status.CONVERGED if at_minimum else Status.NO_DECREASE
                 outcome.message = problem.failure(trial)
-                return
+                if not damping and solved and predicted <= max(STALLED * negligible, little):
+                    outcome.events |= Status.CONVERGED
+                    return
+                # Rounding hides a decrease this small, and more damping predicts less.
+                if best.cost == math.inf or damping > MOST_DAMPING or (
+                    (solved or damping) and not predicted > max(ROUNDING * best.cost, little)
+                ):
+                    outcome.events |= Status.NO_DECREASE
+                    outcome.damping = 0.0
+                    return
+                if damping:
+                    outcome.damping, growth = growth * damping, 2.0 * growth
+                damping = max(outcome.damping, DAMPING)
+                continue
             outcome.trial, before, best = trial, best, trial
+            if damping:
+                outcome.damping = damping * _share_left(before.cost - best.cost, predicted)
+                outcome.message, damping, growth = "", 0.0, MORE_DAMPING
+                continue
+            outcome.damping *= OLD_DAMPING
             if solved and before.cost - best.cost <= negligible:
                 outcome.events |= Status.CONVERGED
                 return
@@ -304,6 +341,8 @@ class Optimizer:
                     f"its tolerance{f': {solution.message}' if solution.message else ''}."
                 )
                 return
+        if damping and not self._uncapped:
+            outcome.events |= Status.CAP_REACHED
 
     def _feasible_near(self, problem: Problem, outcome: Outcome, trial: Trial) -> Trial:
         """A feasible trajectory near an infeasible one, by QPs in the metric of the Hessian.
@@ -329,11 +368,11 @@ class Optimizer:
         return nearest if nearest.cost < math.inf else trial
 
     def _trials(
-        self, problem: Problem, qp: QP, outcome: Outcome, step: Array, useless: bool
+        self, problem: Problem, qp: QP, outcome: Outcome, step: Array, correct: bool, shorten: bool
     ) -> Iterator[Trial]:
         """The trials that a step leads to, one after the other until one is accepted.
 
-        First the full step; then, unless it is ``useless``, corrected ones and shorter ones.
+        First the full step; then, if asked for, corrected ones and shorter ones.
         """
         best = outcome.trial
         full = self._trial(problem, best, step)
@@ -346,14 +385,14 @@ class Optimizer:
             if full.violation <= NEARLY:
                 yield self._trial(problem, best, LENGTHS[0] * step)
             # If the shortened step leaves the set, too, curvature is the reason.
-            if not useless:
+            if correct:
                 trial = self._correct(problem, qp, outcome, full)
                 yield self._feasible_near(problem, outcome, trial)
-        elif bent and not useless:
+        elif bent and correct:
             yield self._correct(problem, qp, outcome, full)
         # From outside, a full step ends as a rule on the boundary of the linearised sets: shorter
         # ones stay outside.
-        if useless or best.violation > FEASIBLE:
+        if not shorten or best.violation > FEASIBLE:
             return
         for length in LENGTHS:
             yield (trial := self._trial(problem, best, length * step))
@@ -418,6 +457,12 @@ class Optimizer:
     def _trial(problem: Problem, best: Trial, step: Array) -> Trial:
         trajectory = best.trajectory + step
         return problem.evaluate(problem.clipped(trajectory) if problem.constrained else trajectory)
+
+
+def _share_left(decrease: float, predicted: float) -> float:
+    """The share of a damping that is left after a step that has lowered J."""
+    missed = 2.0 * min(decrease / predicted, 1.0) - 1.0 if predicted > 0.0 else 1.0
+    return max(LESS_DAMPING, 1.0 - missed * missed * missed)
 
 
 def _target(best: Trial) -> float:

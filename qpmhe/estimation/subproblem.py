@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import QP, Solution
+from qpmhe_solvers.qp import band_of
 
 from ..model.functions import raised_along
 from ..model.residuals import difference
 from ..model.system import System
 from ..terms.base import QuadraticModel, Trial
+from ..terms.information import window_information
 from ..terms.linearization import Span, StageTerms
 from ..terms.rows import Rows
 from ..terms.soft import BEYOND, Penalties
+from ..terms.sum import weight_of_first
 from .constraints import Constraints
 from .problem import Problem
 
@@ -23,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 class Subproblem:
-    """Gauss-Newton QPs in the increments d of a trajectory.
+    r"""Gauss-Newton QPs in the increments d of a trajectory.
 
     The objective is half of J with linearised residuals (see `StageTerms`): its gradient
     at d = 0 is that of J/2, its Hessian the Gauss-Newton one. Sets become
@@ -35,6 +39,12 @@ class Subproblem:
 
     Soft rows are not among them: `softened` adds these, with slack variables, where a solution
     without them violates one.
+
+    `damp` adds :math:`\tfrac\mu2 (|d_0|_D^2 + \sum_i |d_{i+1} - A_i d_i|_{Q_i}^2)` to the
+    objective: it rescales the weights of the prior and of the disturbances, has no unit, and leaves
+    the gradient at d = 0. D is the diagonal of what prior and data say about d_0 where the
+    disturbances are free (Marquardt's scaling, SIAM Journal on Applied Mathematics 11, 1963, of the
+    condensed problem): it does not grow with Q, as the diagonal of the QP's Hessian does.
 
     There is one QP, of the present window length; each use overwrites it.
     """
@@ -65,6 +75,11 @@ class Subproblem:
         # Multipliers of the nonlinear constraints in the last QP of the sequence, (K + 1, T).
         self._forces: Array | None = None
         self._qp: QP | None = None
+        # Its band without damping, once it has been damped; and the band of the damping, with the
+        # trial around which that is.
+        self._undamped: Array | None = None
+        self._damping: Array
+        self._damped_trial: Trial | None = None
         #: Why `at` returned None the last time.
         self.failure = ""
         self._model: QuadraticModel  # of the present QP
@@ -97,6 +112,38 @@ class Subproblem:
         linear[:, :, 0] = trial.residuals
         terms.set_all(count, trial.weights)
         return self._assemble(problem, trial, Span(terms, 0, count), False)
+
+    def damp(self, qp: QP, problem: Problem, trial: Trial, mu: float) -> None:
+        """Give the QP that is around a trial this much damping."""
+        if self._damped_trial is not trial:
+            self._damping, self._damped_trial = self._damping_band(problem, trial), trial
+        if self._undamped is None:
+            self._undamped = qp.band.copy()
+        np.multiply(self._damping, mu, out=qp.band)
+        qp.band += self._undamped
+
+    def _damping_band(self, problem: Problem, trial: Trial) -> Array:
+        """The band that a damping of 1 adds."""
+        n, minus = self._n, self._minus_jacobian
+        count = len(minus)
+        weights = np.broadcast_to(trial.weights, (count, *trial.weights.shape[-2:]))
+        a, c, q = -minus[:, :n], minus[:, n:], weights[:, :n, :n]
+        weighted = q @ a
+        columns = np.concatenate((a.transpose(0, 2, 1) @ weighted, -weighted), axis=1)
+        band = np.zeros((count + 1, n, 2 * n))
+        band[:-1] = band_of(columns)
+        band[1:] += band_of(q)
+        basis = problem.constraints.basis
+        information = weight_of_first(problem.terms, trial).diagonal()
+        with suppress(np.linalg.LinAlgError):
+            eyes = np.broadcast_to(basis.T, (count, *basis.T.shape))
+            spread = basis @ np.linalg.solve(basis.T @ q @ basis, eyes)
+            seen = c.transpose(0, 2, 1) @ weights[:, n:, n:] @ c
+            found = information + window_information(a, seen, spread).diagonal()
+            if np.isfinite(found).all():
+                information = found
+        band[0, :, 0] += information
+        return band
 
     def nearest_point(self, problem: Problem, trial: Trial) -> QP | None:
         """The QP for the nearest trajectory that satisfies the linearised sets; None as in `at`.
@@ -194,6 +241,7 @@ class Subproblem:
 
     def _assemble(self, problem: Problem, trial: Trial, span: Span, is_candidate: bool) -> QP:
         stages, qp = len(trial.trajectory), self._qp
+        self._undamped = None
         if qp is None or qp.stages != stages:
             qp = self._new_qp(stages)
         self._minus_jacobian, functions, slopes = span.minus_jacobian, self._functions, None

@@ -341,7 +341,7 @@ class Window(Record):
             self.rows[field.name][0] = kept[field.name][0]
         self.last_good, self.last_good_covariance = other.last_good_before(other.start)
         self.smoothed_prior, self.trusted = other.smoothed_prior, other.trusted
-        self.watched = other.watched
+        self.watched, self.damping = other.watched, other.damping
         if self.metric is not None and other.metric is not None:
             self.metric.state = other.metric.state
         self.own = {time: own.without(changes) for time, own in other.own.items()}

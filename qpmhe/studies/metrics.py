@@ -13,8 +13,8 @@ from ..estimation.run import Run
 from ..model.residuals import Residual, difference
 
 _FAILURES = (
-    Status.SOLVER_FAILED | Status.NO_DECREASE | Status.MODEL_FAILED | Status.FAILED_STAGE
-    | Status.CANDIDATE_OUTSIDE | Status.TIME_UP
+    Status.SOLVER_FAILED | Status.NO_DECREASE | Status.CAP_REACHED | Status.MODEL_FAILED
+    | Status.FAILED_STAGE | Status.CANDIDATE_OUTSIDE | Status.TIME_UP
 )
 
 

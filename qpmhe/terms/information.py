@@ -15,12 +15,14 @@ def window_information(
 ) -> Array:
     """Information of the windows' data on their first states, (..., n, n).
 
-    ``transitions`` and ``information`` are, stage by stage, those of `observability`, (..., n, n).
+    ``transitions`` and ``information`` are, stage by stage, those of `observability`, (..., n, n);
+    ``disturbance`` is the covariance (n, n) of all stages' disturbances, or one of each.
     """
-    eye = np.eye(len(disturbance))
+    eye, each = np.eye(disturbance.shape[-1]), disturbance.ndim > 2
     found = np.zeros_like(information[0])
     for k in range(len(transitions) - 1, -1, -1):
-        later = np.linalg.solve(eye + found @ disturbance, found)
+        spread = disturbance[k] if each else disturbance
+        later = np.linalg.solve(eye + found @ spread, found)
         found = information[k] + transitions[k].swapaxes(-1, -2) @ later @ transitions[k]
         found = 0.5 * (found + found.swapaxes(-1, -2))
     return found

@@ -231,6 +231,24 @@ static void mhe_root(int n, const real *M, real *out)
     }
 }
 
+/* later = (M^-1 + W)^-1 = S (I + S' W S)^-1 S' for an information M = S S' and a covariance W:
+ * nothing is subtracted. The matrices between are scratch. */
+static void mhe_through_disturbance(int n, const real *M, const real *W, real *root, real *moved,
+                                    real *inner, real *later)
+{
+    mhe_root(n, M, root);
+    mhe_multiply(n, n, n, root, W, moved);
+    mhe_multiply_transposed(n, n, n, moved, root, inner);
+    for (int j = 0; j < n; j++) inner[j * n + j] += 1;
+    memcpy(moved, root, sizeof(real) * (size_t)(n * n));
+    if (mhe_decompose(n, inner))
+        mhe_solve_for(n, inner, n, moved);
+    else
+        moved[0] = NAN;
+    for (int j = 0; j < n * n; j++) later[j] = 0;
+    mhe_add_product(n, n, n, root, moved, later);
+}
+
 #if defined(__GNUC__)
 #pragma GCC diagnostic pop
 #endif

@@ -12,10 +12,8 @@
 #define COLUMNS MHE_COLUMNS
 #define EQUATIONS MHE_EQUATIONS
 
-/* Discounts below it are taken for it; the cost has them as they are, and cannot tell. */
-#define LEAST_FACTOR (sizeof(real) == 8 ? (real)1e-280 : (real)1e-27)
-
-static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACTOR : factor; }
+/* Shorter columns are zeros: the inverse of their square would not be finite. */
+#define LEAST_NORM (sizeof(real) == 8 ? (real)1e-150 : (real)1e-18)
 
 /* Entry c of the row that reflection j has made. */
 static real mhe_entry(const mhe_block *b, int j, int c)
@@ -50,7 +48,7 @@ static int mhe_reflect(mhe_block *b, int j, int c)
         if (fabs(value) > largest) largest = fabs(value), at = i;
     }
     const real norm = sqrt(mhe_sum_of_products(last - j, mirror + j, mirror + j));
-    if (norm == 0) return 0; /* not where it is NaN */
+    if (norm < LEAST_NORM) return 0; /* not where it is NaN */
     b->lead[j] = c;
     b->other[j] = at;
     if (at != j) {
@@ -174,6 +172,8 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         mhe_times(NX, first, offset, k->gradient);
     mhe_add_further(e, k, factor, first, NX);
     memcpy(k->prior_gradient, k->gradient, sizeof k->prior_gradient);
+    for (int j = 0; k->damping > 0 && j < NX; j++)
+        first[j * NX + j] += k->damping * (first[j * NX + j] + k->seen[j]);
     mhe_root(NX, first, k->prior_root);
 #if MHE_PRIOR_ROOTS
     if (root) {
@@ -271,7 +271,8 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
                                    stage->has_own_noise || !stage->is_complete;
             if (is_special || !is_usual) mhe_set_roots(e, k, i);
             is_usual = !is_special;
-            for (int j = 0; j < MHE_FREE * MHE_FREE; j++) root[j] = next * k->free_root[j];
+            const real damped = next * sqrt(1 + k->damping);
+            for (int j = 0; j < MHE_FREE * MHE_FREE; j++) root[j] = damped * k->free_root[j];
             for (int j = 0; j < NY * NY; j++) noise[j] = next * k->noise_root[j];
             for (int r = 0; r < MHE_FREE; r++) {
                 real *row = b->rows + r * COLUMNS;
@@ -358,7 +359,8 @@ static void mhe_set_targets(mhe_estimator *e, mhe_workspace *k, const real *step
         for (int c = 0; c < MHE_FREE; c++) free_part[c] = mhe_dot(NX, s->free_inverse + c * NX, w);
         for (int j = 0; j < NX; j++) {
             drift[j] = s->shift[j] - w[j] + mhe_dot(MHE_FREE, s->free + j * MHE_FREE, free_part);
-            w[j] = moved[j] + drift[j] + (nearest ? 0 : k->around->w[i * NX + j]);
+            w[j] = (moved[j] + drift[j]) * (1 + k->damping) +
+                   (nearest ? 0 : k->around->w[i * NX + j]);
         }
         mhe_times(NX, Q, w, weighed);
         for (int c = 0; c < MHE_FREE; c++) target[c] = 0;

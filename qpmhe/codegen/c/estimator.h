@@ -340,6 +340,7 @@ typedef struct {
     const mhe_terms *at[MHE_HORIZON]; /* the terms of the present QP */
     mhe_real factors[MHE_HORIZON + 1]; /* discounts: of the prior, then of each stage */
     mhe_prior prior;
+    mhe_real damping, seen[MHE_NX];   /* of the present QP; and what the data say about its d(0) */
 #if MHE_ROLLED
     mhe_block blocks[MHE_HORIZON + 1];
     mhe_block start;                  /* of the first state alone */

@@ -6,15 +6,22 @@
 
 #define WIDTH MHE_PANEL_WIDTH
 
-/* Discounts below it are taken for it in the Hessian, which is singular without them; the cost
- * has them as they are, and cannot tell. */
-#define LEAST_FACTOR (sizeof(real) == 8 ? (real)1e-280 : (real)1e-27)
-
 /* The ridge of a Hessian that is singular up to rounding, as shares of its diagonal and of the weights'
  * that losses have not touched: above rounding, and far below what a useful step depends on. */
 #define RIDGE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-4)
 
-static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACTOR : factor; }
+/* Add damping to the panel of a stage: mu A' Q A and -mu A' Q. */
+static void mhe_damp_stage(real mu, const mhe_terms *t, real *panel)
+{
+    for (int r = 0; r < NX; r++) {
+        real *row = panel + r * WIDTH;
+        for (int l = 0; l < NX; l++) {
+            const real value = mu * t->coupling[r * NX + l];
+            row[NX + l] += value;
+            for (int c = 0; c < NX; c++) row[c] -= value * t->f_jacobian[l * NX + c];
+        }
+    }
+}
 
 /* Fill panels and gradient from the terms in workspace->at, around a trajectory that starts
  * at the given offset from the prior. */
@@ -25,6 +32,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     const real *factors = k->factors;
     real prior_scale[NX];
     mhe_set_scale(&s->prior_loss, 1, NX, k->prior.weight, offset, prior_scale);
+    const real mu = k->damping;
     for (int i = 0; i <= count; i++) {
         real *panel = k->panels + i * NX * WIDTH, *g = k->gradient + i * NX;
         const real *weight = i == 0 ? k->prior.weight
@@ -44,6 +52,12 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         } else {
             for (int j = 0; j < NX; j++) g[j] = factor * k->at[i - 1]->following[j];
         }
+        if (mu > 0)
+            for (int r = 0; r < NX; r++) {
+                real *row = panel + r * WIDTH;
+                if (i == 0) row[r] += mu * (row[r] + k->seen[r]);
+                else for (int c = 0; c < NX; c++) row[c] += mu * row[c];
+            }
         if (i == count) break;
         const mhe_terms *t = k->at[i];
         const real next = mhe_floored(factors[i + 1]);
@@ -55,6 +69,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
             }
             g[r] += next * t->own[r];
         }
+        if (mu > 0) mhe_damp_stage(mu * next, t, panel);
     }
     for (int i = 0; k->has_ridge && i <= count; i++) {
         const real *weight = i == 0 ? k->prior.weight

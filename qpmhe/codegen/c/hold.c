@@ -19,18 +19,8 @@ static void mhe_window_information(mhe_estimator *e, real *M)
         for (int r = 0; r < NY; r++)
             for (int c = 0; c < NX; c++)
                 C[r * NX + c] = stage->terms.h_jacobian[r * NX + c] * unit[c];
-        /* (M^-1 + W)^-1 = S (I + S' W S)^-1 S' for M = S S': nothing is subtracted. */
-        mhe_root(NX, M, root);
-        mhe_multiply(NX, NX, NX, root, hold->spread, moved);
-        mhe_multiply_transposed(NX, NX, NX, moved, root, inner);
-        for (int j = 0; j < NX; j++) inner[j * NX + j] += 1;
-        memcpy(moved, root, sizeof moved);
-        if (mhe_decompose(NX, inner))
-            mhe_solve_for(NX, inner, NX, moved);
-        else
-            moved[0] = NAN;
-        for (int j = 0; j < NX * NX; j++) later[j] = M[j] = 0;
-        mhe_add_product(NX, NX, NX, root, moved, later);
+        mhe_through_disturbance(NX, M, hold->spread, root, moved, inner, later);
+        for (int j = 0; j < NX * NX; j++) M[j] = 0;
         mhe_multiply(NX, NX, NX, later, A, moved);
         mhe_add_product(NX, NX, NX, A, moved, M);
         mhe_multiply(NY, NY, NX, stage->noise_weight, C, weighted);

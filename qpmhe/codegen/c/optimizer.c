@@ -11,12 +11,15 @@ typedef struct {
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
     int unsolved;   /* the last QPs that were not solved to the tolerance */
     int followed;   /* the next step starts from a surrogate's minimiser */
+    real damping;   /* with which a search for a shorter step begins, at least */
+    real present, growth; /* that of the present QP, and what it is multiplied with next */
+    int has_seen;   /* its scale is known */
     int factorised; /* the QP's matrix, with its active rows, is in the panels */
 } mhe_outcome;
 
 /* Other reasons for the end of a sequence than its cap, and what no longer holds in another one. */
 #define ENDS (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED | MHE_MODEL_FAILED | MHE_TIME_UP)
-#define OUTDATED (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED)
+#define OUTDATED (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED | MHE_CAP_REACHED)
 
 /* Whether no time is left; it is an event then. */
 static int mhe_is_late(const mhe_workspace *k, mhe_outcome *o)
@@ -154,6 +157,7 @@ static int mhe_solve_as_is(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
                         const mhe_trial *around, int nearest, int again)
 {
+    k->damping = nearest ? 0 : o->present;
 #if MHE_ROLLED
     return mhe_solve_as_is(e, k, o, around, nearest, again);
 #else
@@ -272,11 +276,12 @@ static int mhe_feasible_near(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 
 /* Make the spare trial the first one along the step whose cost is below the best so far, or the
  * last one. A useless step, whose promised decrease is negligible, is not shortened: at a minimum
- * none lowers the cost by more than rounding. */
+ * none lowers the cost by more than rounding. Nor is a damped one. */
 static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int useless)
 {
     const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
     const real target = mhe_target(o);
+    const int shorten = !useless && !(o->present > 0);
     mhe_try(e, k, o, 1);
     if (o->spare->cost < target) return;
 #if CONSTRAINED
@@ -298,14 +303,14 @@ static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int us
     /* Between two infeasible points there is no feasible one of a convex set. */
     if (o->best->violation > MHE_FEASIBLE) return;
 #endif
-    for (int i = 0; i < count && !useless; i++) {
+    for (int i = 0; i < count && shorten; i++) {
         mhe_try(e, k, o, mhe_lengths[i]);
         if (o->spare->cost < target) return;
     }
 #if CONSTRAINED
     /* Along the boundary of a curved set: of a step's length, what it lowers the cost by shrinks
      * in proportion, and how far it leaves the set by the square. */
-    for (int i = 0; i < along && curved && !useless; i++) {
+    for (int i = 0; i < along && curved && shorten; i++) {
         memcpy(k->step, k->bent.x, sizeof k->step);
         mhe_try(e, k, o, mhe_along[i]);
         if (!isfinite(o->spare->cost)) mhe_feasible_near(e, k, o, o->spare);
@@ -314,12 +319,27 @@ static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int us
 #endif
 }
 
-/* Solve one QP and take its step; whether another QP is worth while. */
+/* The share of a damping that is left after a step that has lowered the cost. */
+static real mhe_damping_left(real lowered, real promised)
+{
+    const real share = promised > 0 ? lowered / promised : 1;
+    const real missed = 2 * (share < 1 ? share : 1) - 1;
+    return mhe_max(MHE_LESS_DAMPING, 1 - missed * missed * missed);
+}
+
+/* Solve one QP and take its step; whether another QP is worth while. Where its step has not lowered
+ * the cost, that is one around the same trajectory, with more damping. */
 static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
 {
-    if (!mhe_linearize(e, k, o, o->best)) {
+    const int is_damped = o->present > 0;
+    /* Second-order corrections and searches for feasible points overwrite a QP with rows. */
+    if ((!is_damped || CONSTRAINED) && !mhe_linearize(e, k, o, o->best)) {
         o->events |= MHE_MODEL_FAILED;
         return 0;
+    }
+    if (is_damped && !o->has_seen) {
+        mhe_set_seen(e, k);
+        o->has_seen = 1;
     }
     const int status = mhe_solve_qp(e, k, o, o->best, 0, 0), solved = status == SOLVED;
     o->qps++;
@@ -337,6 +357,14 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
     if (o->spare->cost < target) {
         const real lowered = before - o->spare->cost;
         mhe_take(k, o);
+        if (is_damped) {
+            o->damping = o->present * mhe_damping_left(lowered, promised);
+            o->present = 0;
+            o->growth = MHE_MORE_DAMPING;
+            o->has_seen = 0;
+            return 1;
+        }
+        o->damping *= MHE_OLD_DAMPING;
         if (solved && lowered <= negligible) {
             o->events |= MHE_CONVERGED;
             return 0;
@@ -345,10 +373,24 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         o->events |= MHE_UNCONVERGED;
         return 0;
     }
-    real little = MHE_STALLED * negligible;
-    if (isfinite(before)) little = mhe_max(mhe_rounding_cost(e, k, o->best), little);
-    o->events |= solved && promised <= little ? MHE_CONVERGED : MHE_NO_DECREASE;
-    return 0;
+    const real rounding = isfinite(before) ? mhe_rounding_cost(e, k, o->best) : -1;
+    if (!is_damped && solved && promised <= mhe_max(rounding, MHE_STALLED * negligible)) {
+        o->events |= MHE_CONVERGED;
+        return 0;
+    }
+    /* Rounding hides a decrease this small, and more damping promises less. */
+    if (!isfinite(before) || o->present > MHE_MOST_DAMPING ||
+        ((solved || is_damped) && !(promised > mhe_max(rounding, MHE_ROUNDING * before)))) {
+        o->events |= MHE_NO_DECREASE;
+        o->damping = 0;
+        return 0;
+    }
+    if (is_damped) {
+        o->damping = o->growth * o->present;
+        o->growth *= 2;
+    }
+    o->present = mhe_max(MHE_DAMPING, o->damping);
+    return 1;
 }
 
 /* Make the spare trial the previous estimate, moved on by one step of the model. `before`: stages
@@ -374,7 +416,13 @@ static void mhe_descend(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     }
     o->unsolved = 0;
     o->events &= ~MHE_UNCONVERGED;
-    while (limit-- > 0 && !mhe_is_late(k, o) && mhe_improve_once(e, k, o)) continue;
+    o->present = 0;
+    o->growth = MHE_MORE_DAMPING;
+    o->has_seen = 0;
+    int is_open = 1;
+    while (is_open && limit-- > 0) is_open = !mhe_is_late(k, o) && mhe_improve_once(e, k, o);
+    if (is_open && o->present > 0 && !e->settings->uncapped) o->events |= MHE_CAP_REACHED;
+    o->present = 0;
 }
 
 #if MHE_WIDENED
@@ -570,6 +618,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     mhe_set_prior(e, k);
     mhe_begin_further(e, k);
     memset(o, 0, sizeof *o);
+    o->damping = e->damping;
 #if MHE_WIDENED
     mhe_set_widening(k, s, 0);
 #endif
@@ -600,6 +649,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
 #if CONSTRAINED
     memcpy(e->places, k->rows.place, sizeof e->places);
 #endif
+    e->damping = o->damping;
     if (s->uncapped && o->qps >= s->max_qps && !(o->events & ENDS)) o->events |= MHE_UNCONVERGED;
     o->events |= o->best != o->candidate ? MHE_IMPROVED : MHE_CANDIDATE;
 }

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 _ORDER = ("time_median", "rmse", "cost")
 _WHY = {
     "CONVERGED": "converged", "UNCONVERGED": "not converged", "NO_DECREASE": "no decrease",
+    "CAP_REACHED": "no decrease at cap",
     "SOLVER_STOPPED": "solver stopped",
     "SOLVER_FAILED": "solver failed", "MODEL_FAILED": "model failed", "TIME_UP": "time up",
     "ROWS_DROPPED": "rows dropped", "CANDIDATE_OUTSIDE": "candidate outside",
