@@ -357,6 +357,7 @@ typedef struct {
 #else
     mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
     mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
+    mhe_real prior_diagonal[MHE_NX];  /* of the first state's weight, without the data */
     int32_t has_ridge;                /* on the diagonal of the panels */
 #endif
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];

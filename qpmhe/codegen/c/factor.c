@@ -10,15 +10,25 @@
  * that losses have not touched: above rounding, and far below what a useful step depends on. */
 #define RIDGE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-4)
 
-/* Add damping to the panel of a stage: mu A' Q A and -mu A' Q. */
-static void mhe_damp_stage(real mu, const mhe_terms *t, real *panel)
+/* Add damping to the panels. */
+static void mhe_damp(mhe_estimator *e, mhe_workspace *k)
 {
-    for (int r = 0; r < NX; r++) {
-        real *row = panel + r * WIDTH;
-        for (int l = 0; l < NX; l++) {
-            const real value = mu * t->coupling[r * NX + l];
-            row[NX + l] += value;
-            for (int c = 0; c < NX; c++) row[c] -= value * t->f_jacobian[l * NX + c];
+    const real mu = k->damping;
+    for (int r = 0; r < NX; r++)
+        k->panels[r * WIDTH + r] += mu * (k->prior_diagonal[r] + k->seen[r]);
+    for (int i = 0; i < e->length; i++) {
+        const mhe_terms *t = k->at[i];
+        const real *Q = mhe_disturbance_weight(e->settings, mhe_stage_at(e, i));
+        const real share = mu * mhe_floored(k->factors[i + 1]);
+        real *panel = k->panels + i * NX * WIDTH, *next = panel + NX * WIDTH;
+        for (int r = 0; r < NX; r++) {
+            real *row = panel + r * WIDTH;
+            for (int l = 0; l < NX; l++) {
+                const real value = share * t->coupling[r * NX + l];
+                row[NX + l] += value;
+                for (int c = 0; c < NX; c++) row[c] -= value * t->f_jacobian[l * NX + c];
+                next[r * WIDTH + l] += share * mhe_scaled(Q[r * NX + l], t->disturbance_scale, r);
+            }
         }
     }
 }
@@ -32,7 +42,6 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     const real *factors = k->factors;
     real prior_scale[NX];
     mhe_set_scale(&s->prior_loss, 1, NX, k->prior.weight, offset, prior_scale);
-    const real mu = k->damping;
     for (int i = 0; i <= count; i++) {
         real *panel = k->panels + i * NX * WIDTH, *g = k->gradient + i * NX;
         const real *weight = i == 0 ? k->prior.weight
@@ -49,15 +58,10 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
             mhe_prior_force(&k->prior, offset, g);
             for (int j = 0; j < NX; j++) g[j] *= mhe_scaled(factor, scale, j);
             mhe_add_further(e, k, factor, k->panels, WIDTH);
+            for (int j = 0; j < NX; j++) k->prior_diagonal[j] = panel[j * WIDTH + j];
         } else {
             for (int j = 0; j < NX; j++) g[j] = factor * k->at[i - 1]->following[j];
         }
-        if (mu > 0)
-            for (int r = 0; r < NX; r++) {
-                real *row = panel + r * WIDTH;
-                if (i == 0) row[r] += mu * (row[r] + k->seen[r]);
-                else for (int c = 0; c < NX; c++) row[c] += mu * row[c];
-            }
         if (i == count) break;
         const mhe_terms *t = k->at[i];
         const real next = mhe_floored(factors[i + 1]);
@@ -69,8 +73,8 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
             }
             g[r] += next * t->own[r];
         }
-        if (mu > 0) mhe_damp_stage(mu * next, t, panel);
     }
+    if (k->damping > 0) mhe_damp(e, k);
     for (int i = 0; k->has_ridge && i <= count; i++) {
         const real *weight = i == 0 ? k->prior.weight
                                     : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
