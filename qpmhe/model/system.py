@@ -165,7 +165,17 @@ class System:
     def made(
         cls, f: Function | Trusted, h: Function | Trusted, origin: Origin, **options: Any
     ) -> System:
-        """Make a system as `System` does, by a function of this package that says what it is."""
+        """Make a system as `System` does, by a function of this package that says what it is.
+
+        Parameters
+        ----------
+        f, h : callable or Trusted
+            As for `System`; a `Trusted` one takes leading dimensions and is not tried.
+        origin : Origin
+            Of what the system is made: its discretisation, its expression, how it is pickled.
+        **options
+            The other arguments of `System`.
+        """
         system = object.__new__(cls)
         system._make({"f": f, "h": h, **options}, origin)
         return system
@@ -308,6 +318,13 @@ class System:
     def at(self, x: Array, u: Array) -> System:
         """The same system, checked at a state (n,) and an input (m,) that will be used.
 
+        Parameters
+        ----------
+        x : (n,) array
+            The state.
+        u : (m,) array
+            The input.
+
         Raises
         ------
         ModelError
@@ -331,6 +348,13 @@ class System:
         """Which function differs from its trace at a state (n,) and input (m,), and how.
 
         Blank if none does.
+
+        Parameters
+        ----------
+        x : (n,) array
+            The state.
+        u : (m,) array
+            The input.
         """
         fault = self.evaluation.fault(x, u)
         if not fault and self.constraints is not None and np.isfinite(u).all():
@@ -354,7 +378,13 @@ class System:
         return self._changed(evaluation=other.evaluation, constraints=other.constraints)
 
     def probes(self, scales: Array) -> Points:
-        """Points at which functions are tried, for states of these magnitudes."""
+        """Points at which functions are tried, for states of these magnitudes.
+
+        Parameters
+        ----------
+        scales : (n,) array
+            The magnitudes, in the states' units.
+        """
         # Steps of a random length lead anywhere: `at` then has the first of a usual length.
         if self.origin.is_timed:
             return []

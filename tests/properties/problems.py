@@ -91,7 +91,7 @@ class Problem:
         self.method = str(rng.choice(["euler", "rk4"])) if "ode" in has else None
         self.derivative = "traced"
         if "untraced" in has:
-            self.derivative = str(rng.choice(["complex step", "differences", "given"]))
+            self.derivative = str(rng.choice(["as written", "differences", "given"]))
         self.dt = 0.5
         self.edge = float(rng.choice([3.0, 1e3])) if "domain" in has else np.inf
         self.writing, self.limit = writing, -0.2 if "clip" in writing else rng.uniform(-0.3, 0.3)

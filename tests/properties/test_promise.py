@@ -61,7 +61,7 @@ class Case:
         self.h = lambda x: x @ C.T + np.cos(0.3 * x @ D.T) - 1.0
         self.gain = rng.standard_normal((n, p)) * rng.choice([0.0, 0.1, 0.5])
         self.weights = tuple(weight(rng, size) for size in (n, n, p))
-        self.z0 = rng.standard_normal(n)
+        self.z0 = np.clip(rng.standard_normal(n), -2.9, 2.9)  # a model is defined there
         self.Y = rng.standard_normal((steps, p)) * rng.choice([0.1, 1.0, 5.0])
         for t, j, value in specials:
             self.Y[t % steps, j % p] = value

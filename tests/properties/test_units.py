@@ -46,7 +46,7 @@ def other_units(one, base, most):
     # Covariances of an observer fix the cost's unit; and so do sets, whose tolerances are shares
     # of standard deviations, and difference steps, which are shares of the prior's.
     free = one.kind in ("luenberger", "injection") and not one.sets and not one.names
-    if not free or one.derivative == "differences" or one.loss or one.held:
+    if not free or one.derivative not in ("traced", "given") or one.loss or one.held:
         units = units._replace(cost=1.0)
     return units
 

@@ -106,7 +106,7 @@ SHAPE = "np.isnan(x)\n    if calls > 150:\n        return np.zeros(2)"
     [
         (BEYOND, CONTINUOUS, "h raised ValueError: beyond the table at x = [", False),
         (MISTAKE, DISCRETE, "h raised NameError: name 'ofset' is not defined at x = [", True),
-        (SHAPE, CONTINUOUS, "returned other than real numbers of the right shape at x", True),
+        (SHAPE, CONTINUOUS, "h returned shape (2,); expected (1,) at x", True),
     ],
     ids=["beyond", "mistake", "shape"],
 )

@@ -144,9 +144,8 @@ static int mhe_is_hidden(const mhe_settings *s, const mhe_stage *stage, const mh
 /* The order of rows by their longest entry, in the lengths of the columns. */
 static void mhe_order_rows(int count, int width, const real *rows, int *order)
 {
-    real lengths[WIDE], longest[LINES];
+    real lengths[WIDE] = {0}, longest[LINES];
     for (int j = 0; j < width; j++) {
-        lengths[j] = 0;
         for (int i = 0; i < count; i++) lengths[j] = mhe_max(fabs(rows[i * WIDE + j]), lengths[j]);
     }
     for (int i = 0; i < count; i++) {
