@@ -358,7 +358,7 @@ class CompiledEngine:
                 state["window"], lambda own: self._reader.load(own, tools.usual),
                 may_be_irregular=bool(self._system.dt),
                 is_smoothed=self._settings.arrival == "smoothed",
-                # The trajectory may be that of a surrogate, whose end is no estimate.
+                # With graduated losses the trajectory may belong to a widened loss, not to the estimate.
                 ends_alike=self.cost.graduation == 1.0,
             )
             memory = self._library.estimators(record.z[:1], tools.record)

@@ -512,7 +512,7 @@ class PythonEngine:
         window.load_state_dict(
             state["window"], lambda own: self._reader.load(own, tools.usual),
             may_be_irregular=self._system.has_timed, is_smoothed=self._smoothed,
-            # The trajectory may be that of a surrogate, whose end is no estimate.
+            # With graduated losses the trajectory may belong to a widened loss, not to the estimate.
             ends_alike=self._cost.graduation == 1.0,
         )
         if window.has_terms and not with_terms:

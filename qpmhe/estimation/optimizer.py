@@ -245,7 +245,7 @@ class Optimizer:
         best, surrogate = outcome.trial, problem.with_cost(problem.surrogate)
         outcome.trial = began = surrogate.judged(best)
         self._descend(surrogate, outcome, start, limit)
-        # The candidate's own trajectory may be none of the model's, and its J that of a roll-out.
+        # The candidate may break the noise-free directions; its J then belongs to its roll-out.
         found = best if outcome.trial is began else problem.judged(outcome.trial)
         if found.cost < math.inf:
             outcome.followed = found.trajectory

@@ -235,8 +235,8 @@ class _Bound:
     def scale(self, start: Array, deviations: Array, typical: Array, u: Array) -> Array:
         """The largest change (size,) of each row within a standard deviation around a start.
 
-        Where that is more, it is the change within the typical magnitudes or, if greater, the
-        row's value: a vague prior tells nothing about how large a miss is.
+        A vague prior would make this change too large to judge a violation by. So the result is
+        at most the change within the typical magnitudes, or the row's value if that is greater.
         """
         far, size = self._change(start, deviations, u)
         near, _ = self._change(start, typical, u)

@@ -53,7 +53,7 @@ class Functions:
     f_jacobian, h_jacobian : Jacobian
         Their derivatives with respect to x.
     rate_jacobian : Jacobian or None
-        That of the rate of a discretised ODE, where the user gave it: it is only compared.
+        The Jacobian that the user gave for the rate of an ODE; it is checked, not evaluated.
     kernel : ModelKernel or None
         Evaluates several of them in one call; None for functions that have no expression.
     """
@@ -175,7 +175,7 @@ class Origin:
     jacobians : str
         How the given Jacobians are computed, in a word.
     remedy : str
-        What to do where a given Jacobian is wrong, with ``{name}`` for that of its function.
+        The remedy that the error about a wrong given Jacobian names; ``{name}`` is the function.
     symbolic : CasadiModel, optional
         f and h as CasADi functions, where they were given as such.
     make_timed : callable, optional
@@ -405,7 +405,7 @@ class Model:
         if not self.names:
             return replace(self, functions=self.written)
         assert self.trace is not None
-        # A system with steps of another length has a trace of its own, or that of the usual one.
+        # The trace of the usual system lacks the input for the step's length.
         evaluator = self.trace.evaluator(timed=self.system.m > self.trace.m)
         return replace(self, functions=self.written.evaluated_by(evaluator, self.names))
 

@@ -190,7 +190,7 @@ class ModelTrace:
         return self._same(jacobian, partial(pinned.evaluator().one, name), scales)
 
     def is_rate(self, jacobian: Jacobian, pinned: Pinned, scales: Array | None) -> bool:
-        """Whether the Jacobian of a rate is that of its trace, up to rounding."""
+        """Whether a given Jacobian of the rate equals the traced derivative, up to rounding."""
         ca, rate = import_casadi(), pinned.found["f"].function
         x, u = ca.SX.sym("x", self._n), ca.SX.sym("u", self._m)
         slope = ca.Function("slope", [x, u], [ca.densify(ca.jacobian(rate(x, u), x))])
