@@ -358,7 +358,7 @@ class CompiledEngine:
                 state["window"], lambda own: self._reader.load(own, tools.usual),
                 may_be_irregular=bool(self._system.dt),
                 is_smoothed=self._settings.arrival == "smoothed",
-                # With graduated losses the trajectory may belong to a widened loss, not to the estimate.
+                # A graduated loss may leave the trajectory of a widened one.
                 ends_alike=self.cost.graduation == 1.0,
             )
             memory = self._library.estimators(record.z[:1], tools.record)

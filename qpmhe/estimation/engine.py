@@ -512,7 +512,7 @@ class PythonEngine:
         window.load_state_dict(
             state["window"], lambda own: self._reader.load(own, tools.usual),
             may_be_irregular=self._system.has_timed, is_smoothed=self._smoothed,
-            # With graduated losses the trajectory may belong to a widened loss, not to the estimate.
+            # A graduated loss may leave the trajectory of a widened one.
             ends_alike=self._cost.graduation == 1.0,
         )
         if window.has_terms and not with_terms:
