@@ -117,7 +117,7 @@ def _plain(value: Any) -> NDArray[Any]:
     array = np.asarray(value)
     if array.dtype.names is None:
         return array
-    clean = np.zeros(array.shape, array.dtype)  # also between the fields, which NumPy leaves as it is
+    clean = np.zeros(array.shape, array.dtype)  # and so is what lies between the fields
     for name in array.dtype.names:
         clean[name] = array[name]
     return clean.view(np.uint8).reshape(len(array), array.dtype.itemsize)
