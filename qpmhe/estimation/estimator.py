@@ -34,6 +34,7 @@ from .contracts import check_correction, check_observer, check_prior
 from .engines import EngineChangeError, engine_for, engine_of_snapshot
 from .estimate import Estimate
 from .problem import Solved
+from .reach import reached
 from .run import Run, RunSource
 from .settings import Settings
 from .step_length import step_error, warn_of_step
@@ -222,6 +223,7 @@ class MovingHorizonEstimator:
                 self._usual_input,
             )
             warn_of_step(error, system, 3)
+            self._compare_traces()
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -232,6 +234,41 @@ class MovingHorizonEstimator:
                 f"{system.n} states do not fit into memory ({error}); take a shorter horizon."
             ) from error
 
+
+    def _compare_traces(self) -> None:
+        """Compare traces and functions where the first window may lead, before the first step."""
+        own, horizon = self._own_system, self.settings.horizon
+        if not own.is_traced:
+            return
+        where = reached(
+            own, self.cost, self.observer.initial_covariance(), self._initial_state,
+            self._usual_input, horizon,
+        )
+        fault = own.fault([*where, *own.usual_points()])
+        if fault:
+            self._own_system = own.as_written()
+            warn_of(fault, 4)
+
+    def verify(self) -> bool:
+        """Compare the functions f and h, and others that are traced, with their traces now.
+
+        An estimator evaluates expressions in the place of functions that can be traced. It
+        compares both when it is made; later where values that the functions read have changed,
+        at which it looks every 16 samples; and, without ``time_budget``, at each 1000th sample.
+        This method compares them at the present state and at points of several magnitudes,
+        whatever has changed, in some hundred microseconds.
+
+        Returns
+        -------
+        bool
+            Whether they agree. If not, an `EngineWarning` names the function and the point, and the
+            estimator evaluates the functions as they are written from now on.
+        """
+        try:
+            return self._engine.verify(self._usual_input)
+        except EngineChangeError as change:
+            self._change_engine(change)
+            return False
 
     def _checked_start(
         self, initial_state: ArrayLike, system: System
