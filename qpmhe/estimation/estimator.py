@@ -246,6 +246,8 @@ class MovingHorizonEstimator:
         )
         fault = own.fault([*where, *own.usual_points()])
         if fault:
+            if own.tracing is not None:
+                own.tracing.forget()
             self._own_system = own.as_written()
             warn_of(fault, 4)
 

@@ -221,6 +221,11 @@ class ModelTrace:
         """What was traced, as the user wrote it."""
         return tuple(self._functions.values())
 
+    def forget(self) -> None:
+        """Trace the functions again when a trace is needed next: they have changed."""
+        with self._lock:
+            self._now = None
+
     def wrong(self, pinned: Pinned, where: Points) -> tuple[str, str] | None:
         """Which function differs from its trace at these points, and how; None if none does."""
         for name, one in pinned.found.items():

@@ -172,10 +172,10 @@ class Counting:
     """A model that counts the calls with numbers."""
 
     def __init__(self, gain=0.1):
-        self.gain, self.calls = [gain], []
+        self.gain, self.calls = [gain], 0
 
     def f(self, x):
-        self.calls.append(type(x))
+        self.calls += 1
         return x @ A.T + self.gain[0] * np.sin(x)
 
     def system(self):
@@ -194,28 +194,28 @@ def estimator(system, engine, **options):
 def test_functions_are_not_called_in_the_loop(engine):
     plant = Counting()
     mhe = estimator(plant.system(), engine, time_budget=10.0)
-    made = len(plant.calls)
+    made = plant.calls
     for _ in range(2):
         for k in range(1100):
             mhe.update([np.sin(0.1 * k)])
         mhe.reset()
-    assert len(plant.calls) == made
+    assert plant.calls == made
     assert mhe.verify()
-    assert len(plant.calls) > made
+    assert plant.calls > made
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_without_a_budget_they_are_called_every_thousandth_sample(engine):
     plant = Counting()
     mhe = estimator(plant.system(), engine)
-    made, at = len(plant.calls), []
+    made, at = plant.calls, []
     for k in range(2100):
-        before = len(plant.calls)
+        before = plant.calls
         mhe.update([np.sin(0.1 * k)])
-        if len(plant.calls) > before:
+        if plant.calls > before:
             at.append(k)
     assert at == [1000, 2000]
-    assert 0 < len(plant.calls) - made < 10
+    assert 0 < plant.calls - made < 10
 
 
 @pytest.mark.parametrize("engine", ENGINES)
