@@ -244,7 +244,7 @@ class MovingHorizonEstimator:
             own, self.cost, self.observer.initial_covariance(), self._initial_state,
             self._usual_input, horizon,
         )
-        fault = own.fault([*where, *own.usual_points()])
+        fault = own.fault(where)
         if fault:
             if own.tracing is not None:
                 own.tracing.forget()

@@ -13,10 +13,12 @@ from ..model.system import System
 Array = NDArray[np.float64]
 
 _SEED = 20210829
-# Random points within one standard deviation of the prior, and within three.
-_NEAR, _FAR = 8, 2
-# Of so many points the model is followed, over at most so many samples.
-_FOLLOWED, _SAMPLES = 3, 20
+# Random points within one standard deviation of the prior where steps are compared.
+_NEAR = 8
+# How many deviations of the prior away functions are compared.
+_AWAY = (1.0, 1.0, 3.0)
+# The model is followed over at most so many samples.
+_SAMPLES = 20
 
 
 def prior_deviations(cost: Cost, covariance: Array | None) -> Array:
@@ -47,10 +49,11 @@ def prior_points(system: System, state: Array, prior: Array) -> Array:
 def reached(
     system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, horizon: int
 ) -> Points:
-    """States and inputs that an estimator may meet in its first window.
+    """States and inputs that an estimator may meet in its first window, without the first one.
 
-    Points of the prior, and of a few of them those to which the model leads, with disturbances of
-    one standard deviation: after one sample, half a window and a whole one, at most 20 samples.
+    Points within one and three deviations of the prior; and where the model leads from the initial
+    state and from the last of these points, with disturbances of one standard deviation, in a
+    window of at most 20 samples: after half of it, and at its end.
 
     Parameters
     ----------
@@ -69,11 +72,10 @@ def reached(
     """
     generator = np.random.default_rng(_SEED)
     prior = prior_deviations(cost, covariance)
-    draws = generator.uniform(-1.0, 1.0, (_NEAR // 2 + _FAR, state.size))
-    draws[-_FAR:] *= 3.0
-    states = _within(system, np.vstack((state, state + prior * draws)))
+    draws = np.array(_AWAY)[:, None] * generator.uniform(-1.0, 1.0, (len(_AWAY), state.size))
+    states = _within(system, state + prior * draws)
     samples = min(horizon, _SAMPLES)
-    kept, followed = {1, (samples + 1) // 2, samples}, states[:_FOLLOWED]
+    kept, followed = {(samples + 1) // 2, samples}, np.vstack((state, states[-1]))
     deviations, found = disturbance_deviations(system, cost), [states]
     inputs = np.tile(u, (len(followed), 1))
     try:

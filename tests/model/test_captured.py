@@ -269,7 +269,7 @@ def test_verify_finds_what_cannot_be_seen(engine):
 def test_a_change_before_an_estimator_is_made_is_seen_when_it_is_made(engine):
     """Also of a branch that the initial state does not reach, but the first window may."""
     hidden = Hidden()
-    system = hidden.system(2.5)
+    system = hidden.system(1.3)
     estimator(system, engine)
     hidden.values["gain"] = 0.3
     with pytest.warns(EngineWarning, match="f has changed since it was traced"):
