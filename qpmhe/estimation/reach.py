@@ -9,6 +9,7 @@ from .._linalg import inverse
 from ..costs import Cost
 from ..model.points import Points
 from ..model.system import System
+from ..model.traces import warn_of
 
 Array = NDArray[np.float64]
 
@@ -88,6 +89,24 @@ def reached(
     except Exception:  # a model outside of its domain; the steps will report that
         pass
     return [(one, u) for one in np.vstack(found) if np.isfinite(one).all()]
+
+
+def compared(
+    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, horizon: int
+) -> System:
+    """The system, its traces compared with its functions at such points; as written if they differ.
+
+    Arguments are those of `reached`.
+    """
+    if not system.is_traced:
+        return system
+    fault = system.fault(reached(system, cost, covariance, state, u, horizon))
+    if not fault:
+        return system
+    if system.tracing is not None:
+        system.tracing.forget()
+    warn_of(fault, 5)
+    return system.as_written()
 
 
 def _within(system: System, points: Array) -> Array:
