@@ -118,7 +118,10 @@ class BatchEstimator:
         own = self._own().as_written()
         _, first, which = np.unique(states, axis=0, return_index=True, return_inverse=True)
         checked = [
-            check_start(own, self.observer, self.cost, states[k], f"initial_states[{k}]")[0]
+            check_start(
+                own, self.observer, self.cost, states[k], f"initial_states[{k}]",
+                metric=self.settings.projection_metric,
+            )[0]
             for k in first.tolist()
         ]
         return np.array(checked)[which.ravel()]

@@ -40,12 +40,12 @@ class Window(ObserverSteps):
         horizon: int,
         initial_state: Array,
         with_terms: bool,
-        project: bool,
+        projection: str | None,
         reinitialized: bool = False,
         usual: Conditions = USUAL,
     ) -> None:
         super().__init__(
-            system, observer, cost, horizon, initial_state, with_terms, project, usual
+            system, observer, cost, horizon, initial_state, with_terms, projection, usual
         )
         self._held = list(system.held)
         self.trust_start()

@@ -127,6 +127,10 @@ class Problem:
             "project_observer": bool(rng.random() < 0.8),
             "infeasible": ("drop_rows", "keep_candidate")[rng.integers(2)],
         }
+        # Of a generator of its own: what is drawn behind stays as it was.
+        own = np.random.default_rng(rng.bit_generator.seed_seq.spawn(1)[0])
+        if own.random() < 0.3:
+            self.options["projection_metric"] = "diagonal"
 
     def draw_directions(self):
         """G: of the system, of a singular covariance of the disturbances, or none."""
