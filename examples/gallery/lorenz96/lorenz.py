@@ -131,7 +131,6 @@ def lines(variances: tuple[float, float, float], horizon: int, qps: int) -> tupl
         Way("EKF", qpmhe.ExtendedKalman, alone),
         Way("UKF", qpmhe.UnscentedKalman, unscented),
         replace(mhe, name=f"MHE, N = 10, {qps} QPs", horizon=10),
-        replace(mhe, name=f"MHE, N = {horizon}, 1 QP", qps=1),
         mhe,
     )
 
