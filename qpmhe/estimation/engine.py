@@ -17,7 +17,7 @@ from .._checks import check_problem
 from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
-from ..memory.record import Mark, Record
+from ..memory.record import Mark, MemoryRecord
 from ..memory.snapshot import reading
 from ..model.derivatives import Nearby
 from ..model.residuals import difference
@@ -417,7 +417,7 @@ class PythonEngine:
         self._next_check = 0 if self._system.is_traced else math.inf
 
     def adopt(
-        self, usual: Conditions, record: Record, residuals: Array,
+        self, usual: Conditions, record: MemoryRecord, residuals: Array,
         metric: tuple[Array, bool] | None, replay: bool,
     ) -> None:
         """Continue from another engine's record.
