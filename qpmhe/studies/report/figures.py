@@ -153,7 +153,8 @@ def _sweep(rows: DataFrame, name: str, lines: str | None) -> tuple[Drawing, dict
         looks.append(look)
         mine = mine.sort_values(name, na_position="last")
         x = [qps_words(one) for one in mine[name]] if name == "qps" else mine[name].tolist()
-        marks.append(PlotMark("line", x, mine[by].astype(float).tolist(), look, bars=_bars(mine, by)))
+        y = mine[by].astype(float).tolist()
+        marks.append(PlotMark("line", x, y, look, bars=_bars(mine, by)))
     axis = Axis(words, "values", sorted(set(rows[name].dropna().astype(float))))
     if name == "qps":
         axis = Axis(words, "category", ranked(map(qps_words, rows["qps"])))
