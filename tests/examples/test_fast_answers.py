@@ -19,6 +19,7 @@ def poor_on_purpose():
         yield
 
 
+@pytest.mark.slow
 def test_a_bound_that_holds_helps_the_speed_and_harms_the_distance():
     short, long = study.bounds(FEW)
     for row in (short, long):
@@ -29,7 +30,7 @@ def test_a_bound_that_holds_helps_the_speed_and_harms_the_distance():
 def test_the_exact_map_is_worse_than_the_kalman_filter():
     for row in study.uniform(FEW):
         kalman = row["Kalman filter"]
-        assert 0.97 * kalman < row["its cost, |w| ≤ 1"] <= 1.001 * kalman
+        assert 0.97 * kalman < row["its cost, w bounded"] <= 1.001 * kalman
         if row["r"] >= 0.1:
             assert row["exact MAP"] > 1.02 * kalman
     assert row["exact MAP"] > 1.2 * kalman  # the noisiest
@@ -63,7 +64,7 @@ def test_a_smoothed_prior_wants_a_smaller_covariance():
 
 def test_huber_and_gates_change_sides():
     slow, _, fast, fastest = study.outliers(FEW)
-    assert slow["Huber over the first"] == pytest.approx(1.0, abs=0.05)
+    assert slow["Huber over the first"] == pytest.approx(1.0, abs=0.1)
     assert fast["Huber over the first"] < 0.9 < 1.2 < fast["over the second"]
     assert fastest["Huber over the first"] < 0.2
     assert fastest["over the second"] < 0.9
@@ -79,7 +80,8 @@ def test_the_unobservable_turn_is_claimed_to_be_known():
     least = row["least possible deviation (rad)"]
     # 5 m and 0.5 rad at 10 m: 1 / sqrt((10 / 5)^2 + 1 / 0.5^2)
     assert least == pytest.approx(1.0 / np.sqrt(8.0))
-    assert row["claimed (median)"] < 0.2 * least
+    assert row["along the true states"] == pytest.approx(least, rel=0.03)
+    assert row["claimed (median)"] < 0.2 * least < 0.5 * row["error (rms)"]
 
 
 def test_the_mean_cost_tells_the_priors_apart():
