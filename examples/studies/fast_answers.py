@@ -462,7 +462,7 @@ def table(rows: Rows) -> str:
 def _cell(value: Any) -> str:
     if isinstance(value, str | int):
         return str(value)
-    return f"{value:.3g}" if 1e-3 <= abs(value) < 1e3 else f"{value:.0e}"
+    return f"{value:.3g}"
 
 
 def filled(page: str, name: str, text: str) -> str:
