@@ -26,11 +26,11 @@ class Ridge(FirstStateTerm):
     name = NAME
 
     @staticmethod
-    def belongs(system, cost):
+    def belongs(system, cost):  # noqa: ARG004
         return getattr(cost, "ridged", False)
 
     @classmethod
-    def of(cls, system, cost, prior, basis):
+    def of(cls, system, cost, prior, basis):  # noqa: ARG003
         return cls()
 
     @property
