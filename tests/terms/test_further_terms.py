@@ -26,11 +26,11 @@ class Ridge(FirstStateTerm):
     name = NAME
 
     @staticmethod
-    def belongs(system, cost):  # noqa: ARG004
+    def belongs(system, cost):
         return getattr(cost, "ridged", False)
 
     @classmethod
-    def of(cls, system, cost, prior, basis):  # noqa: ARG003
+    def of(cls, system, cost, prior, basis):
         return cls()
 
     @property
