@@ -17,7 +17,7 @@ from .._checks import check_problem
 from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
-from ..memory.record import Mark, Record
+from ..memory.record import Mark, MemoryRecord
 from ..memory.snapshot import reading
 from ..model.captured import ComparisonTimes, Due
 from ..model.derivatives import Nearby
@@ -430,7 +430,7 @@ class PythonEngine:
             self._times.end()
 
     def adopt(
-        self, usual: Conditions, record: Record, residuals: Array,
+        self, usual: Conditions, record: MemoryRecord, residuals: Array,
         metric: tuple[Array, bool] | None, replay: bool,
     ) -> None:
         """Continue from another engine's record.
