@@ -210,20 +210,23 @@ def verdict(setup: Setup, results: Sequence[Result], burn: int) -> str:
 
 
 def draw(setups: Sequence[Setup], results: Sequence[Sequence[Result]]) -> Figure:
-    """Errors over time, the mean of all runs."""
+    """Errors of the first run over time, the mean over a unit of time; without the UKF's."""
+    width = round(1.0 / DT)
     with rc_context(LIGHT):
-        figure = Figure(figsize=(8.4, 5.6), layout="constrained")
+        figure = Figure(figsize=(8.4, 6.0), layout="constrained")
         panels = figure.subplots(len(setups), 1, sharex=True, squeeze=False)[:, 0]
         for panel, setup, found in zip(panels, setups, results, strict=True):
             shown = {one.way.name: one for one in found if one.way.name != "UKF"}
-            times = DT * np.arange(found[0].errors.shape[1])
             for style, (name, one) in zip(line_styles(shown), shown.items(), strict=True):
-                panel.plot(times, one.errors.mean(axis=0), linewidth=1.0, label=name, **style)
+                smooth = np.convolve(one.errors[0], np.full(width, 1.0 / width), "valid")
+                times = 0.5 + DT * np.arange(len(smooth))
+                panel.plot(times, smooth, linewidth=1.4, label=name, **style)
             if len(setup.seen) == SIZE:
-                panel.axhline(PUBLISHED["iEnKS, 40 members"], color="0.4", linestyle=":",
-                              label="DAPPER: iEnKS")
-            panel.set(title=setup.title, ylabel="RMS error", yscale="log")
-            panel.legend(loc="upper right", ncols=3, fontsize="small")
+                panel.axhline(PUBLISHED["iEnKS, 40 members"], color="0.4", linewidth=0.8,
+                              label="DAPPER: iEnKS, mean")
+            panel.set(title=setup.title, ylabel="RMS error")
+            panel.set_ylim(0.0, 3.0 * float(np.median(found[0].errors[0])))
+            panel.legend(loc="upper right", ncols=2, fontsize="small")
         panels[-1].set_xlabel("time t")
     return figure
 
