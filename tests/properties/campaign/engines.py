@@ -3,8 +3,9 @@
 A difference is explained, in this order: by rounding, where an engine differs as much from itself
 when its memory and its data change in their last digits; by the tolerance of the Python step's QPs,
 where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
-where it differs as much from itself when the QPs change in their last digits; by a cap or by a QP
-that a method has not solved. What is left is a fault.
+where it differs as much from itself when the QPs change in their last digits; by a direction in
+which J is nearly flat, where the step in C loses digits to the weights of active rows; by a cap or
+by a QP that a method has not solved. What is left is a fault.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from qpmhe.codegen.exchange import hand_over
 from qpmhe_solvers import RawSolution, Solver, SolveStatus, create
 from qpmhe_solvers.options import SolverOptions
 
-from .judge import nudged
+from .judge import EPS, nudged
 
 CLOSE = 1e-6  # of two estimates in units, and of their J as a share
+FLAT = 1e8  # condition of a Hessian from which on J is nearly flat in a direction
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
@@ -51,6 +53,7 @@ class Nudging(Solver):
 
     def __init__(self):
         super().__init__(SolverOptions())
+        self.condition = 1.0  # the largest one of their Hessians in units of its diagonal
         self.r, self.inner = np.random.default_rng(4), create(
             "auto", SolverOptions(absolute_tolerance=1e-12)
         )
@@ -60,6 +63,10 @@ class Nudging(Solver):
         for part in (other.band, other.gradient):
             part[...] = nudged(self.r, part)
         found = self.inner.solve(other)
+        lower = np.tril(qp.dense())
+        roots = np.sqrt(np.diag(lower))
+        values = np.linalg.eigvalsh(lower / np.outer(roots, roots))
+        self.condition = max(self.condition, values[-1] / max(values[0], EPS))
         solved = found.status is SolveStatus.SOLVED
         return RawSolution(found.d, solved, found.iterations, found.bound_duals, found.row_duals)
 
@@ -148,6 +155,8 @@ class Beside:
                 return "tolerance of QPs"
             if self._is_hessian(x, arguments):
                 return "rounding of the Hessian"
+            if self.nudging.settings.backend.condition > FLAT:
+                return "flat J"
         finally:
             engine._memory[...] = after
         if "max_solver_iterations" in self.case.options:
@@ -179,7 +188,7 @@ class Beside:
             self.nudging = self.case.estimator(
                 "python", backend=Nudging(), max_solver_iterations=None
             )
-        found = []
+        found, self.nudging.settings.backend.condition = [], 1.0
         for _ in range(_TRIES):
             self.compiled._engine._memory[...] = self.memory
             self._hand_over(self.nudging)

@@ -169,7 +169,7 @@ def _penalties(case, x, w, v, seen):
     if case.constraint and not case.constraint[2]:
         for share, point in zip(shares, x, strict=True):
             missed = max(0.0, float(case.constraint[0](point)))
-            total += share * (3.0 * missed + 2.0 * missed**2)
+            total += share * (3.0 * missed + 2.0 * missed * missed)
             slack += share * 1e-11 * (3.0 + 4.0 * missed) * (1.0 + missed)
     return total, slack
 
