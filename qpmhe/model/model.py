@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -24,7 +25,8 @@ from .traces import Pinned, warn_of
 if TYPE_CHECKING:
     from .augmentation import Augmentation
     from .constraints import ConstraintFunctions
-    from .system import System, SystemOptions
+    from .system import System
+    from .system_arguments import SystemOptions
 
 Array = NDArray[np.float64]
 Along = Callable[[Array, Array, Array], Array]
@@ -480,3 +482,26 @@ def check_at(
         if not u.size or u.any():
             raise
         function.check(x, np.full_like(u, 0.5))
+
+
+# Models of other magnitudes than these are made again.
+_MOST_KEPT = 8
+
+
+class ModelCache:
+    """The models of a system that were made last, by the states' magnitudes."""
+
+    def __init__(self) -> None:
+        self._lock, self._kept = threading.RLock(), dict[bytes, Model]()
+
+    def of(self, written: Model, scales: Array | None) -> Model:
+        """The model for these magnitudes; made again where its functions have changed."""
+        key = b"" if scales is None else scales.tobytes()
+        with self._lock:
+            found = self._kept.pop(key, None)
+            if found is None or not found.holds():
+                found = written.scaled(scales)
+            self._kept[key] = found
+            if len(self._kept) > _MOST_KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            return found
