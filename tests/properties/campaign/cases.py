@@ -99,7 +99,7 @@ class Case:
         self._draw_observer_and_cost(r)
         self._draw_options(r)
         writings = models.WRITINGS[engine]
-        self.writing = str(r.choice(list(writings), p=list(writings.values())))
+        self.writing = models.installed(str(r.choice(list(writings), p=list(writings.values()))))
         self.tags += [family.__name__, self.writing]
         self._construct(r)
 

@@ -223,6 +223,10 @@ class Judge:
 
     def faults(self, estimate, window, mean=None):
         """(kind, detail) of each fault; the prior's mean is the candidate's first state if None."""
+        with np.errstate(all="ignore"):
+            return self._faults(estimate, window, mean)
+
+    def _faults(self, estimate, window, mean):
         found: list[tuple[str, Any]] = []
         case, x, candidate = self.case, estimate.trajectory, estimate.candidate
         status, improved = estimate.status, Status.IMPROVED in estimate.status

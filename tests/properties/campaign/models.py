@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.util import find_spec
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -191,6 +192,11 @@ WRITINGS = {
     "python": {"single": 0.3, "batched": 0.25, "opaque": 0.15, "casadi": 0.2, "jax": 0.1},
     "compiled": {"single": 0.4, "batched": 0.2, "casadi": 0.25, "jax": 0.15},
 }
+
+
+def installed(writing):
+    """The writing, or NumPy where its library is missing."""
+    return "batched" if writing in ("casadi", "jax") and find_spec(writing) is None else writing
 
 
 def with_units(model, x_units, y_units):
