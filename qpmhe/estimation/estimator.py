@@ -27,6 +27,7 @@ from .contracts import check_correction, check_observer, check_prior
 from .engines import EngineChangeError, engine_for
 from .estimate import Estimate
 from .estimator_memory import EstimatorMemory
+from .reach import compared
 from .run import Run, RunSource
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require
@@ -210,6 +211,10 @@ class MovingHorizonEstimator(EstimatorMemory):
                 self._usual_input,
             )
             warn_of_step(error, system, 3)
+            self._own_system = compared(
+                self._own_system, cost, observer.initial_covariance(), self._initial_state,
+                self._usual_input, horizon,
+            )
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -313,6 +318,27 @@ class MovingHorizonEstimator(EstimatorMemory):
         except EngineChangeError as change:
             self._change_engine(change)
         return self._engine.step(y_array, u_array, dt, own, began)
+
+    def verify(self) -> bool:
+        """Compare the functions f and h, and others that are traced, with their traces now.
+
+        An estimator evaluates expressions in the place of functions that can be traced. It compares
+        both when it is made; later where values that the functions read have changed, at which it
+        looks before the samples; and, without ``time_budget``, at each 1000th sample. This method
+        compares them at the present state and at points of several magnitudes, whatever has
+        changed, in some hundred microseconds.
+
+        Returns
+        -------
+        bool
+            Whether they agree. If not, an `EngineWarning` names the function and the point, and the
+            estimator evaluates the functions as they are written from now on.
+        """
+        try:
+            return self._engine.verify(self._usual_input)
+        except EngineChangeError as change:
+            self._change_engine(change)
+            return False
 
     def _change_engine(self, change: EngineChangeError) -> None:
         self._engine = change.engine

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .._linalg import cholesky, inverse, least_pivot
 from ..costs import Cost
-from ..memory.fields import Sizes
+from ..memory.fields import MemorySizes
 from ..model.functions import contained, raised
 from ..model.sets import ConvexSet
 from ..model.system import Function, System
@@ -54,7 +54,7 @@ class ObserverSteps(WindowSamples):
     ) -> None:
         n, p, m = system.n, system.p, system.m
         covariance, memory = observer.initial_covariance(), observer.initial_memory()
-        sizes = Sizes.of(
+        sizes = MemorySizes.of(
             n, p, m, horizon, sensors=len(observer.sensors), held=len(system.held),
             covariance=covariance is not None, majorised=not cost.quadratic,
             roots=observer.propagates_roots, memory=0 if memory is None else len(memory),

@@ -277,7 +277,7 @@ class Problem:
     def _rolled_out(self, trajectory: Array, of_candidate: bool) -> Array:
         """Follow the model where there is no disturbance, stage by stage.
 
-        Components j with W_j = {c} become f_j(x_i) + c; for directions see `Directions`.
+        Components j with W_j = {c} become f_j(x_i) + c; for directions see `NoiseFreeDirections`.
         """
         constraints, rolled_out = self.constraints, trajectory.copy()
         free, shift, directions = constraints.noise_free, constraints.constant, None

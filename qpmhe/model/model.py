@@ -353,17 +353,22 @@ class Model:
         pinned = self._relied
         return pinned is not None and any(one.function for one in pinned.found.values())
 
-    def fault(self, x: Array, u: Array) -> str:
-        """Which function differs from its trace at a state (n,) and input (m,), and how.
+    @property
+    def traced_functions(self) -> tuple[Callable[..., Any], ...]:
+        """The user's f and h, where traces may stand in their places."""
+        return self.system.tracing.functions if self.is_traced and self.system.tracing else ()
+
+    def fault(self, where: Points) -> str:
+        """Which function differs from its trace at these states and inputs, and how.
 
         Blank if none does. Never raises, whatever the functions do.
         """
         pinned, tracing = self._relied, self.system.tracing
-        if pinned is None or tracing is None or not np.isfinite(u).all():
+        if pinned is None or tracing is None:
             return ""
         if self.system.origin.is_timed:  # compared as the model that it is made of
             return ""
-        wrong = tracing.wrong(pinned, x, u)
+        wrong = tracing.wrong(pinned, [one for one in where if np.isfinite(one[1]).all()])
         return "" if wrong is None else f"{wrong[0]} has changed since it was traced: {wrong[1]}"
 
     # Other models of the same system
@@ -425,7 +430,7 @@ class Model:
         rate = written.rate_jacobian
         for function in (written.f, written.h, *(() if rate is None else (rate,))):
             check_at(function, x, u)
-        fault = self.fault(x, u)
+        fault = self.fault([(x, u)])
         if fault:
             model = self.as_written()
             warn_of(fault)

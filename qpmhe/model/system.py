@@ -20,7 +20,7 @@ from .derivatives import Jacobian
 from .functions import BatchedFunction, Trusted
 from .model import Model, ModelCache, Origin, check_at
 from .ode import made_from_ode
-from .points import FEW, Points, points
+from .points import FEW, USUAL, Points, points
 from .residuals import Residual, Turns, checked_residual
 from .sets import ConvexSet, SoftSet
 from .system_arguments import (
@@ -312,22 +312,31 @@ class System:
         constraints = self.constraints
         return self.evaluation.is_traced or (constraints is not None and constraints.is_traced)
 
-    def fault(self, x: Array, u: Array) -> str:
-        """Which function differs from its trace at a state (n,) and input (m,), and how.
+    @property
+    def traced_functions(self) -> tuple[Callable[..., Any], ...]:
+        """The user's functions in whose places traces are evaluated."""
+        constraints = () if self.constraints is None else self.constraints.traced_functions
+        return *self.evaluation.traced_functions, *constraints
+
+    def fault(self, where: Points) -> str:
+        """Which function differs from its trace at these states and inputs, and how.
 
         Blank if none does.
 
         Parameters
         ----------
-        x : (n,) array
-            The state.
-        u : (m,) array
-            The input.
+        where : list of (x, u)
+            States (n,) and inputs (m,); what is not finite is left out.
         """
-        fault = self.evaluation.fault(x, u)
-        if not fault and self.constraints is not None and np.isfinite(u).all():
-            return self.constraints.fault(x, u)
+        fault = self.evaluation.fault(where)
+        if not fault and self.constraints is not None:
+            return self.constraints.fault([one for one in where if np.isfinite(one[1]).all()])
         return fault
+
+    def usual_points(self) -> Points:
+        """States and inputs of several magnitudes, in the units of `scales`, within X's bounds."""
+        units = 1.0 if self.scales is None else self.scales
+        return points(USUAL, self.n, self.m, self.states, units)
 
     def as_written(self) -> System:
         """The same system, whose functions are called as they are written."""
