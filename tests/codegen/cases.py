@@ -282,7 +282,7 @@ def _kinetics(method, steps=1):
         method=method, steps=steps,
     )
     cost = QuadraticCost.from_covariances(
-        prior=np.diag([0.1, 0.001, 0.1]) ** 2, disturbance=np.diag([0.02, 0.0005, 0.02]) ** 2,
+        prior=np.diag([0.1, 0.001, 0.1]) ** 2, disturbance=0.05**2 * np.eye(3),
         noise=0.02**2 * np.eye(2),
     )
     generator, x, samples = np.random.default_rng(3), np.array([1.0, 0.004, 0.2]), []
