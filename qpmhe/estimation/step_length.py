@@ -156,8 +156,8 @@ def check_step(
         f"{steps} of {system.method} in dt = {system.dt:g} is too long: from x = {point} the "
         f"result differs from that of half the length by {error.deviations:.2g} standard "
         f"deviations of the disturbance in state {error.component} (expected at most "
-        f"{comparison.most:g}), so estimates may be wrong though each step improves its cost. {remedy}. Or make the "
-        "covariance of the disturbance as large as the error.",
+        f"{comparison.most:g}), so estimates may be wrong though each step improves its cost. "
+        f"{remedy}. Or make the covariance of the disturbance as large as the error.",
         ModelWarning,
         stacklevel=level + 1,
     )
