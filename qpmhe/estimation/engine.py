@@ -242,6 +242,8 @@ class PythonEngine:
         trial, candidate, message = outcome.trial, problem.candidate, outcome.message
         status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
         if outcome.events:
+            if Status.RESTORED in outcome.events:
+                status = Status(0)  # better than no candidate, but in the sets
             status |= outcome.events
         if window.events:
             status |= Status(window.events)
@@ -302,6 +304,7 @@ class PythonEngine:
             self._disturbances,
             window.observer_state.copy(),
             window.rejected,
+            outcome.restored_cost,
         )
         if window.newest_failed and outcome.improved:
             window.restart(estimate.state)

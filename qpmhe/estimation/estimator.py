@@ -82,7 +82,8 @@ class MovingHorizonEstimator:
         ends before, with `Status.UNCONVERGED`, at 100 QPs, and without a cap on iterations or time
         at three in a row that the backend has not solved to its tolerance. Where a QP's step does
         not lower J at any length, the next QP is damped, and counts. If inequalities are
-        dropped, at least one QP is solved without them, even beyond the cap.
+        dropped, or the candidate is restored into the sets, at least one QP is solved after that,
+        even beyond the cap.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.
@@ -102,10 +103,12 @@ class MovingHorizonEstimator:
         Whether the observer's state is projected onto X after each step, in the observer's metric:
         `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its linearised
         error. False gives the paper's plain observer, which may leave X.
-    infeasible : {"drop_rows", "keep_candidate"}
+    infeasible : {"drop_rows", "restore"}
         What to do if the candidate violates a set and no trajectory satisfying all sets is found at
-        a cost up to the candidate's: ``drop_rows`` leaves out, in this step only, the inequalities
-        that the candidate violates; ``keep_candidate`` returns the candidate.
+        a cost up to the candidate's. ``drop_rows`` leaves out, in this step only, the inequalities
+        that the candidate violates. ``restore`` first looks for the nearest trajectory that
+        satisfies all sets, and lowers the cost from there: the sets come before the cost, which may
+        then be above the candidate's. The paper's theorem does not cover such a step.
     warm_start : bool
         Whether the sequence starts at the previous estimate, shifted by one step, if its true J is
         lower than the candidate's. Either way J(estimate) <= J(candidate).

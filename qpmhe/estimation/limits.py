@@ -50,6 +50,12 @@ NEAREST_POINTS = 5
 #: what the last one missed: it approaches no feasible one.
 NEARER = 0.9
 
+#: Largest number of QPs for a trajectory into which a candidate is restored, from each start.
+RESTORING = 20
+
+#: A step towards the sets is taken if it takes away this share, times its length, of the miss.
+TOWARDS = 0.1
+
 #: Largest miss of a row of a feasible trial, as a share of the row's scale: QP solvers end on the
 #: boundary up to their tolerance.
 FEASIBLE = 5e-9

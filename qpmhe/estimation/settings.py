@@ -11,7 +11,7 @@ from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, OptionError
 from .limits import PATIENCE
 
-Infeasible = Literal["drop_rows", "keep_candidate"]
+Infeasible = Literal["drop_rows", "restore"]
 Candidate = Literal["observer", "reinitialized"]
 Arrival = Literal["observer", "smoothed"]
 Engine = Literal["auto", "python", "compiled"]

@@ -125,7 +125,7 @@ class Problem:
             "warm_start": bool(rng.random() < 0.3),
             "candidate": "reinitialized" if rng.random() < 0.2 else "observer",
             "project_observer": bool(rng.random() < 0.8),
-            "infeasible": ("drop_rows", "keep_candidate")[rng.integers(2)],
+            "infeasible": ("drop_rows", "restore")[rng.integers(2)],
         }
 
     def draw_directions(self):
@@ -488,6 +488,8 @@ class Problem:
         units = units or self.own_units
         if self.k:
             options["parameters"] = self.nominal * units.inputs[self.m :]
+        if (self.options | options).get("engine") == "compiled":  # which does not restore
+            options["infeasible"] = "drop_rows"
         return qpmhe.MovingHorizonEstimator(
             *self.parts(units), initial_state=self.start * units.states, **self.options | options,
         )
