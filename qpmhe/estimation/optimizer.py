@@ -49,6 +49,9 @@ _ENDS = (
 # What no longer holds where another sequence begins.
 _OUTDATED = Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED | Status.CAP_REACHED
 
+# A message names so many missed rows.
+_NAMED = 6
+
 
 class Outcome:
     """The result of the sequence of QPs, updated while it runs.
@@ -246,9 +249,11 @@ class Optimizer:
                 if outcome.dropped:
                     outcome.events |= Status.ROWS_DROPPED
         if missed:
+            listed = [f"the {row}" for row in missed[:_NAMED]]
+            listed += [f"{len(missed) - _NAMED} more"] * (len(missed) > _NAMED)
             outcome.message = (
-                "no trajectory that satisfies all sets was found; the nearest to one misses the "
-                f"{', the '.join(map(str, missed))}. {outcome.message}"
+                "no trajectory that satisfies all sets was found; the nearest to one misses "
+                f"{', '.join(listed)}. {outcome.message}"
             ).strip()
 
     def _restore(
