@@ -117,7 +117,10 @@ def _plain(value: Any) -> NDArray[Any]:
     array = np.asarray(value)
     if array.dtype.names is None:
         return array
-    return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), array.dtype.itemsize)
+    clean = np.zeros(array.shape, array.dtype)  # and so is what lies between the fields
+    for name in array.dtype.names:
+        clean[name] = array[name]
+    return clean.view(np.uint8).reshape(len(array), array.dtype.itemsize)
 
 
 def hand_over(

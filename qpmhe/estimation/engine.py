@@ -19,10 +19,11 @@ from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..memory.record import Mark, Record
 from ..memory.snapshot import reading
+from ..model.captured import ComparisonTimes, Due
 from ..model.derivatives import Nearby
 from ..model.residuals import difference
 from ..model.system import System
-from ..model.traces import next_check, warn_of
+from ..model.traces import warn_of
 from ..observers import Observer
 from ..terms.sum import root_of_first, weight_of_first
 from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
@@ -105,8 +106,8 @@ class PythonEngine:
         self._smoothed = settings.arrival == "smoothed"
         self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
-        # The time of the next comparison of the trace with the functions that it stands for.
-        self._next_check: float = 0 if system.is_traced else math.inf
+        # When the traces are compared with the functions that they stand for.
+        self._times = ComparisonTimes(system.traced_functions, settings.time_budget is None)
         self._undo_point: Mark
 
     def _use_system(self, system: System) -> None:
@@ -183,7 +184,7 @@ class PythonEngine:
         self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
-        if self._window.time >= self._next_check:
+        if self._window.time >= self._times.next:
             self._check_trace(u)
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
@@ -207,13 +208,22 @@ class PythonEngine:
             raise
 
     def _check_trace(self, u: Array) -> None:
-        """Compare trace and functions at z(t); take the functions for good where they differ."""
-        window = self._window
-        fault = self._system.fault(window.candidate[-1], u)
-        self._next_check = next_check(window.time, self._settings.horizon)
-        if fault:
-            self.leave_trace()
-            warn_of(fault, 5)
+        """Compare traces and functions if it is time to."""
+        due = self._times.due(self._window.time)
+        if due is not Due.NOWHERE:
+            self.verify(u, due is Due.EVERYWHERE, 6)
+
+    def verify(self, u: Array, everywhere: bool = True, level: int = 4) -> bool:
+        """Compare traces and functions at z(t); take the functions for good where they differ."""
+        window, system = self._window, self._system
+        where = [(window.candidate[-1], u), *(system.usual_points() if everywhere else ())]
+        fault = system.fault(where)
+        if not fault:
+            self._times.compared(window.time)
+            return True
+        self.leave_trace()
+        warn_of(fault, level)
+        return False
 
     def leave_trace(self) -> None:
         """Evaluate the original functions, along the window and from now on."""
@@ -224,7 +234,7 @@ class PythonEngine:
         except BaseException:  # an interrupt: the trace is still there, and compared again
             self.replace(before)
             raise
-        self._next_check = math.inf
+        self._times.end()
 
     def _warn(self) -> None:
         text = self._watch.warning(self._window.watched)
@@ -417,7 +427,10 @@ class PythonEngine:
     def _use(self, memory: Memory) -> None:
         self._system, self._tools, self._window = memory
         self._nearby = _nearby(self._system)
-        self._next_check = 0 if self._system.is_traced else math.inf
+        if self._system.is_traced:
+            self._times.restart(self._window.time)
+        else:
+            self._times.end()
 
     def adopt(
         self, usual: Conditions, record: Record, residuals: Array,

@@ -13,7 +13,8 @@ from qpmhe_solvers.values import shown
 from ..errors import InvalidInputError, SetError, ShapeError
 from .functions import BatchedFunction, Trusted
 from .sets import Box, ConvexSet, SoftSet
-from .system import System, SystemOptions
+from .system import System
+from .system_arguments import SystemOptions
 
 Array = NDArray[Any]
 Index = NDArray[np.intp]
