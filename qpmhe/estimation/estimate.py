@@ -44,6 +44,7 @@ class Status(enum.Flag):
     DERIVATIVE_NEARBY = enum.auto()
     CAP_REACHED = enum.auto()
     RESTORED = enum.auto()
+    RESTARTED = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what to do about it, in sentences."""
@@ -102,7 +103,8 @@ _TEXTS = {
     ),
     Status.OBSERVER_FAR: (
         "The observer has been far from the estimates for a whole horizon; use another gain or "
-        "observer, or candidate='reinitialized', which restarts it from the estimates."
+        "observer, or candidate='reinitialized', which restarts it from the estimates at each "
+        "sample, or restart=True, which does where that predicts the measurements better."
     ),
     Status.TIME_UP: "The time budget was spent; the best trajectory so far is the estimate.",
     Status.GRADUATED: (
@@ -144,6 +146,12 @@ _TEXTS = {
         "No trajectory satisfying all sets was found at a cost up to the candidate's: the nearest "
         "one to the candidate takes its place, and the estimate's true cost is at most "
         "estimate.restored_cost. The paper's theorem does not cover this sample."
+    ),
+    Status.RESTARTED: (
+        "The observer has predicted the window's measurements far worse than another one that "
+        "starts at the estimate of a horizon before, with the prior's covariance: that one "
+        "continues from here on, and what is proved about the former ends. If this happens often, "
+        "use another gain or observer, or larger covariances of its disturbance."
     ),
 }
 

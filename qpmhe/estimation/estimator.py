@@ -119,6 +119,13 @@ class MovingHorizonEstimator(EstimatorMemory):
         this estimate already uses N - 1 of the window's measurements, so they count twice. The
         candidate stays the observer's trajectory, and its J then has a prior term. If a loss is not
         finite there, the step uses z(t-N).
+    restart : bool
+        Whether the observer may be restarted from an estimate, at most once in N samples. At each
+        sample a second observer runs over the window, from the estimate that was made of its first
+        state before its measurements came, with the prior's covariance. It takes the first one's
+        place where it has predicted these measurements far better, by an F-test of the squared
+        errors. The status then has `Status.RESTARTED`, with which what the theorem and certificates
+        prove ends. Each sample costs N observer steps more.
     parameters : (k,) array_like, optional
         Usual values of the model's parameters, the last k of the system's m inputs; ``u`` then has
         m - k numbers. They hold until `set` changes them; `update` takes values for a single
@@ -172,12 +179,13 @@ class MovingHorizonEstimator(EstimatorMemory):
         isolated: bool = False,
         arrival: str = "observer",
         parameters: ArrayLike | None = None,
+        restart: bool = False,
     ) -> None:
         is_copy = "settings" in vars(self)  # from `__setstate__`: no warning is given twice
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
             engine, project_observer, infeasible, warm_start, candidate, time_budget,
-            isolated, arrival, nominal_parameters(parameters),
+            isolated, arrival, nominal_parameters(parameters), restart,
         )
         self.system, self.observer, self.cost = system, observer, cost
         require(system, System, "system", "qpmhe.System")

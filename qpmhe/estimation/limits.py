@@ -63,6 +63,10 @@ FEASIBLE = 5e-9
 #: An observer more than this many standard deviations of the prior from an estimate is far.
 FAR = 10.0
 
+#: With this probability, of two samples of equally large normal errors the first does not seem so
+#: much larger that its observer is restarted.
+LARGER = 0.99
+
 #: A correction is in the range of the disturbances if less than this share of it is not.
 IN_RANGE = 1e-12
 

@@ -80,6 +80,7 @@ class Case:
             one.from_observer = False
         # The code is checked when it is loaded: what is wrong is optimised less.
         self.levels = LEVELS[int(rng.integers(len(LEVELS))) :]
+        self.restarted = -1
         self.scribble, self.snapshots = rng.random() < 0.3, rng.random() < 0.15
 
     @contextmanager
@@ -257,6 +258,11 @@ class Case:
         again, watcher = range(K - 1, K), self.watcher
         if self.one.options["candidate"] == "reinitialized":
             z[first], again = history[first], range(K)
+        elif Status.RESTARTED in status:
+            wrong(not self.one.options["restart"], "restarted against the option")
+            wrong(t - self.restarted < K, "restarted twice within a horizon")
+            z[first], P[first], again = history[first], watcher.P0.copy(), range(K)
+            self.restarted = t
         wrong(not np.array_equal(found[0], z[first]), "the candidate starts at", found[0])
         tolerance = 1e-9 if watcher.exact else 1e-5
         for i in again:
