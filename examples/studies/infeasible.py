@@ -53,17 +53,21 @@ class Found(NamedTuple):
 
 
 def compared(
-    name: str, sets: str, records: Sequence[Callable[[str], Found]], settled: int
+    name: str, sets: str, records: Sequence[Callable[[str], Found]], settled: int | None = None
 ) -> str:
-    """A line of the table, of functions that run a policy on a record."""
+    """A line of the table, of functions that run a policy on a record.
+
+    Its last three quarters are settled, or those from a sample on.
+    """
     found = [[run(policy) for policy in POLICIES] for run in records]
 
     def share(flag: Status, policy: int) -> str:
         return f"{100.0 * np.mean([pair[policy].run.share(flag) for pair in found]):.0f}"
 
-    def ratio(size: Callable[[Array], Array], first: int = 0) -> str:
+    def ratio(size: Callable[[Array], Array], is_settled: bool = False) -> str:
         logs = []
         for drop, restore in found:
+            first = (len(drop.errors) // 4 if settled is None else settled) if is_settled else 0
             one, other = size(drop.errors[first:]), size(restore.errors[first:])
             logs.append(np.log(other / np.where(one > 0.0, one, 1.0)))
         return f"{np.exp(np.mean(logs)):.3f}"
@@ -75,7 +79,7 @@ def compared(
     times = [restore.seconds / drop.seconds for drop, restore in found]
     return " | ".join((
         name, sets, share(Status.CANDIDATE_OUTSIDE, 0), share(Status.ROWS_DROPPED, 0),
-        share(Status.RESTORED, 1), ratio(rms), ratio(rms, settled),
+        share(Status.RESTORED, 1), ratio(rms), ratio(rms, True),
         ratio(lambda errors: np.nanmax(np.abs(errors), axis=0)), f"{np.median(times):.2f}",
     ))
 
@@ -149,7 +153,7 @@ def gallery(names: Sequence[str], data: Path, most: int) -> Iterator[str]:
                 "noises": Box(-3.0 * v, 3.0 * v)
             }))
             runs = [of_record(narrow, record, most) for record in problem.records[:2]]
-            yield compared(problem.name, "V: 3 sd", runs, most // 4)
+            yield compared(problem.name, "V: 3 sd", runs)
 
 
 def of_record(problem: Problem, record: Any, most: int) -> Callable[[str], Found]:
