@@ -39,7 +39,7 @@ _ROWS_DROPPED = Status.ROWS_DROPPED.value
 _PIECE = 256
 
 
-class Tools(NamedTuple):
+class CompiledTools(NamedTuple):
     """What a step uses; made again when the usual conditions change."""
 
     usual: Conditions
@@ -61,7 +61,9 @@ class CompiledEngine:
         self._system, self._given_cost, self._settings = system, cost, settings
         self._reader = ConditionReader(system, cost)
         self._directions = directions = library.directions
-        self._tools = Tools(usual_conditions(settings), system, directions.cost, library.settings)
+        self._tools = CompiledTools(
+            usual_conditions(settings), system, directions.cost, library.settings
+        )
         space = directions.cost.space
         self._to_disturbances = None if space is None else space.to_disturbances
         n, p, m, horizon = system.n, system.p, system.m, settings.horizon
@@ -106,7 +108,7 @@ class CompiledEngine:
         if system is not None:
             self._system, self._mirror = self._system.evaluated_like(system), None
 
-    def _replace(self, memory: NDArray[Any], tools: Tools) -> None:
+    def _replace(self, memory: NDArray[Any], tools: CompiledTools) -> None:
         """Remember this in place of all that was; whole or, if interrupted, not at all."""
         before = self._memory.copy(), self._tools
         self._held = tools, self._tools  # the memory points to a record of these
@@ -117,10 +119,10 @@ class CompiledEngine:
             self._memory[...], self._tools = before
             raise
 
-    def _tools_for(self, usual: Conditions) -> Tools:
+    def _tools_for(self, usual: Conditions) -> CompiledTools:
         """What a step uses under these usual conditions."""
         system, cost = usual.applied(self._system, self._directions.cost)
-        return Tools(usual, system, cost, self._library.settings_for(system, cost, usual))
+        return CompiledTools(usual, system, cost, self._library.settings_for(system, cost, usual))
 
     @property
     def usual(self) -> Conditions:

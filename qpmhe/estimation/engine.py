@@ -17,7 +17,7 @@ from .._checks import check_problem
 from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
-from ..memory.record import Mark, Record
+from ..memory.record import Mark, MemoryRecord
 from ..memory.snapshot import reading
 from ..model.captured import ComparisonTimes, Due
 from ..model.derivatives import Nearby
@@ -34,7 +34,7 @@ from .optimizer import Optimizer
 from .problem import Formulation, Solved
 from .settings import Settings
 from .subproblem import Subproblem
-from .watch import ObserverWatch
+from .watch import NEAR, ObserverWatch
 from .window import Window
 
 Array = NDArray[np.float64]
@@ -198,7 +198,7 @@ class PythonEngine:
         )
         try:
             with np.errstate(all="ignore"):
-                if window.length == self._settings.horizon:
+                if window.end - window.start == window.horizon:
                     self._solver.shift()
                     if self._smoothed and window.trajectory is not None:
                         window.smoothed_prior = window.trajectory[1].copy()
@@ -209,7 +209,8 @@ class PythonEngine:
                     window.challenge()
                 estimate = self._estimate(began)
             window.history[window.end] = estimate.state
-            self._warn()
+            if window.watched != NEAR:
+                self._warn()
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             self.undo()
@@ -273,7 +274,8 @@ class PythonEngine:
         if candidate.values is not None and (text := problem.constraint_failure(candidate)):
             status |= Status.MODEL_FAILED
             message = f"{text} {message}".strip()
-        if not math.isfinite(candidate.cost):
+        finite = math.isfinite(candidate.cost)
+        if not finite:
             status &= ~Status.NO_DECREASE  # the model failed, not the solver
             if problem.rolled_out is not None:
                 status |= Status.MODEL_FAILED
@@ -294,7 +296,7 @@ class PythonEngine:
             if window.watched[0] >= settings.horizon:
                 status |= Status.OBSERVER_FAR
         else:
-            window.watched = 0, 0
+            window.watched = NEAR
             # The candidate's arrays are views of the window: copy.
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
@@ -320,11 +322,12 @@ class PythonEngine:
             outcome.nearest_points,
             filtered,
             self._disturbances,
-            window.observer_state.copy(),
-            window.rejected,
+            window.z[window.end].copy(),
+            window.rejected if window.rejects else None,
             outcome.restored_cost,
         )
-        if window.newest_failed and outcome.improved:
+        # Where the newest stage failed, J of the candidate is infinite.
+        if not finite and outcome.improved and window.newest_failed:
             window.restart(estimate.state)
             estimate.observer_state = estimate.state.copy()
         if problem.hold is not None:
@@ -441,7 +444,7 @@ class PythonEngine:
             self._times.end()
 
     def adopt(
-        self, usual: Conditions, record: Record, residuals: Array,
+        self, usual: Conditions, record: MemoryRecord, residuals: Array,
         metric: tuple[Array, bool] | None, replay: bool,
     ) -> None:
         """Continue from another engine's record.

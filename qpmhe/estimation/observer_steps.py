@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .._linalg import cholesky, inverse, least_pivot
 from ..costs import Cost
-from ..memory.fields import Sizes
+from ..memory.fields import MemorySizes
 from ..model.functions import contained, raised
 from ..model.sets import ConvexSet
 from ..model.system import Function, System
@@ -54,7 +54,7 @@ class ObserverSteps(WindowSamples):
     ) -> None:
         n, p, m = system.n, system.p, system.m
         covariance, memory = observer.initial_covariance(), observer.initial_memory()
-        sizes = Sizes.of(
+        sizes = MemorySizes.of(
             n, p, m, horizon, sensors=len(observer.sensors), held=len(system.held),
             covariance=covariance is not None, majorised=not cost.quadratic,
             roots=observer.propagates_roots, memory=0 if memory is None else len(memory),
@@ -78,7 +78,8 @@ class ObserverSteps(WindowSamples):
         # Time up to which running observers have taken the samples; -1 makes them start again.
         self._advanced_to = -1
         self._sample = Sample(system, np.zeros(m))
-        self._rejects = observer.rejects
+        #: Whether the observer has a gate.
+        self.rejects: bool = observer.rejects
         self._usual = usual
         self._filled: Conditions | None = None  # those that are in the sample now
         self._evaluating = ""  # for messages: the function that is being evaluated
@@ -161,7 +162,7 @@ class ObserverSteps(WindowSamples):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
-        if self._rejects:
+        if self.rejects:
             self._report_rejected(k)
 
     def _not_finite(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> str:
@@ -191,7 +192,7 @@ class ObserverSteps(WindowSamples):
     @property
     def rejected(self) -> NDArray[np.bool_] | None:
         """Which sensors the observer rejected at the newest stage; None without a gate."""
-        return self._rejected_at(self.end - 1) if self._rejects else None
+        return self._rejected_at(self.end - 1) if self.rejects else None
 
     def _rejected_at(self, k: int) -> NDArray[np.bool_]:
         rejections = self.rejections

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..memory.fields import Sizes
-from ..memory.record import Record
+from ..memory.fields import MemorySizes
+from ..memory.record import MemoryRecord
 from ..model.system import System
 from ..terms.linearization import StageTerms
 from .conditions import USUAL, Conditions
 from .limits import LARGEST
-from .stages import StageView, Views, WindowView
+from .stages import StageView, Views, WindowArrays
 
 Array = NDArray[np.float64]
 
@@ -24,14 +24,14 @@ Array = NDArray[np.float64]
 _KEPT = 1000
 
 
-class WindowSamples(Record):
+class WindowSamples(MemoryRecord):
     """Samples y(t-N), ..., y(t-1) with the observer's states z(t-N), ..., z(t).
 
     Here t is ``time``, the number of samples taken: y(t-1) is the newest, and x(t) is estimated.
     """
 
     def __init__(
-        self, system: System, cost: Cost, sizes: Sizes, initial_state: Array,
+        self, system: System, cost: Cost, sizes: MemorySizes, initial_state: Array,
         covariance: Array | None, with_terms: bool,
     ) -> None:
         super().__init__(
@@ -50,8 +50,8 @@ class WindowSamples(Record):
         self._stage_views: Sequence[StageView] = Views(
             room, lambda k: StageView(self, self.terms, k)
         )
-        self._window_views: Sequence[WindowView] = Views(
-            room + 1 - horizon, lambda k: WindowView(self, self.terms, k, k + horizon)
+        self._window_views: Sequence[WindowArrays] = Views(
+            room + 1 - horizon, lambda k: WindowArrays(self, self.terms, k, k + horizon)
         )
         if horizon <= _KEPT:
             self._stage_views = list(self._stage_views)
@@ -65,10 +65,10 @@ class WindowSamples(Record):
         )
 
     @property
-    def view(self) -> WindowView:
+    def view(self) -> WindowArrays:
         """The views of the present window, which has at least one stage."""
         if self.end - self.start < self.horizon:
-            return WindowView(self, self.terms, self.start, self.end)
+            return WindowArrays(self, self.terms, self.start, self.end)
         return self._window_views[self.start]
 
     @property
@@ -194,7 +194,7 @@ class WindowSamples(Record):
         """J of the candidate; its prior term is 0 exactly."""
         return self.candidate_cost_of(self.view)
 
-    def candidate_cost_of(self, view: WindowView) -> float:
+    def candidate_cost_of(self, view: WindowArrays) -> float:
         """J of the candidate, from the window's present view."""
         costs = view.costs
         if self._discounts is None:

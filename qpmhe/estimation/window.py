@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..memory.record import Mark, Record
+from ..memory.record import Mark, MemoryRecord
 from ..model.system import System
 from ..observers import Observer
 from ..terms.base import read_only
@@ -70,6 +70,8 @@ class Window(ObserverSteps):
 
     def moves_state(self, own: Conditions | None) -> bool:
         """Whether a sample with these conditions may project z(t) onto another X."""
+        if own is None and not self.own:
+            return False
         states = None if own is None else own.states
         return states is not self.own.get(self.time - 1, USUAL).states
 
@@ -96,7 +98,7 @@ class Window(ObserverSteps):
             self.own[time] = own
             if own.noise_weight is not None or own.disturbance_weight is not None:
                 self._set_weight(k, time)
-        if self._observers_ready:
+        if self._observers is not None and self._observers_ready:
             self._find_observed(k, time)
             if moves:
                 self._advanced_to = min(self._advanced_to, time - 1)
@@ -250,12 +252,12 @@ class Window(ObserverSteps):
         return bool(np.isfinite(checked).all())
 
     def roll_back(self, mark: Mark) -> None:
-        """Undo all changes since a mark; see `Record.roll_back`."""
+        """Undo all changes since a mark; see `MemoryRecord.roll_back`."""
         self._advanced_to = -1
         super().roll_back(mark)
 
     def load_state_dict(self, *arguments: Any, **options: Any) -> None:
-        """Load a snapshot; see `Record.load_state_dict`."""
+        """Load a snapshot; see `MemoryRecord.load_state_dict`."""
         super().load_state_dict(*arguments, **options)
         self.has_disturbance_weights = True
 
@@ -271,7 +273,7 @@ class Window(ObserverSteps):
             following = hold.followed(trajectory[int(self.length == self.horizon)])
         self.trusted = np.stack((hold.target, following))
 
-    def adopt(self, record: Record, residuals: Array) -> None:
+    def adopt(self, record: MemoryRecord, residuals: Array) -> None:
         """Go on from another engine's record, with its joint residuals along the candidate."""
         self.copy_from(record)
         self.terms.residuals[: self.end] = residuals

@@ -29,7 +29,7 @@ from .symbols import (
     _MACHINERY,
     INSTEAD,
     NotTraceableError,
-    Record,
+    TraceRecord,
     place,
     plain,
     run,
@@ -176,7 +176,7 @@ _STANDARD = str(Path(dis.__file__).parent)
 
 
 @contextlib.contextmanager
-def _watch(record: Record) -> Iterator[None]:
+def _watch(record: TraceRecord) -> Iterator[None]:
     """Refuse, meanwhile, exceptions in the user's code, and looks at types and identities."""
 
     def within(_: Any, event: str, argument: Any) -> Any:
