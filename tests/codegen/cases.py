@@ -628,7 +628,7 @@ FEATURES = {
         ), conditions),
         # The window never is full of such samples, about which there is a warning.
         "states not projected": ("states in a polytope", conditions, {
-            "project_observer": False, "horizon": STEPS + 1, "infeasible": "keep_candidate",
+            "project_observer": False, "horizon": STEPS + 1,
         }),
         "states in a diagonal metric": ("states in a polytope", METRIC, conditions, DIAGONAL),
         "extended in states, diagonal": ("states in a polytope", filtered(), gaps, DIAGONAL),
@@ -656,7 +656,6 @@ FEATURES = {
         ),
         "narrow conditions": ("inputs", boxed, conditions, {"horizon": 1}),
         "tank conditions": (_tank, conditions),
-        "tank kept": ("tank conditions", {"infeasible": "keep_candidate"}, WARM),
         "tank in time": ("tank conditions", {"time_budget": 1e6}),
     },
     "observers": {
