@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from functools import lru_cache
 from importlib.resources import files
 from string import Template
@@ -18,8 +19,6 @@ from ..model.expressions import CasadiModel, import_casadi
 from .layout import TERMS, Layout
 from .single import in_single_precision
 
-# In the place of a part: the calls of the further terms.
-_FURTHER = ""
 #: The file that holds a whole estimator.
 MAIN = "mhe.c"
 # Four (n, n) arrays of them fit on any usual stack.
@@ -201,19 +200,17 @@ def estimator_files(
 ) -> dict[str, str]:
     """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
-    parts = (
-        "algebra.c", "residuals.c", "conditions.c", "cost.c", "observer.c", "projection.c",
-        "window.c", "prior.c", *(f"{term}.c" for term, _ in layout.terms), _FURTHER, "sets.c",
-        "trial.c", "damping.c", "factor.c" if layout.free is None else "elimination.c",
-        "budget.c", "inequalities.c", "optimizer.c", "step.c",
-    )
     single = layout.real == "float"
-    further = _further_terms([term for term, _ in layout.terms])
-    texts = [
-        model_source(model, single),
-        *(further if part == _FURTHER else template(part) for part in parts),
-    ]
-    body = prologue() + "\n".join(texts)
+    before = "algebra", "residuals", "conditions", "cost"
+    after = (
+        "sets", "trial", "damping", "factor" if layout.free is None else "elimination", "budget",
+        "inequalities", "optimizer", "step",
+    )
+    body = prologue() + "\n".join((
+        model_source(model, single), *_parts(before), layout.sizes.c_functions(),
+        *_parts(_observer_parts(layout)), *_parts(("window", "prior", *layout.terms)),
+        _further_terms(layout.terms), *_parts(after),
+    ))
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
         f"const mhe_settings mhe_default_settings = {_initializer(settings)};\n"
@@ -224,7 +221,30 @@ def estimator_files(
     return {f"{name}.h": head, f"{name}.c": text}
 
 
-def _further_terms(names: list[str]) -> str:
+def _parts(names: Iterable[str]) -> list[str]:
+    """Text of these parts of the C."""
+    return [template(f"{name}.c") for name in names]
+
+
+def _observer_parts(layout: Layout) -> list[str]:
+    """The parts of C that compute the observer, and keep it in X."""
+    parts, rule = [], layout.innovation or "none"
+    if layout.covariance:
+        parts += ["covariance"]
+    if layout.deviations:
+        parts += ["kalman", *(["innovation"] if layout.innovation else []), f"innovation_{rule}"]
+    parts += [f"observer_{layout.observer}", "sensors" if layout.innovation else "sensors_none"]
+    if layout.covariance:
+        parts += ["roots" if layout.deviations else "roots_none", "following"]
+    else:
+        parts += ["following_none"]
+    if not layout.sets[2][0]:
+        return [*parts, "inside_none"]
+    metric = "metric_covariance" if layout.covariance else "metric_own"
+    return [*parts, "projection", metric, "inside"]
+
+
+def _further_terms(names: tuple[str, ...]) -> str:
     """C functions that call those of the terms that not every estimator has."""
 
     def body(call: str) -> str:
