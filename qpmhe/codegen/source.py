@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from functools import lru_cache
+from functools import cache
 from importlib.resources import files
 from string import Template
 from textwrap import indent
@@ -26,7 +26,7 @@ _MOST_STATES = 256
 CONTINUOUS = {None: 0, "euler": 1, "rk4": 4}
 
 
-@lru_cache(maxsize=16)
+@cache
 def template(name: str) -> str:
     """Text of a file among the package's C templates."""
     return files(__package__).joinpath("c", name).read_text(encoding="ascii")

@@ -162,7 +162,7 @@ class Innovation(ABC):
         limits[: given.size] = given
         for k, sensor in enumerate(self.sensors(outputs)):
             of_output[list(sensor)] = k
-        return {"limits": limits, "sensor_of": of_output, "reopen": np.int32(self.reopen)}
+        return {"limits": limits, "sensor_of": of_output, "reopen": np.array(self.reopen, np.int32)}
 
     @abstractmethod
     def judge(

@@ -95,7 +95,7 @@ class UnscentedKalman(KalmanType):
         """The covariances and the spread, unless a derived class may compute otherwise."""
         if type(self) is not UnscentedKalman:
             return None
-        spread = {"spread": np.float64(self._spread)}
+        spread = {"spread": np.array(self._spread)}
         return self._form("unscented", 2 * len(self._prior), spread)
 
     @property
