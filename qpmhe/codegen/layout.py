@@ -286,6 +286,11 @@ class Layout:
         )
 
     @property
+    def has_rows(self) -> bool:
+        """Whether there is a set."""
+        return any(there for there, _ in self.sets)
+
+    @property
     def rows(self) -> tuple[int, int]:
         """Stages of a window with rows, and rows of each, at least one."""
         return self.horizon + self.sets[2][0], max(sum(self.set_rows), 1)

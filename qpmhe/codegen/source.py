@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .._version import __version__
 from ..errors import CompilationError
 from ..model.expressions import CasadiModel, import_casadi
-from .layout import TERMS, Layout
+from .layout import SET_NAMES, TERMS, Layout
 from .single import in_single_precision
 
 #: The file that holds a whole estimator.
@@ -201,15 +201,13 @@ def estimator_files(
     """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
     single = layout.real == "float"
-    before = "algebra", "residuals", "conditions", "cost"
-    after = (
-        "sets", "trial", "damping", "factor" if layout.free is None else "elimination", "budget",
-        "inequalities", "optimizer", "step",
-    )
+    before = "algebra", "residuals", *(["sides"] if layout.has_rows else [])
     body = prologue() + "\n".join((
-        model_source(model, single), *_parts(before), layout.sizes.c_functions(),
+        model_source(model, single), *_parts(before), *_own_sets(layout),
+        *_parts(("conditions", "cost")), layout.sizes.c_functions(),
         *_parts(_observer_parts(layout)), *_parts(("window", "prior", *layout.terms)),
-        _further_terms(layout.terms), *_parts(after),
+        _further_terms(layout.terms), *_parts([] if layout.held else ["hold_none"]),
+        *_parts(_search_parts(layout)), template("step.c"),
     ))
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
@@ -229,6 +227,7 @@ def _parts(names: Iterable[str]) -> list[str]:
 def _observer_parts(layout: Layout) -> list[str]:
     """The parts of C that compute the observer, and keep it in X."""
     parts, rule = [], layout.innovation or "none"
+    parts.append(_or_none("quiet", layout.quiet > 0))
     if layout.covariance:
         parts += ["covariance"]
     if layout.deviations:
@@ -242,6 +241,33 @@ def _observer_parts(layout: Layout) -> list[str]:
         return [*parts, "inside_none"]
     metric = "metric_covariance" if layout.covariance else "metric_own"
     return [*parts, "projection", metric, "inside"]
+
+
+def _or_none(part: str, is_there: bool) -> str:
+    """The name of a part, or that of the one in its place."""
+    return part if is_there else f"{part}_none"
+
+
+def _own_sets(layout: Layout) -> list[str]:
+    """The parts of C by which samples may have sets of their own."""
+    return [
+        Template(template(f"{_or_none('own_set', is_there)}.c")).substitute(
+            name=name, letter=letter, capital=letter.upper(), size="NY" if letter == "v" else "NX",
+        )
+        for letter, name, (is_there, _) in zip("wvx", SET_NAMES, layout.sets, strict=True)
+    ]
+
+
+def _search_parts(layout: Layout) -> tuple[str, ...]:
+    """The parts of C that look for an estimate."""
+    constrained, factor = layout.has_rows, "factor" if layout.free is None else "elimination"
+    rows = f"rows_{factor}", "rows", "active_set", "interior_point", "constrained"
+    return (
+        _or_none("sets", constrained), "trial", "damping", factor, "budget", "outcome",
+        *(rows if constrained else ["unconstrained"]), "trials", _or_none("curved", constrained),
+        "optimizer", _or_none("graduated", layout.widened),
+        _or_none("rolled_out", layout.quiet > 0), _or_none("outside", constrained), "improve",
+    )
 
 
 def _further_terms(names: tuple[str, ...]) -> str:

@@ -65,12 +65,7 @@ static const real *mhe_disturbance_of(const mhe_settings *s, const mhe_stage *st
     if (stage->has_own_disturbance) {
         mhe_covariance_of(NX, stage->own_disturbance_weight, s->covariances.disturbance, scratch,
                           own);
-#if MHE_QUIET
-        mhe_multiply(NX, NX, NX, s->candidate_keep, own, scratch);
-        for (int i = 0; i < NX; i++)
-            for (int j = 0; j < NX; j++)
-                own[i * NX + j] = mhe_dot(NX, scratch + i * NX, s->candidate_keep + j * NX);
-#endif
+        mhe_keep_directions(s, own);
         return own;
     }
     return s->covariances.disturbance;

@@ -510,3 +510,13 @@ static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);
     return mhe_solve(e, k, 0, k->step);
 }
+
+/* The trial that the QP is around. */
+static void mhe_set_around(mhe_workspace *k, const mhe_trial *around) { k->around = around; }
+
+/* Roots need no ridge. */
+static int mhe_set_ridge(mhe_workspace *k, int has_ridge)
+{
+    (void)k; (void)has_ridge;
+    return 0;
+}

@@ -17,7 +17,6 @@ typedef struct {
     real moves[POINTS * NX], roots[NX];
 } mhe_sigma;
 
-#if MHE_X_SET
 /* Draw a pair of sigma points z + d and z - d nearer to z, to stay in the bounds of X; by how much.
  * Where z is on a bound both are inside of it: a sum of products ignores their sign. */
 static real mhe_draw_inside(const mhe_x_set *set, const real *z, real *one, real *other)
@@ -46,7 +45,6 @@ static real mhe_draw_inside(const mhe_x_set *set, const real *z, real *one, real
     }
     return share;
 }
-#endif
 
 static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, const real *P,
                              const real *root, mhe_sigma *sigma)
@@ -62,12 +60,9 @@ static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, cons
     }
     for (int k = 0; k < NX; k++) {
         real share = 1;
-#if MHE_X_SET
-        share = mhe_draw_inside(mhe_x_set_at(s, stage), stage->z, moves + k * NX,
-                                moves + (NX + k) * NX);
-#else
-        (void)stage;
-#endif
+        if (MHE_X_SET)
+            share = mhe_draw_inside(mhe_x_set_at(s, stage), stage->z, moves + k * NX,
+                                    moves + (NX + k) * NX);
         sigma->roots[k] = 1 / (sqrt((real)2) * s->observer.spread * share);
     }
 }

@@ -29,14 +29,8 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         if (!(o->events & MHE_MODEL_FAILED)) o->events |= MHE_FAILED_STAGE;
     }
     mhe_watch(e, k, o);
-#if MHE_WIDENED
-    memcpy(e->trajectory, o->followed ? k->followed : o->best->x, size);
-#else
-    memcpy(e->trajectory, o->best->x, size);
-#endif
-#if MHE_HELD
+    memcpy(e->trajectory, mhe_next_start(k, o), size);
     mhe_trust(e, k, o->best != o->candidate ? o->best->x : 0);
-#endif
     e->has_trajectory = 1;
     if (!isfinite(newest->cost) && o->best != o->candidate)
         memcpy(e->z_end, o->best->x + e->length * NX, sizeof e->z_end);
@@ -61,12 +55,8 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
         memcpy(e->smoothed_prior, e->trajectory + NX, sizeof e->smoothed_prior);
         e->has_smoothed = 1;
     }
-#if MHE_HELD
-    memcpy(e->trusted, e->trusted + MHE_HELD, sizeof e->trusted / 2);
-#endif
-#if CONSTRAINED
+    mhe_trust_on(e);
     if (before == MHE_HORIZON) mhe_shift_places(e);
-#endif
     int events = mhe_push(e, sample);
     if (e->settings->reinitialize) {
         mhe_stage *oldest = mhe_stage_at(e, 0);
@@ -105,14 +95,7 @@ static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome
     memcpy(out->observer_state, e->z_end, sizeof e->z_end);
     mhe_filtered(e, o, out->filtered);
     mhe_fill_sensors(e, out);
-#if CONSTRAINED
-    if (o->rows_dropped)
-        memcpy(out->dropped, k->left_out, sizeof out->dropped);
-    else
-        memset(out->dropped, 0, sizeof out->dropped);
-#else
-    (void)k;
-#endif
+    mhe_fill_dropped(k, o->rows_dropped, out);
 }
 
 void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
@@ -124,9 +107,7 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
     mhe_start_inside(e);
     memcpy(e->last_good, e->z_end, sizeof e->last_good);
     memcpy(e->history_end, e->z_end, sizeof e->z_end);
-#if MHE_HELD
     mhe_trust_start(e);
-#endif
     mhe_start_observer(e);
 }
 
