@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 
+from .fold import folded
+
 # Stands for lines that were left out.
 _GAP = "\x01\n"
 _DIRECTIVE = re.compile(r"#\s*(ifdef|ifndef|if|elif|else|endif)\b(.*)")
@@ -37,7 +39,8 @@ def stripped(header: str, source: str) -> tuple[str, str]:
     texts = [_resolved(header, macros, 1), _UNUSED.sub(r"\1", _resolved(source, macros, 0))]
     before: list[str] = []
     while texts != before:
-        before, texts = texts, _without_unused(texts)
+        before = texts
+        texts = _without_unused([texts[0], folded(texts[1], lambda one: _value(one, macros))])
     return _tidy(texts[0]), _tidy(texts[1])
 
 

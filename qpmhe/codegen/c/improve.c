@@ -42,7 +42,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     o->spare = k->trials + 1;
     o->other = k->trials + 2;
     mhe_set_candidate(e, k, o->candidate);
-    const int rolled_out = mhe_roll_candidate_out(e, k, o);
+    mhe_roll_candidate_out(e, k, o);
     const int feasible = o->candidate->violation <= MHE_FEASIBLE;
     if (!feasible) o->events |= MHE_CANDIDATE_OUTSIDE;
     if (!feasible && s->max_qps > 0)
@@ -51,8 +51,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
         o->events |= MHE_NO_QPS;
     else
         mhe_search(e, k, o, s->start_at_best ? before : -1, s->max_qps);
-    if (rolled_out && feasible && s->max_qps > 0 && o->best == o->candidate)
-        mhe_search_from_rolled_out(e, k, o);
+    mhe_search_from_rolled_out(e, k, o);
     mhe_keep_places(e, k);
     e->damping = o->damping;
     if (s->uncapped && o->qps >= s->max_qps && !(o->events & ENDS)) o->events |= MHE_UNCONVERGED;

@@ -158,6 +158,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     memset(k->step, 0, sizeof(real) * (size_t)size);
     memset(q->force, 0, sizeof q->force);
     mhe_begin_interior(e, k);
+    (void)offset;
     const real outside = mhe_row_violation(e, k, k->step);
     const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. */

@@ -148,6 +148,7 @@ static void mhe_see_judged(const mhe_settings *s, const mhe_stage *stage, mhe_se
     memcpy(P, stage->covariance, sizeof stage->covariance);
     if (stage->is_vague) memcpy(root, stage->root, sizeof stage->root);
     mhe_judge_outputs(s, stage, seen, P, stage->is_vague ? root : 0, next);
+    (void)next;
 }
 
 #if defined(__GNUC__)

@@ -72,7 +72,8 @@ static int mhe_solve_qp(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
 {
     k->damping = nearest ? 0 : o->present;
     mhe_set_ridge(k, 0);
-    const int status = mhe_solve_as_is(e, k, o, around, nearest, again);
-    if (status != FAILED || !mhe_set_ridge(k, 1)) return status;
-    return mhe_solve_as_is(e, k, o, around, nearest, 0);
+    int status = mhe_solve_as_is(e, k, o, around, nearest, again);
+    if (status == FAILED && mhe_set_ridge(k, 1))
+        status = mhe_solve_as_is(e, k, o, around, nearest, 0);
+    return status;
 }

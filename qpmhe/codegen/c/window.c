@@ -65,6 +65,7 @@ static real mhe_advance(mhe_estimator *e, int i, int linear, real *next, const m
     mhe_enter_turn(s, predicted);
     if (!mhe_all_finite(NX, next)) return INFINITY;
     *events |= mhe_stay_inside(e, i, onto, predicted, next);
+    (void)onto; /* without X there is nothing to go onto */
     const real cost = mhe_stage_cost(s, 0, stage, w, v);
     return isfinite(cost) ? cost : INFINITY;
 }
