@@ -1,6 +1,5 @@
-/* Innovations that the covariance does not explain: tests of the sensors. */
-
-/* Two functions of the observer's own. */
+/* Innovations that the covariance does not explain: tests of the sensors. The two functions that are
+ * declared here are the observer's. */
 
 /* P C' as rows of C P, and C P C', of the outputs that are there; from a root of P if there is one. */
 static void mhe_predict_outputs(const mhe_settings *s, const mhe_stage *stage,
