@@ -52,7 +52,14 @@ def _without_branches(text: str, value: Callable[[str], bool | None]) -> str:
     while (found := _BRANCH.search(text, start)):
         start, indent = found.end(), found[1]
         close = _closing(text, start)
-        holds = value(text[start : close - 1])
+        condition = text[start : close - 1]
+        holds = value(condition)
+        if holds is None and "||" not in condition:
+            known = {one: value(one) for one in condition.split(" && ")}
+            holds = False if False in known.values() else None
+            if holds is None and True in known.values():
+                left = " && ".join(one for one in known if not known[one])
+                text = text[:start] + left + text[close - 1 :]
         if holds is None:
             continue
         if text.startswith(" {\n", close):

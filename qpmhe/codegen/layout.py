@@ -286,6 +286,11 @@ class Layout:
         )
 
     @property
+    def has_prior_roots(self) -> bool:
+        """Whether a root of the observer's covariance may give one of the prior's weight."""
+        return self.observer_prior and self.deviations > 0
+
+    @property
     def has_rows(self) -> bool:
         """Whether there is a set."""
         return any(there for there, _ in self.sets)

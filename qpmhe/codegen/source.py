@@ -126,6 +126,20 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
     ))
 
 
+def _own_losses(model: CasadiModel) -> str:
+    """The C function that calls users' losses."""
+    names = [which for which, own in zip(TERMS, model.losses, strict=True) if own is not None]
+    calls = "".join(
+        f"    if (loss->kind == MHE_OWN_{name.upper()})\n"
+        f"        mhe_call_{name}_loss(&q, 0, value, slope);\n" for name in names
+    )
+    return (
+        "/* rho(q) and rho'(q) of a user's loss. */\n"
+        "static void mhe_own_loss(const mhe_loss *loss, real q, real *value, real *slope)\n"
+        f"{{\n    *value = *slope = NAN;\n    (void)loss; (void)q;\n{calls}}}\n"
+    )
+
+
 # A function that other programs would call, on one line or on several.
 _EXPORTED = re.compile(
     r"^CASADI_SYMBOL_EXPORT (?P<head>[^\n]*?)\{(?:[^\n]*\}\n|\n.*?^\}\n)", re.M | re.S
@@ -203,10 +217,12 @@ def estimator_files(
     single = layout.real == "float"
     before = "algebra", "residuals", *(["sides"] if layout.has_rows else [])
     body = prologue() + "\n".join((
-        model_source(model, single), *_parts(before), *_own_sets(layout),
-        *_parts(("conditions", "cost")), layout.sizes.c_functions(),
-        *_parts(_observer_parts(layout)), *_parts(("window", "prior", *layout.terms)),
-        _further_terms(layout.terms), *_parts([] if layout.held else ["hold_none"]),
+        model_source(model, single), *([_own_losses(model)] if layout.loss else []),
+        *_parts(before), *_own_sets(layout),
+        *_parts(("conditions", *_cost_parts(layout), "cost")), layout.sizes.c_functions(),
+        *_parts(_observer_parts(layout)), template("window.c"), *_parts(_prior_parts(layout)),
+        *_parts(layout.terms), _further_terms(layout.terms),
+        *_parts([] if layout.held else ["hold_none"]),
         *_parts(_search_parts(layout)), template("step.c"),
     ))
     data = (
@@ -258,12 +274,28 @@ def _own_sets(layout: Layout) -> list[str]:
     ]
 
 
+def _cost_parts(layout: Layout) -> tuple[str, ...]:
+    """The parts of C with losses, and with the prior's weight."""
+    return (
+        _or_none("losses", layout.loss), _or_none("widening", layout.widened),
+        "prior_cost_roots" if layout.has_prior_roots else "prior_cost",
+    )
+
+
+def _prior_parts(layout: Layout) -> tuple[str, ...]:
+    """The parts of C that set the prior of a window."""
+    if not layout.observer_prior:
+        return "prior_observer_none", "prior"
+    return _or_none("prior_roots", layout.has_prior_roots), "prior_observer", "prior"
+
+
 def _search_parts(layout: Layout) -> tuple[str, ...]:
     """The parts of C that look for an estimate."""
     constrained, factor = layout.has_rows, "factor" if layout.free is None else "elimination"
     rows = f"rows_{factor}", "rows", "active_set", "interior_point", "constrained"
+    roots = [] if factor == "factor" else [_or_none("elimination_roots", layout.has_prior_roots)]
     return (
-        _or_none("sets", constrained), "trial", "damping", factor, "budget", "outcome",
+        _or_none("sets", constrained), "trial", "damping", *roots, factor, "budget", "outcome",
         *(rows if constrained else ["unconstrained"]), "trials", _or_none("curved", constrained),
         "optimizer", _or_none("graduated", layout.widened),
         _or_none("rolled_out", layout.quiet > 0), _or_none("outside", constrained), "improve",

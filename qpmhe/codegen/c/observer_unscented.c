@@ -50,6 +50,7 @@ static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, cons
                              const real *root, mhe_sigma *sigma)
 {
     real *moves = sigma->moves;
+    (void)stage;
     if (root)
         memcpy(moves, root, sizeof(real) * NX * NX);
     else
