@@ -277,7 +277,7 @@ def _own_sets(layout: Layout) -> list[str]:
 def _cost_parts(layout: Layout) -> tuple[str, ...]:
     """The parts of C with losses, and with the prior's weight."""
     return (
-        _or_none("losses", layout.loss), _or_none("widening", layout.widened),
+        _or_none("widening", layout.widened), _or_none("losses", layout.loss),
         "prior_cost_roots" if layout.has_prior_roots else "prior_cost",
     )
 

@@ -70,14 +70,7 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
     (void)work;
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
-    if (MHE_LOSS && t == &stage->terms && !isfinite(stage->cost)) {
-        /* Of the candidate where the model failed: no residual, and the weight itself. */
-        for (int j = 0; j < NX; j++) t->disturbance_scale[MHE_LOSS ? j : 0] = 1;
-        for (int j = 0; j < NY; j++) t->noise_scale[MHE_LOSS ? j : 0] = 1;
-    } else {
-        mhe_set_scale(&s->disturbance_loss, mhe_w_widening(work), NX, Q, w, t->disturbance_scale);
-        mhe_set_scale(&s->noise_loss, mhe_v_widening(work), NY, R, v, t->noise_scale);
-    }
+    mhe_set_scales(s, work, stage, Q, w, v, t);
     mhe_times(NX, Q, w, t->following);
     for (int i = 0; i < NX; i++)
         t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);

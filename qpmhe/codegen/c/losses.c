@@ -56,3 +56,17 @@ static real mhe_scaled(real weight, const real *scale, int row)
 {
     return scale[row] * weight;
 }
+
+/* What the rows of a stage's weights are multiplied with. */
+static void mhe_set_scales(const mhe_settings *s, const mhe_workspace *k, const mhe_stage *stage,
+                           const real *Q, const real *w, const real *v, mhe_terms *t)
+{
+    if (t == &stage->terms && !isfinite(stage->cost)) {
+        /* Of the candidate where the model failed: no residual, and the weight itself. */
+        for (int j = 0; j < NX; j++) t->disturbance_scale[j] = 1;
+        for (int j = 0; j < NY; j++) t->noise_scale[j] = 1;
+    } else {
+        mhe_set_scale(&s->disturbance_loss, mhe_w_widening(k), NX, Q, w, t->disturbance_scale);
+        mhe_set_scale(&s->noise_loss, mhe_v_widening(k), NY, stage->noise_weight, v, t->noise_scale);
+    }
+}
