@@ -70,7 +70,7 @@ static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
     (void)work;
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
-    mhe_set_scales(s, work, stage, Q, w, v, t);
+    mhe_scale_weights(s, work, stage, Q, w, v, t);
     mhe_times(NX, Q, w, t->following);
     for (int i = 0; i < NX; i++)
         t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);

@@ -58,9 +58,11 @@ static real mhe_scaled(real weight, const real *scale, int row)
 }
 
 /* What the rows of a stage's weights are multiplied with. */
-static void mhe_set_scales(const mhe_settings *s, const mhe_workspace *k, const mhe_stage *stage,
-                           const real *Q, const real *w, const real *v, mhe_terms *t)
+static void mhe_scale_weights(const mhe_settings *s, const mhe_workspace *k,
+                              const mhe_stage *stage, const real *Q, const real *w, const real *v,
+                              mhe_terms *t)
 {
+    (void)k;
     if (t == &stage->terms && !isfinite(stage->cost)) {
         /* Of the candidate where the model failed: no residual, and the weight itself. */
         for (int j = 0; j < NX; j++) t->disturbance_scale[j] = 1;

@@ -21,8 +21,9 @@ static real mhe_scaled(real weight, const real *scale, int row)
     return weight;
 }
 
-static void mhe_set_scales(const mhe_settings *s, const mhe_workspace *k, const mhe_stage *stage,
-                           const real *Q, const real *w, const real *v, mhe_terms *t)
+static void mhe_scale_weights(const mhe_settings *s, const mhe_workspace *k,
+                              const mhe_stage *stage, const real *Q, const real *w, const real *v,
+                              mhe_terms *t)
 {
     (void)s; (void)k; (void)stage; (void)Q; (void)w; (void)v; (void)t;
 }
