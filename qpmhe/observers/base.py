@@ -297,10 +297,8 @@ class KalmanType(Observer):
 
     def _form(
         self, name: str, deviations: int, data: Mapping[str, NDArray[Any]] | None = None
-    ) -> ObserverForm | None:
-        """The observer's C form, with its covariances; None if its innovations have none."""
-        if self._innovation is not None and self._innovation.c_name is None:
-            return None
+    ) -> ObserverForm:
+        """The observer's C form, with its covariances."""
         return ObserverForm(
             name, data or {}, prior=self._prior, disturbance=self._disturbance, noise=self._noise,
             deviations=deviations, innovation=self._innovation,
