@@ -155,7 +155,9 @@ COMPILERS = "_H$|__cplusplus|__GNUC__|__FAST_MATH__|__STDC_VERSION__|_WIN32|CASA
     ("    if (A_ONE) return;\n", "    return;\n"),
     ("    if (A_NONE) {\n        b();\n    } else {\n        c();\n    }\n", None),
     ("    if (A_NONE)\n        b();\n    else\n        c();\n", None),
-    ("    if (A_NONE && x)\n        b();\n", None),
+    ("    if (A_NONE && x)\n        c();\n    b();\n", "    b();\n"),
+    ("    if (A_ONE && x > 1) b();\n", "    if (x > 1) b();\n"),
+    ("    if (A_NONE || x)\n        b();\n", None),
 ])
 def test_what_does_nothing_goes(text, left):
     functions = (
@@ -202,9 +204,10 @@ def test_the_numbers_are_the_same(name, real, level, tmp_path):
         mhe.system, mhe.observer, mhe.cost, mhe.settings, "mhe", real, mhe.usual
     )
     number = np.float64 if real == "double" else np.float32
+    inputs = int(re.search(r"#define MHE_NU (\d+)", whole["mhe.h"])[1])
     rows = [one.start]
     for sample in one.samples:
-        rows += [np.ravel(sample["y"]), np.resize(sample.get("u", 0.0), one.system.m)]
+        rows += [np.resize(sample["y"], one.system.p), np.resize(sample.get("u", 1.0), inputs)]
     data = np.concatenate(rows).astype(number).tobytes()
     sizes, estimates = [], []
     for folder in (tmp_path / "whole", tmp_path / "stripped"):
