@@ -155,7 +155,7 @@ class CSolver:
         sets = tuple((one is not None, one or 0) for one in general)
         gains = (("gain", False, n * p), ("filter_gain", False, n * p))
         self.layout = Layout(
-            n, p, 0, horizon, sets, 0, real, numbers_of=(("observer", gains),)
+            n, p, 0, horizon, sets, real, numbers_of=(("observer", gains),)
         )
         files = estimator_files(
             system.symbolic, self.layout, np.zeros((), self.layout.settings_type())
