@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,8 +22,10 @@ from ..memory.fields import MemorySizes
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
-from ..observers.base import covariance_of
+from ..observers import Observer
+from ..observers.base import ObserverForm, covariance_of
 from ..observers.roots import least_share
+from ..terms.base import TermForm
 from ..terms.prior import PriorWeights
 from ..terms.rows import Rows
 from .directions import Directions
@@ -44,8 +46,6 @@ _MOST = int(np.iinfo(np.int32).max)
 # From so many states on, LAPACK's calls take less time than loops that a compiler made.
 _LAPACK_STATES = 40
 _PROJECTIONS = (None, "observer", "diagonal")
-# What corrects an observer, in the order of the numbers in C.
-_OBSERVERS = ("gain", "extended", "unscented", "function")
 # In single precision rounding makes eigenvalues of correlations of this size.
 _LEAST_SINGLE = 1e-6
 
@@ -64,12 +64,18 @@ class Layout:
     loss: bool = False
     #: Whether a loss is widened while the first window fills.
     widened: bool = False
-    #: What corrects the observer, by its number in C, and whether its covariance is computed.
-    observer: int = 0
+    #: The observer's name in C, and whether its covariance is computed, and with how many rows of
+    #: deviations.
+    observer: str = "gain"
     covariance: bool = False
-    #: How innovations are judged, by its number in C, and the sensors whose are.
-    innovation: int = 0
+    deviations: int = 0
+    constant_gain: bool = True
+    needs_jacobians: bool = False
+    #: The name in C of the rule that judges innovations, blank where there is none, the sensors
+    #: whose innovations it judges, and whether it rejects any.
+    innovation: str = ""
     sensors: int = 0
+    rejects: bool = False
     #: Whether the covariance weighs the prior.
     observer_prior: bool = False
     #: Which terms have a user's loss, in the order of `TERMS`, as bits.
@@ -89,9 +95,11 @@ class Layout:
     free: int | None = None
     #: States that are held where the window does not see them.
     held: int = 0
-    #: The terms of J that not every estimator has: their names in C, and of their numbers the
-    #: names, whether they are integers, and how many there are.
-    terms: tuple[tuple[str, tuple[tuple[str, bool, int], ...]], ...] = ()
+    #: The terms of J that not every estimator has, by their names in C.
+    terms: tuple[str, ...] = ()
+    #: The parts of C with numbers of their own: their names, and of their numbers the names,
+    #: whether they are integers, and how many there are; 0 for a single one.
+    numbers_of: tuple[tuple[str, tuple[tuple[str, bool, int], ...]], ...] = ()
 
     @classmethod
     def of(
@@ -100,8 +108,7 @@ class Layout:
     ) -> Layout:
         """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
         system, observer, cost = directions.system, directions.observer, directions.cost
-        own, form = observer.c_form, cost.c_form
-        assert own is not None
+        form = cost.c_form
         losses = () if form is None else form.losses
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
@@ -112,24 +119,31 @@ class Layout:
             rows = directions.rows
             numbers = () if rows is None else tuple(rows.numbers.tolist())
             sets = ((rows is not None, len(numbers)), *sets[1:])
-        weighs, kind = cost.observer_prior is not None, _OBSERVERS.index(own.kind)
-        projects = system.states is not None and observer.metric is None
+        own = observer_form(system, observer, cost)
+        rule = own.innovation
+        terms = directions.terms_of(system, cost)
         return cls(
-            system.n, system.p, system.m, horizon, sets, real, observer=kind,
+            system.n, system.p, system.m, horizon, sets, real, observer=own.name,
             widened=any(one.graduation > 1.0 for one in losses[1:]),
             loss=any(one.kind != "quadratic" for one in losses),
             own_losses=sum((one.kind == "own") << k for k, one in enumerate(losses)),
-            # The covariance of a constant gain's error has no other use.
-            covariance=own.prior is not None and (kind > 0 or weighs or projects),
-            innovation=0 if own.innovation is None else 1 if own.innovation.rejects else 2,
-            sensors=len(observer.sensors), observer_prior=weighs,
+            covariance=own.prior is not None, deviations=own.deviations,
+            constant_gain=observer.constant_gain is not None,
+            needs_jacobians=observer.needs_jacobians,
+            innovation="" if rule is None or rule.c_name is None else rule.c_name,
+            sensors=len(observer.sensors), rejects=observer.rejects,
+            observer_prior=cost.observer_prior is not None,
             lapack=lapack and system.n >= _LAPACK_STATES and directions.free is None, clock=clock,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
             free=directions.free, held=len(system.held),
-            terms=tuple(
-                (name, tuple((k, one.dtype.kind == "i", one.size) for k, one in data.items()))
-                for name, data in directions.terms_of(system, cost)
+            terms=tuple(term.name for term in terms),
+            numbers_of=tuple(
+                (name, tuple(
+                    (k, one.dtype.kind == "i", one.size if one.ndim else 0)
+                    for k, one in data.items()
+                ))
+                for name, data in _numbers(terms, own, system.p).items()
             ),
         )
 
@@ -148,30 +162,33 @@ class Layout:
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
             "output_residual": self.residuals[0], "state_residual": self.residuals[1],
-            "observer": self.observer, "covariance": int(self.covariance),
+            "covariance": int(self.covariance), "deviations": self.deviations,
+            "constant_gain": int(self.constant_gain), "rejects": int(self.rejects),
+            "needs_jacobians": int(self.needs_jacobians),
             "observer_prior": int(self.observer_prior),
-            "innovation": self.innovation, "sensors": self.sensors,
+            "sensors": self.sensors,
             "turns": int(self.turns), "quiet": self.quiet, "held": self.held,
             "rolled": int(self.free is not None), "free": self.free or 0,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
             "stage_members": self.sizes.c_text(True),
             "estimator_members": self.sizes.c_text(False),
         }
-        values["term_types"], values["term_fields"] = self._term_types(name)
+        values["part_types"], values["part_fields"] = self._part_types(name)
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
             values[f"{letter}_rows"] = rows
         return values
 
-    def _term_types(self, prefix: str) -> tuple[str, str]:
-        """The structs of the terms in C, and the fields of the settings that have them."""
+    def _part_types(self, prefix: str) -> tuple[str, str]:
+        """The structs of parts' numbers in C, and the fields of the settings that have them."""
         types, fields = [], []
-        for name, data in self.terms:
+        for name, data in self.numbers_of:
             rows = "".join(
-                f"    {'int32_t' if whole else f'{prefix}_real'} {field}[{size}];\n"
-                for field, whole, size in data
+                f"    {'int32_t' if whole else f'{prefix}_real'} "
+                f"{field}{f'[{size}]' if size else ''};\n" for field, whole, size in data
             )
-            types.append(f"\n/* The numbers of a term of J. */\ntypedef struct {{\n{rows}}} "
+            about = "a term of J" if name in self.terms else f"the {name}"
+            types.append(f"\n/* The numbers of {about}. */\ntypedef struct {{\n{rows}}} "
                          f"{prefix}_{name};\n")
             fields.append(f"    {prefix}_{name} {name};\n")
         return "".join(types), "".join(fields)
@@ -183,7 +200,7 @@ class Layout:
             ("parameter", r), ("graduation", r), ("kind", np.int32), ("per_component", np.int32),
         ])
         fields: list[Any] = [
-            ("gain", r, n * p), ("filter_gain", r, n * p), ("prior_weight", r, n * n),
+            ("prior_weight", r, n * n),
             ("disturbance_weight", r, n * n), ("noise_weight", r, p * p),
             ("noise_deviations", r, p), *((f"{name}_loss", loss) for name in TERMS),
             ("output_periods", r, p), ("state_periods", r, n), ("turn_middle", r, n),
@@ -192,17 +209,13 @@ class Layout:
             bounds = [("added", r, n * n), ("least_weight", r, n * n)]
             fields.append(("covariances", _struct([
                 ("initial", r, n * n), ("disturbance", r, n * n), ("noise", r, p * p),
-                ("f_jacobian", r, n * n), ("h_jacobian", r, p * n),
                 *(bounds if self.observer_prior else []),
-                ("least", r), ("spread", r), ("noise_share", r), ("typical", r, n),
+                ("least", r), ("noise_share", r), ("typical", r, n),
             ])))
-        for name, data in self.terms:
+        for name, data in self.numbers_of:
             fields.append((name, _struct([
-                (field, np.int32 if whole else r, size) for field, whole, size in data
-            ])))
-        if self.sensors:
-            fields.append(("innovation", _struct([
-                ("limits", r, p), ("sensor_of", np.int32, p), ("reopen", np.int32),
+                (field, np.int32 if whole else r, *((size,) if size else ()))
+                for field, whole, size in data
             ])))
         fields += [
             ("discount", r), ("sample_time", r), ("tolerance", r),
@@ -272,6 +285,16 @@ class Layout:
         )
 
     @property
+    def has_prior_roots(self) -> bool:
+        """Whether a root of the observer's covariance may give one of the prior's weight."""
+        return self.observer_prior and self.deviations > 0
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether there is a set."""
+        return any(there for there, _ in self.sets)
+
+    @property
     def rows(self) -> tuple[int, int]:
         """Stages of a window with rows, and rows of each, at least one."""
         return self.horizon + self.sets[2][0], max(sum(self.set_rows), 1)
@@ -319,8 +342,29 @@ class Layout:
         return MemorySizes.of(
             self.nx, self.ny, self.nu, self.horizon, sensors=self.sensors, held=self.held,
             rows=self.rows, covariance=self.covariance, **sets,
-            roots=_OBSERVERS[self.observer] in ("extended", "unscented"),
+            roots=self.deviations > 0,
         )
+
+
+def observer_form(system: System, observer: Observer, cost: Cost) -> ObserverForm:
+    """The observer in C: without its covariance where the estimator does not read it."""
+    form = observer.c_form
+    assert form is not None
+    weighs = cost.observer_prior is not None
+    projects = system.states is not None and observer.metric is None
+    return form if form.plain is None or weighs or projects else form.plain
+
+
+def _numbers(
+    terms: tuple[TermForm, ...], observer: ObserverForm, outputs: int
+) -> dict[str, Mapping[str, NDArray[Any]]]:
+    """The numbers of the parts of C that have some, by the parts' names."""
+    found = {term.name: term.data for term in terms}
+    if observer.data:
+        found["observer"] = observer.data
+    if observer.innovation is not None:
+        found["innovation"] = observer.innovation.c_data(outputs)
+    return found
 
 
 def settings_record(
@@ -335,8 +379,11 @@ def settings_record(
     with np.errstate(over="ignore", under="ignore"):
         record = _filled(layout, directions, system, cost, settings, usual)
     given = [(name, record[name]) for name in (
-        "gain", "prior_weight", "disturbance_weight", "noise_weight"
+        "prior_weight", "disturbance_weight", "noise_weight"
     )]
+    if "observer" in (record.dtype.names or ()):
+        own = record["observer"]
+        given += [(name, own[name]) for name in own.dtype.names or ()]
     if layout.covariance:
         own = record["covariances"]
         given += [(f"observer's {name}", own[name]) for name in own.dtype.names or ()]
@@ -354,12 +401,10 @@ def _filled(
     usual: Conditions,
 ) -> NDArray[Any]:
     record, observer = np.zeros((), layout.settings_type()), directions.observer
-    own, form, single = observer.c_form, cost.c_form, layout.real == "float"
-    assert own is not None
+    form, single = cost.c_form, layout.real == "float"
+    own = observer_form(directions.system, observer, directions.cost)
     assert form is not None
     prior_weights = PriorWeights(system, observer, cost)
-    for name in ("gain", "filter_gain"):
-        _fill(record, name, getattr(own, name))
     if layout.covariance:
         part = record["covariances"]
         assert own.disturbance is not None
@@ -368,21 +413,14 @@ def _filled(
         for name, matrix in (
             ("initial", own.prior), ("disturbance", system.state_covariance(disturbance)),
             ("noise", covariance_of(usual.noise_weight, own.noise)),
-            ("f_jacobian", own.f_jacobian), ("h_jacobian", own.h_jacobian),
             ("typical", prior_weights.typical),
         ):
             _fill(part, name, matrix)
-        part["spread"] = own.spread
         part["noise_share"] = least_share(covariance_of(usual.noise_weight, own.noise))
         part["least"] = _LEAST_SINGLE if single else SINGULAR
         if layout.observer_prior:
             _fill(part, "added", prior_weights.added)
             _fill(part, "least_weight", prior_weights.least)
-    if own.innovation is not None:
-        part, limits = record["innovation"], own.innovation.limits(system.p)
-        part["limits"][: limits.size], part["reopen"] = limits, own.innovation.reopen
-        for k, outputs in enumerate(observer.sensors):
-            part["sensor_of"][list(outputs)] = k
     record["discount"] = form.discount
     for name, loss in zip(TERMS, form.losses, strict=True):
         _fill(record, f"{name}_weight", getattr(form, name))
@@ -421,7 +459,8 @@ def _filled(
     if layout.free is not None:
         for name, matrix in directions.elimination(system, cost).items():
             _fill(record, name, matrix)
-    for name, data in directions.terms_of(system, cost) if layout.terms else ():
+    terms = directions.terms_of(system, cost) if layout.terms else ()
+    for name, data in _numbers(terms, own, system.p).items():
         for field, values in data.items():
             _fill(record[name], field, values)
     record["inner_lower"], record["inner_upper"] = system.f_jacobian.inner

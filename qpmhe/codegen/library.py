@@ -68,6 +68,17 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
             "(Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, UnscentedKalman, "
             "OutputInjection)."
         )
+    if form.innovation is not None and form.innovation.c_name is None:
+        return (
+            f"{type(form.innovation).__name__}, the rule for innovations of "
+            f"{type(observer).__name__}, has no C form; take qpmhe.Gate or qpmhe.HuberInnovation, "
+            "or engine='python'."
+        )
+    if observer.sensors and form.innovation is None:
+        return (
+            f"{type(observer).__name__} counts its sensors' failures by a rule of its own, which "
+            "has no C form; take engine='python'."
+        )
     if observer.initial_memory() is not None:
         return (
             f"{type(observer).__name__} has a memory of its own, which the compiled step does not "

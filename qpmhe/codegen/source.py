@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+from collections.abc import Iterable
+from functools import cache
 from importlib.resources import files
 from string import Template
 from textwrap import indent
@@ -22,18 +23,16 @@ from ..model.implicit_steps import (
     ROUNDING,
     SMALL,
 )
-from .layout import TERMS, Layout
+from .layout import SET_NAMES, TERMS, Layout
 from .single import in_single_precision
 
-# In the place of a part: the calls of the further terms.
-_FURTHER = ""
 #: The file that holds a whole estimator.
 MAIN = "mhe.c"
 # Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
 
 
-@lru_cache(maxsize=16)
+@cache
 def template(name: str) -> str:
     """Text of a file among the package's C templates."""
     return files(__package__).joinpath("c", name).read_text(encoding="ascii")
@@ -131,6 +130,20 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif\n",
         *calls, template("model.c"), *_step_parts(model),
     ))
+
+
+def _own_losses(model: CasadiModel) -> str:
+    """The C function that calls users' losses."""
+    names = [which for which, own in zip(TERMS, model.losses, strict=True) if own is not None]
+    calls = "".join(
+        f"    if (loss->kind == MHE_OWN_{name.upper()})\n"
+        f"        mhe_call_{name}_loss(&q, 0, value, slope);\n" for name in names
+    )
+    return (
+        "/* rho(q) and rho'(q) of a user's loss. */\n"
+        "static void mhe_own_loss(const mhe_loss *loss, real q, real *value, real *slope)\n"
+        f"{{\n    *value = *slope = NAN;\n    (void)loss; (void)q;\n{calls}}}\n"
+    )
 
 
 def _step_parts(model: CasadiModel) -> list[str]:
@@ -231,19 +244,17 @@ def estimator_files(
 ) -> dict[str, str]:
     """Header and source of a whole estimator."""
     head = header(name, {**layout.header_values(name), "version": __version__})
-    parts = (
-        "algebra.c", "residuals.c", "conditions.c", "cost.c", "observer.c", "projection.c",
-        "window.c", "prior.c", *(f"{term}.c" for term, _ in layout.terms), _FURTHER, "sets.c",
-        "trial.c", "damping.c", "factor.c" if layout.free is None else "elimination.c",
-        "budget.c", "inequalities.c", "optimizer.c", "step.c",
-    )
     single = layout.real == "float"
-    further = _further_terms([term for term, _ in layout.terms])
-    texts = [
-        model_source(model, single),
-        *(further if part == _FURTHER else template(part) for part in parts),
-    ]
-    body = prologue() + "\n".join(texts)
+    before = "algebra", "residuals", *(["sides"] if layout.has_rows else [])
+    body = prologue() + "\n".join((
+        model_source(model, single), *([_own_losses(model)] if layout.loss else []),
+        *_parts(before), *_own_sets(layout),
+        *_parts(("conditions", *_cost_parts(layout), "cost")), layout.sizes.c_functions(),
+        *_parts(_observer_parts(layout)), template("window.c"), *_parts(_prior_parts(layout)),
+        *_parts(layout.terms), _further_terms(layout.terms),
+        *_parts([] if layout.held else ["hold_none"]),
+        *_parts(_search_parts(layout)), template("step.c"),
+    ))
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
         f"const mhe_settings mhe_default_settings = {_initializer(settings)};\n"
@@ -254,7 +265,74 @@ def estimator_files(
     return {f"{name}.h": head, f"{name}.c": text}
 
 
-def _further_terms(names: list[str]) -> str:
+def _parts(names: Iterable[str]) -> list[str]:
+    """Text of these parts of the C."""
+    return [template(f"{name}.c") for name in names]
+
+
+def _observer_parts(layout: Layout) -> list[str]:
+    """The parts of C that compute the observer, and keep it in X."""
+    parts, rule = [], layout.innovation or "none"
+    parts.append(_or_none("quiet", layout.quiet > 0))
+    if layout.covariance:
+        parts += ["covariance"]
+    if layout.deviations:
+        parts += ["kalman", *(["innovation"] if layout.innovation else []), f"innovation_{rule}"]
+    parts += [f"observer_{layout.observer}", "sensors" if layout.innovation else "sensors_none"]
+    if layout.covariance:
+        parts += ["roots" if layout.deviations else "roots_none", "following"]
+    else:
+        parts += ["following_none"]
+    if not layout.sets[2][0]:
+        return [*parts, "inside_none"]
+    metric = "metric_covariance" if layout.covariance else "metric_own"
+    return [*parts, "projection", metric, "inside"]
+
+
+def _or_none(part: str, is_there: bool) -> str:
+    """The name of a part, or that of the one in its place."""
+    return part if is_there else f"{part}_none"
+
+
+def _own_sets(layout: Layout) -> list[str]:
+    """The parts of C by which samples may have sets of their own."""
+    return [
+        Template(template(f"{_or_none('own_set', is_there)}.c")).substitute(
+            name=name, letter=letter, capital=letter.upper(), size="NY" if letter == "v" else "NX",
+        )
+        for letter, name, (is_there, _) in zip("wvx", SET_NAMES, layout.sets, strict=True)
+    ]
+
+
+def _cost_parts(layout: Layout) -> tuple[str, ...]:
+    """The parts of C with losses, and with the prior's weight."""
+    return (
+        _or_none("widening", layout.widened), _or_none("losses", layout.loss),
+        "prior_cost_roots" if layout.has_prior_roots else "prior_cost",
+    )
+
+
+def _prior_parts(layout: Layout) -> tuple[str, ...]:
+    """The parts of C that set the prior of a window."""
+    if not layout.observer_prior:
+        return "prior_observer_none", "prior"
+    return _or_none("prior_roots", layout.has_prior_roots), "prior_observer", "prior"
+
+
+def _search_parts(layout: Layout) -> tuple[str, ...]:
+    """The parts of C that look for an estimate."""
+    constrained, factor = layout.has_rows, "factor" if layout.free is None else "elimination"
+    rows = f"rows_{factor}", "rows", "active_set", "interior_point", "constrained"
+    roots = [] if factor == "factor" else [_or_none("elimination_roots", layout.has_prior_roots)]
+    return (
+        _or_none("sets", constrained), "trial", "damping", *roots, factor, "budget", "outcome",
+        *(rows if constrained else ["unconstrained"]), "trials", _or_none("curved", constrained),
+        "optimizer", _or_none("graduated", layout.widened),
+        _or_none("rolled_out", layout.quiet > 0), _or_none("outside", constrained), "improve",
+    )
+
+
+def _further_terms(names: tuple[str, ...]) -> str:
     """C functions that call those of the terms that not every estimator has."""
 
     def body(call: str) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 
+from .fold import folded
+
 # Stands for lines that were left out.
 _GAP = "\x01\n"
 _DIRECTIVE = re.compile(r"#\s*(ifdef|ifndef|if|elif|else|endif)\b(.*)")
@@ -12,6 +14,7 @@ _MACRO = re.compile(r"^#define (\w+)\b(\([^)]*\))?((?:[^\\\n]|\\[^\n]|\\\n)*)\n"
 _FUNCTION = re.compile(
     r"^static [^;={]*?\b(\w+)\([^;{]*\)\s*\{(?:[^\n]*\}\n|.*?^\}\n)", re.M | re.S
 )
+_PROTOTYPE = re.compile(r"^static [^;={}]*?\b(\w+)\([^;{]*\);\n", re.M)
 _QUIET = re.compile(r'/\*.*?\*/|"(?:\\.|[^"\\\n])*"', re.S)
 # Warnings of functions without use are switched off around those that many estimators do not need.
 _UNUSED = re.compile(
@@ -37,17 +40,24 @@ def stripped(header: str, source: str) -> tuple[str, str]:
     texts = [_resolved(header, macros, 1), _UNUSED.sub(r"\1", _resolved(source, macros, 0))]
     before: list[str] = []
     while texts != before:
-        before, texts = texts, _without_unused(texts)
+        before = texts
+        texts = _without_unused([texts[0], folded(texts[1], lambda one: _value(one, macros))])
     return _tidy(texts[0]), _tidy(texts[1])
 
 
 def _without_unused(texts: list[str]) -> list[str]:
     """The texts without static functions and macros that only their own definition names."""
-    uses = _names("".join(texts))
+    whole = "".join(texts)
+    uses = _names(whole) - Counter(one[1] for one in _PROTOTYPE.finditer(whole))
+    own = {one[1]: _names(one[0])[one[1]] for one in _FUNCTION.finditer(whole)}
 
     def kept(one: re.Match[str]) -> str:
         return one[0] if uses[one[1]] > _names(one[0])[one[1]] else _GAP
 
+    def kept_prototype(one: re.Match[str]) -> str:
+        return one[0] if uses[one[1]] > own.get(one[1], 0) else _GAP
+
+    texts = [_PROTOTYPE.sub(kept_prototype, text) for text in texts]
     return [_MACRO.sub(kept, _FUNCTION.sub(kept, text)) for text in texts]
 
 

@@ -202,6 +202,49 @@ class MemorySizes(NamedTuple):
             lines.append(f"    {kind} {name}{f'[{size}]' if size else ''};{note}")
         return "\n".join(lines)
 
+    def c_functions(self) -> str:
+        """What C needs to find the stages of a window, and the state behind each."""
+        places, copies = [], []
+        for one in self.fields("c", "state"):
+            kind = f"mhe_{one.kind}" if one.kind not in _C_KINDS else _c_kind(one)[0]
+            at = "" if one.shape else "&"
+            places.append(
+                f"static {kind} *mhe_next_{one.name}(mhe_estimator *e, int i)\n{{\n"
+                f"    return i + 1 < e->length ? {at}mhe_stage_at(e, i + 1)->{one.name} : "
+                f"{at}e->{one.name}_end;\n}}\n"
+            )
+            copies.append(
+                f"    memcpy(stage->{one.name}, e->{one.name}_end, sizeof stage->{one.name});\n"
+                if one.shape else f"    stage->{one.name} = e->{one.name}_end;\n"
+            )
+        return _C_FUNCTIONS.format(places="\n".join(places), copies="".join(copies))
+
+
+_C_FUNCTIONS = """/* What the estimator remembers, by stages of the window. */
+
+static mhe_stage *mhe_stage_at(mhe_estimator *e, int i)
+{{
+    const int k = e->first + i;
+    return e->stages + (k < MHE_HORIZON ? k : k - MHE_HORIZON);
+}}
+
+/* Behind stage i. No estimator needs all of these. */
+#if defined(__GNUC__)
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-function"
+#endif
+
+{places}
+#if defined(__GNUC__)
+#pragma GCC diagnostic pop
+#endif
+
+/* A new stage, the newest, begins where the last one ended. */
+static void mhe_begin_stage(const mhe_estimator *e, mhe_stage *stage)
+{{
+{copies}}}
+"""
+
 
 def _c_kind(field: Field) -> tuple[str, Any]:
     return _C_FLAG if field.kind == "flag" and not field.shape else _C_KINDS[field.kind]

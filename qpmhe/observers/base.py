@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from types import NoneType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,37 +94,42 @@ def check_written(observer: Observer, sample: Sample, given: Array) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ObserverForm:
-    """The data with which the step in C computes an observer.
+    """An observer as the step in C computes it: by ``codegen/c/observer_NAME.c``.
+
+    That part has two functions: ``mhe_correction``, L(z, v) of a stage and what the observer
+    remembers behind it, and ``mhe_filter``, its estimate of x(t) that has used y(t). Without a
+    covariance it also has ``mhe_correction_slope``, the slope of L at v = 0; with deviations and a
+    rule for innovations also ``mhe_predict_outputs`` and ``mhe_predict_deviations``.
 
     Parameters
     ----------
-    kind : {"gain", "extended", "unscented", "function"}
-        What corrects: a constant gain, an extended or an unscented Kalman filter, a function.
-    gain, filter_gain : (n, p) array or None
-        The constant gain of the correction, and the gain of the measurement update.
-    prior, disturbance, noise : (n, n), (r, r) and (p, p) array or None
-        Covariances of the initial error, of w and of v, of an observer with a covariance.
-    f_jacobian, h_jacobian : (n, n) and (p, n) array or None
-        The constant Jacobians that propagate the error covariance of a constant gain.
-    spread : float
-        Distance of sigma points from the state, in standard deviations.
+    name : str
+        NAME.
+    data : mapping
+        The observer's numbers, ``settings->observer`` there: real ones, or integers of 32 bits.
     correction : callable or None
         The CasADi form of a function L(z, v), from the sizes of its arguments.
+    prior, disturbance, noise : (n, n), (r, r) and (p, p) array or None
+        Covariances of the initial error, of w and of v, of an observer with a covariance.
+    deviations : int
+        Rows of deviations with which a Kalman filter represents its covariance, where that loses
+        digits: ``codegen/c/kalman.c`` computes with them. 0 for other observers.
     innovation : Innovation or None
         How a Kalman filter tests its innovations.
+    plain : ObserverForm or None
+        The form of the same observer without its covariance, for an estimator that does not read
+        it; None if the correction does.
     """
 
-    kind: str
-    gain: Array | None = None
-    filter_gain: Array | None = None
+    name: str
+    data: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    correction: Callable[[int, int], Traced] | None = None
     prior: Array | None = None
     disturbance: Array | None = None
     noise: Array | None = None
-    f_jacobian: Array | None = None
-    h_jacobian: Array | None = None
-    spread: float = 0.0
-    correction: Callable[[int, int], Traced] | None = None
+    deviations: int = 0
     innovation: Innovation | None = None
+    plain: ObserverForm | None = None
 
 
 class Observer(ABC):
@@ -232,7 +238,7 @@ class Observer(ABC):
         gain, filter_gain = self.constant_gain, self.filter_gain
         if gain is None or filter_gain is None:
             return None
-        return ObserverForm("gain", gain, filter_gain)
+        return ObserverForm("gain", {"gain": gain, "filter_gain": filter_gain})
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array] | None:
         """The estimate of x(t) that uses y(t), and its covariance; None if there is none.
@@ -305,11 +311,13 @@ class KalmanType(Observer):
             return None
         return float(np.sqrt(self._innovation.limits(len(self._noise))[0]))
 
-    def _form(self, kind: str) -> ObserverForm:
+    def _form(
+        self, name: str, deviations: int, data: Mapping[str, NDArray[Any]] | None = None
+    ) -> ObserverForm:
         """The observer's C form, with its covariances."""
         return ObserverForm(
-            kind, prior=self._prior, disturbance=self._disturbance, noise=self._noise,
-            innovation=self._innovation,
+            name, data or {}, prior=self._prior, disturbance=self._disturbance, noise=self._noise,
+            deviations=deviations, innovation=self._innovation,
         )
 
     def _judge(self, prediction: Prediction, noise: Array, v: Array, sample: Sample) -> Verdict:

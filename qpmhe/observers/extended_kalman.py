@@ -58,7 +58,9 @@ class ExtendedKalman(KalmanType):
     @property
     def c_form(self) -> ObserverForm | None:
         """The covariances, unless a derived class may compute otherwise."""
-        return self._form("extended") if type(self) is ExtendedKalman else None
+        if type(self) is not ExtendedKalman:
+            return None
+        return self._form("extended_kalman", len(self._prior))
 
     @property
     def propagates_roots(self) -> bool:

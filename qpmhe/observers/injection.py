@@ -86,7 +86,7 @@ class OutputInjection(Observer):
         """The correction, unless a derived class may compute otherwise."""
         if type(self) is not OutputInjection:
             return None
-        return ObserverForm("function", correction=self._expression)
+        return ObserverForm("injection", correction=self._expression)
 
     def _expression(self, n: int, p: int) -> Traced:
         """The correction as CasADi has it, compared with the function; found once."""

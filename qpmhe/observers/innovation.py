@@ -146,6 +146,24 @@ class Innovation(ABC):
     def limits(self, outputs: int) -> Array:
         """The largest squared innovations of sensors with 1, 2, ... outputs that are there."""
 
+    @property
+    def c_name(self) -> str | None:
+        """NAME of ``codegen/c/innovation_NAME.c``, by which C applies the tests; None if it cannot.
+
+        That part has two functions: ``mhe_apply_tests``, by which outputs count less or not at all,
+        and ``mhe_rejection``, the bits of a status. All rules have the same tests.
+        """
+        return None
+
+    def c_data(self, outputs: int) -> dict[str, NDArray[Any]]:
+        """The numbers of the tests, ``settings->innovation`` in C."""
+        limits, of_output = np.zeros(outputs), np.zeros(outputs, np.int32)
+        given = self.limits(outputs)
+        limits[: given.size] = given
+        for k, sensor in enumerate(self.sensors(outputs)):
+            of_output[list(sensor)] = k
+        return {"limits": limits, "sensor_of": of_output, "reopen": np.array(self.reopen, np.int32)}
+
     @abstractmethod
     def judge(
         self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts
@@ -344,6 +362,11 @@ class Gate(Innovation):
         most = max(map(len, self.sensors(outputs)))
         return np.asarray(2.0 * gammaincinv(0.5 * np.arange(1, most + 1), self.probability))
 
+    @property
+    def c_name(self) -> str | None:
+        """The gate in C, unless a derived class may judge otherwise."""
+        return "gate" if type(self) is Gate else None
+
     def judge(
         self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts
     ) -> Verdict:
@@ -415,6 +438,11 @@ class HuberInnovation(Innovation):
     def limits(self, outputs: int) -> Array:
         """The threshold's square; see `Innovation.limits`."""
         return np.array([self.threshold**2])
+
+    @property
+    def c_name(self) -> str | None:
+        """The weights in C, unless a derived class may judge otherwise."""
+        return "huber" if type(self) is HuberInnovation else None
 
     def judge(
         self, prediction: Prediction, noise: Array, v: Array, observed: Mask, rejections: Counts

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -128,9 +126,9 @@ class SteadyStateKalman(Observer):
         form = super().c_form
         if form is None or type(self) is not SteadyStateKalman:
             return form
-        return replace(
-            form, prior=self._prior, disturbance=self._own, noise=self._noise,
-            f_jacobian=self._a, h_jacobian=self._c,
+        return ObserverForm(
+            "steady_kalman", {**form.data, "f_jacobian": self._a, "h_jacobian": self._c},
+            prior=self._prior, disturbance=self._own, noise=self._noise, plain=form,
         )
 
     @property

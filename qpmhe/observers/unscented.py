@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -96,7 +95,8 @@ class UnscentedKalman(KalmanType):
         """The covariances and the spread, unless a derived class may compute otherwise."""
         if type(self) is not UnscentedKalman:
             return None
-        return replace(self._form("unscented"), spread=self._spread)
+        spread = {"spread": np.array(self._spread)}
+        return self._form("unscented", 2 * len(self._prior), spread)
 
     @property
     def propagates_roots(self) -> bool:

@@ -1,9 +1,10 @@
-"""Written C has what its estimator uses, and gives the object code of all of it."""
+"""Written C has what its estimator uses, and computes the numbers of all of it."""
 
 import re
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 
 from qpmhe.codegen import write
@@ -11,6 +12,7 @@ from qpmhe.codegen.library import generated
 from qpmhe.codegen.strip import stripped
 
 from .cases import CASES, case
+from .test_written import DRIVER
 
 CC = shutil.which("cc")
 HEADER = """#ifndef A_H
@@ -133,6 +135,43 @@ int fourth(void) { return third(); }
 COMPILERS = "_H$|__cplusplus|__GNUC__|__FAST_MATH__|__STDC_VERSION__|_WIN32|CASADI|casadi|LINKED"
 
 
+@pytest.mark.parametrize(("text", "left"), [
+    # Calls of functions that do nothing.
+    ("    idle(e, f(2));\n    b();\n", "    b();\n"),
+    ("    if (a)\n        idle(e, 1);\n    b();\n", None),
+    ("    idle(e, i++);\n", None), ("    idle(e, i = 2);\n", None),
+    # Numbers in the place of functions that only return one.
+    ("    *s |= none(e);\n    b();\n", "    b();\n"), ("    none(e);\n    b();\n", "    b();\n"),
+    ("    x = none(e) + 1;\n", "    x = 0 + 1;\n"),
+    ("    if (a || none(e)) {\n        b();\n    }\n", "    if (a) {\n        b();\n    }\n"),
+    ("    if (none(e)) return;\n    b();\n", "    b();\n"),
+    ("    if (a == 1 && none(e))\n        c = b(2,\n              3);\n    b();\n", "    b();\n"),
+    ("    if (one(e))\n        b();\n    b();\n", "    b();\n    b();\n"),
+    # Branches that are decided, unless there is an alternative.
+    ("    if (A_NONE) {\n        int x = 1;\n    }\n    b();\n", "    b();\n"),
+    ("    if (A_ONE) {\n        for (;;) {\n            b();\n        }\n    }\n",
+     "    for (;;) {\n        b();\n    }\n"),
+    ("    if (!A_ONE) return;\n    b();\n", "    b();\n"),
+    ("    if (A_ONE) return;\n", "    return;\n"),
+    ("    if (A_NONE) {\n        b();\n    } else {\n        c();\n    }\n", None),
+    ("    if (A_NONE)\n        b();\n    else\n        c();\n", None),
+    ("    if (A_NONE && x)\n        c();\n    b();\n", "    b();\n"),
+    ("    if (A_ONE && x > 1) b();\n", "    if (x > 1) b();\n"),
+    ("    if (A_NONE || x)\n        b();\n", None),
+])
+def test_what_does_nothing_goes(text, left):
+    functions = (
+        "static void idle(int *e, int i)\n{\n    (void)e; (void)i;\n}\n\n"
+        "static int none(int *e)\n{\n    (void)e;\n    return 0;\n}\n\n"
+        "static int one(int *e)\n{\n    (void)e;\n    return 1;\n}\n\n"
+    )
+    found = source(f"{functions}void all(int *e)\n{{\n{text}}}\n")
+    if left is None:
+        assert text in found
+    else:
+        assert found.lstrip() == f"void all(int *e)\n{{\n{left}}}\n"
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_written_code_reads_well(name, tmp_path):
     files = write(case(name).estimator("python"), tmp_path)
@@ -158,12 +197,19 @@ def test_written_code_reads_well(name, tmp_path):
     ("tank in time", "double", "-O1"), ("matrix expressions", "double", "-O1"),
     ("angles across the seam", "double", "-O3"),
 ])
-def test_the_object_code_is_the_same(name, real, level, tmp_path):
-    mhe = case(name).estimator("python")
+def test_the_numbers_are_the_same(name, real, level, tmp_path):
+    one = case(name)
+    mhe = one.estimator("python")
     whole = generated(
         mhe.system, mhe.observer, mhe.cost, mhe.settings, "mhe", real, mhe.usual
     )
-    codes = []
+    number = np.float64 if real == "double" else np.float32
+    inputs = int(re.search(r"#define MHE_NU (\d+)", whole["mhe.h"])[1])
+    rows = [one.start]
+    for sample in one.samples:
+        rows += [np.resize(sample["y"], one.system.p), np.resize(sample.get("u", 1.0), inputs)]
+    data = np.concatenate(rows).astype(number).tobytes()
+    sizes, estimates = [], []
     for folder in (tmp_path / "whole", tmp_path / "stripped"):
         folder.mkdir()
         if folder.name == "stripped":
@@ -171,12 +217,18 @@ def test_the_object_code_is_the_same(name, real, level, tmp_path):
         else:
             for file, text in whole.items():
                 (folder / file).write_text(text)
-        command = [CC, "-std=c99", level, "-shared", "-fPIC", "-s", "-o", "mhe.so", "mhe.c", "-lm"]
-        subprocess.run(command, cwd=folder, check=True)
-        codes.append((folder / "mhe.so").read_bytes())
+        (folder / "main.c").write_text(DRIVER)
+        flags = ["-std=c99", level, "-ffp-contract=off"]
+        subprocess.run([CC, *flags, "-o", "main", "main.c", "mhe.c", "-lm"], cwd=folder, check=True)
+        done = subprocess.run(["./main"], cwd=folder, input=data, capture_output=True, check=True)
+        estimates.append(done.stdout)
+        subprocess.run([CC, *flags, "-c", "mhe.c"], cwd=folder, check=True)
+        sizes.append((folder / "mhe.o").stat().st_size)
     lines = [
         sum(len(path.read_text().splitlines()) for path in tmp_path.glob(f"{folder}/mhe.[ch]"))
         for folder in ("whole", "stripped")
     ]
-    assert codes[0] == codes[1]
-    assert lines[1] < 0.8 * lines[0]
+    assert len(estimates[0]) > 100 * len(one.samples)
+    assert estimates[0] == estimates[1]
+    assert sizes[1] < 1.02 * sizes[0]
+    assert lines[1] < 0.9 * lines[0]

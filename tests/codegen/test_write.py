@@ -71,3 +71,31 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(QpmheError, match=r"257 states; .* at most 256"):
         codegen.write(linear(257, max_qps=0), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+class Wider(qpmhe.Gate):
+    """A rule of a user's own: C would compute the gate's verdicts in its place."""
+
+    def judge(self, prediction, noise, v, observed, rejections):
+        return super().judge(prediction, noise, 0.5 * v, observed, rejections)
+
+
+class Counting(qpmhe.Luenberger):
+    """An observer that counts failures in its own way."""
+
+    sensors = ((0,),)
+
+
+@pytest.mark.parametrize(("observer", "text"), [
+    (qpmhe.ExtendedKalman(
+        prior=np.eye(3), disturbance=np.eye(3), noise=[[1.0]], innovation=Wider(0.9)
+    ), "Wider, the rule for innovations of ExtendedKalman, has no C form; take qpmhe.Gate"),
+    (Counting(np.full(3, 0.1)), "Counting counts its sensors' failures by a rule of its own"),
+])
+def test_rules_of_ones_own_are_refused(observer, text, tmp_path):
+    one = linear()
+    mhe = qpmhe.MovingHorizonEstimator(
+        one.system, observer, one.cost, horizon=2, initial_state=np.zeros(3)
+    )
+    with pytest.raises(OptionError, match=text):
+        codegen.write(mhe, tmp_path)

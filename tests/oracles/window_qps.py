@@ -153,7 +153,10 @@ class CSolver:
             ca.Function("f", [x], [x]), ca.Function("h", [x], [ca.repmat(x[0], p)]), compiled=False
         )
         sets = tuple((one is not None, one or 0) for one in general)
-        self.layout = Layout(n, p, 0, horizon, sets, 0, real)
+        gains = (("gain", False, n * p), ("filter_gain", False, n * p))
+        self.layout = Layout(
+            n, p, 0, horizon, sets, real, numbers_of=(("observer", gains),)
+        )
         files = estimator_files(
             system.symbolic, self.layout, np.zeros((), self.layout.settings_type())
         )

@@ -1,62 +1,12 @@
 /* What a sample comes with in place of the usual: weights, sides of sets, sensors, a step's length. */
 
-#if MHE_W_SET || MHE_V_SET || MHE_X_SET
-/* A miss of a row counts as a share of its width, or of a standard deviation if that is less. */
-static void mhe_set_scales(int count, const real *lower, const real *upper, const real *deviation,
-                           real *scale)
-{
-    for (int i = 0; i < count; i++) {
-        const real width = upper[i] - lower[i];
-        scale[i] = width > 0 && width < deviation[i] ? width : deviation[i];
-    }
-}
-
-/* The settings' set with the sides of another. */
-#define TAKE_SIDES(own, set, n, count) do { \
-        memcpy((own).rows, (set).rows, sizeof (own).rows); \
-        memcpy((own).deviation, (set).deviation, sizeof (own).deviation); \
-        memcpy((own).row_deviation, (set).row_deviation, sizeof (own).row_deviation); \
-        memcpy((own).row_fixed, (set).row_fixed, sizeof (own).row_fixed); \
-        mhe_set_scales(n, (own).lower, (own).upper, (own).deviation, (own).scale); \
-        mhe_set_scales(count, (own).row_lower, (own).row_upper, (own).row_deviation, \
-                       (own).row_scale); \
-    } while (0)
-#endif
-
 /* Complete a stage's own sets, in which only the sides are known. */
 static void mhe_complete_own_sets(const mhe_settings *s, mhe_stage *stage)
 {
-#if MHE_W_SET
-    if (stage->has_own_w) TAKE_SIDES(stage->own_w, s->disturbances, NX, MHE_W_ROWS);
-#endif
-#if MHE_V_SET
-    if (stage->has_own_v) TAKE_SIDES(stage->own_v, s->noises, NY, MHE_V_ROWS);
-#endif
-#if MHE_X_SET
-    if (stage->has_own_x) TAKE_SIDES(stage->own_x, s->states, NX, MHE_X_ROWS);
-#endif
-    (void)s; (void)stage;
+    mhe_complete_own_w(s, stage);
+    mhe_complete_own_v(s, stage);
+    mhe_complete_own_x(s, stage);
 }
-
-/* The sets that hold at a stage. */
-#if MHE_W_SET
-static const mhe_w_set *mhe_w_set_at(const mhe_settings *s, const mhe_stage *stage)
-{
-    return stage->has_own_w ? &stage->own_w : &s->disturbances;
-}
-#endif
-#if MHE_V_SET
-static const mhe_v_set *mhe_v_set_at(const mhe_settings *s, const mhe_stage *stage)
-{
-    return stage->has_own_v ? &stage->own_v : &s->noises;
-}
-#endif
-#if MHE_X_SET
-static const mhe_x_set *mhe_x_set_at(const mhe_settings *s, const mhe_stage *stage)
-{
-    return stage->has_own_x ? &stage->own_x : &s->states;
-}
-#endif
 
 /* Take a sample's measurement and what it comes with. */
 static void mhe_take_conditions(const mhe_settings *s, mhe_stage *stage, const mhe_sample *sample)
@@ -70,18 +20,9 @@ static void mhe_take_conditions(const mhe_settings *s, mhe_stage *stage, const m
     if (stage->has_own_disturbance)
         memcpy(stage->own_disturbance_weight, sample->disturbance_weight,
                sizeof stage->own_disturbance_weight);
-#if MHE_W_SET
-    stage->has_own_w = sample->disturbances != 0;
-    if (stage->has_own_w) stage->own_w = *sample->disturbances;
-#endif
-#if MHE_V_SET
-    stage->has_own_v = sample->noises != 0;
-    if (stage->has_own_v) stage->own_v = *sample->noises;
-#endif
-#if MHE_X_SET
-    stage->has_own_x = sample->states != 0;
-    if (stage->has_own_x) stage->own_x = *sample->states;
-#endif
+    mhe_take_own_w(stage, sample);
+    mhe_take_own_v(stage, sample);
+    mhe_take_own_x(stage, sample);
     mhe_complete_own_sets(s, stage);
     for (int j = 0; j < NY; j++) {
         const real y = sample->y[j];

@@ -32,163 +32,14 @@ static const real *mhe_disturbance_weight(const mhe_settings *s, const mhe_stage
     return stage->has_own_disturbance ? stage->own_disturbance_weight : s->disturbance_weight;
 }
 
-#if MHE_OWN_LOSSES
-/* rho(q) and rho'(q) of a user's loss. */
-static void mhe_own_loss(const mhe_loss *loss, real q, real *value, real *slope)
-{
-    *value = *slope = NAN;
-#if MHE_OWN_LOSSES & 1
-    if (loss->kind == MHE_OWN_PRIOR) mhe_call_prior_loss(&q, 0, value, slope);
-#endif
-#if MHE_OWN_LOSSES & 2
-    if (loss->kind == MHE_OWN_DISTURBANCE) mhe_call_disturbance_loss(&q, 0, value, slope);
-#endif
-#if MHE_OWN_LOSSES & 4
-    if (loss->kind == MHE_OWN_NOISE) mhe_call_noise_loss(&q, 0, value, slope);
-#endif
-}
-#endif
-
-#if MHE_LOSS
-/* rho(q). */
-static real mhe_loss_value(const mhe_loss *loss, real q)
-{
-    const real k = loss->parameter;
-#if MHE_OWN_LOSSES
-    real value, slope;
-    if (loss->kind >= MHE_OWN_PRIOR) {
-        mhe_own_loss(loss, q, &value, &slope);
-        return value;
-    }
-#endif
-    if (loss->kind == MHE_HUBER) return q <= k * k ? q : 2 * k * sqrt(q) - k * k;
-    if (loss->kind == MHE_POWER) return pow(q, k / 2);
-    return q;
-}
-
-/* rho'(q): by what the weight is multiplied in the form that touches the loss. */
-static real mhe_loss_slope(const mhe_loss *loss, real q)
-{
-    const real k = loss->parameter;
-#if MHE_OWN_LOSSES
-    real value, slope;
-    if (loss->kind >= MHE_OWN_PRIOR) {
-        mhe_own_loss(loss, q, &value, &slope);
-        return slope;
-    }
-#endif
-    if (loss->kind == MHE_HUBER) return q <= k * k ? 1 : k / sqrt(q);
-    /* The power's own slope may be infinite at 0. */
-    if (loss->kind == MHE_POWER) return k / 2 * pow(mhe_max((real)1e-8, q), k / 2 - 1);
-    return 1;
-}
-#endif
-
-/* The loss of s, widened: m rho(q / m). */
-static real mhe_lost(const mhe_loss *loss, real m, int n, const real *W, const real *s)
-{
-#if MHE_LOSS
-    real sum = 0;
-    if (!loss->per_component) return m * mhe_loss_value(loss, mhe_form(n, W, s) / m);
-    for (int j = 0; j < n; j++) sum += mhe_loss_value(loss, W[j * n + j] * s[j] * s[j] / m);
-    return m * sum;
-#else
-    (void)loss; (void)m;
-    return mhe_form(n, W, s);
-#endif
-}
-
-/* What the rows of W are multiplied with in the form that touches the widened loss at s; a loss of
- * each component has a diagonal W. */
-static void mhe_set_scale(const mhe_loss *loss, real m, int n, const real *W, const real *s,
-                          real *scale)
-{
-#if MHE_LOSS
-    if (loss->per_component)
-        for (int j = 0; j < n; j++)
-            scale[j] = mhe_loss_slope(loss, W[j * n + j] * s[j] * s[j] / m);
-    else {
-        const real slope = mhe_loss_slope(loss, mhe_form(n, W, s) / m);
-        for (int j = 0; j < n; j++) scale[j] = slope;
-    }
-#else
-    (void)loss; (void)m; (void)n; (void)W; (void)s; (void)scale;
-#endif
-}
-
-/* By what the losses of w and of v are widened now. Without a workspace: not at all. */
-static real mhe_w_widening(const mhe_workspace *k)
-{
-#if MHE_WIDENED
-    if (k) return k->w_widening;
-#endif
-    (void)k;
-    return 1;
-}
-
-static real mhe_v_widening(const mhe_workspace *k)
-{
-#if MHE_WIDENED
-    if (k) return k->v_widening;
-#endif
-    (void)k;
-    return 1;
-}
-
-static real mhe_scaled(real weight, const real *scale, int row)
-{
-#if MHE_LOSS
-    return scale[row] * weight;
-#else
-    (void)scale; (void)row;
-    return weight;
-#endif
-}
-
 /* l(w, v) of a stage; without a workspace that of the losses themselves. */
 static real mhe_stage_cost(const mhe_settings *s, const mhe_workspace *k, const mhe_stage *stage,
                            const real *w, const real *v)
 {
+    (void)k;
     return mhe_lost(&s->disturbance_loss, mhe_w_widening(k), NX, mhe_disturbance_weight(s, stage),
                     w) +
            mhe_lost(&s->noise_loss, mhe_v_widening(k), NY, stage->noise_weight, v);
-}
-
-#if MHE_PRIOR_ROOTS
-/* a' W a; |R a|^2 where W has a root R: no digits cancel then. */
-static real mhe_rooted_form(const real *root, const real *W, const real *a)
-{
-    real seen[NX];
-    if (!root) return mhe_form(NX, W, a);
-    mhe_times(NX, root, a, seen);
-    return mhe_dot(NX, seen, seen);
-}
-#else
-#define mhe_rooted_form(root, W, a) mhe_form(NX, W, a)
-#endif
-
-/* out = W a for the prior's weight. */
-static void mhe_prior_force(const mhe_prior *prior, const real *a, real *out)
-{
-#if MHE_PRIOR_ROOTS
-    if (prior->root) {
-        real seen[NX];
-        mhe_times(NX, prior->root, a, seen);
-        for (int j = 0; j < NX; j++) out[j] = 0;
-        mhe_add_product(NX, NX, 1, prior->root, seen, out);
-        return;
-    }
-#endif
-    mhe_times(NX, prior->weight, a, out);
-}
-
-/* Gamma of an offset from the prior; quadratic where the observer weighs it. */
-static real mhe_prior_cost(const mhe_settings *s, const mhe_workspace *k, const real *offset)
-{
-#if MHE_PRIOR_ROOTS
-    if (k->prior.root) return mhe_rooted_form(k->prior.root, k->prior.weight, offset);
-#endif
-    return mhe_lost(&s->prior_loss, 1, NX, k->prior.weight, offset);
 }
 
 #if MHE_LAPACK
@@ -216,16 +67,10 @@ static int mhe_dense_terms(const real *Q, const real *w, mhe_terms *t)
 static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
                           const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
 {
+    (void)work;
     const real *A = t->f_jacobian, *C = t->h_jacobian;
     const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
-    if (MHE_LOSS && t == &stage->terms && !isfinite(stage->cost)) {
-        /* Of the candidate where the model failed: no residual, and the weight itself. */
-        for (int j = 0; j < NX; j++) t->disturbance_scale[MHE_LOSS ? j : 0] = 1;
-        for (int j = 0; j < NY; j++) t->noise_scale[MHE_LOSS ? j : 0] = 1;
-    } else {
-        mhe_set_scale(&s->disturbance_loss, mhe_w_widening(work), NX, Q, w, t->disturbance_scale);
-        mhe_set_scale(&s->noise_loss, mhe_v_widening(work), NY, R, v, t->noise_scale);
-    }
+    mhe_scale_weights(s, work, stage, Q, w, v, t);
     mhe_times(NX, Q, w, t->following);
     for (int i = 0; i < NX; i++)
         t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);

@@ -141,17 +141,6 @@ static void mhe_set_roots(mhe_estimator *e, mhe_workspace *k, int i)
     mhe_root(NY, V, k->noise_root);
 }
 
-/* The root of the prior's weight, where it has one. */
-static const real *mhe_root_of_prior(const mhe_prior *prior)
-{
-#if MHE_PRIOR_ROOTS
-    return prior->root;
-#else
-    (void)prior;
-    return 0;
-#endif
-}
-
 /* The gradient, in the increments as if all of them were free, around a trajectory that starts at
  * the given offset from the prior; and the root of the first state's weight. */
 static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
@@ -162,6 +151,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     real scale[NX], first[NX * NX];
     mhe_set_scale(&s->prior_loss, 1, NX, weight, offset, scale);
     const real *root = mhe_root_of_prior(&k->prior);
+    (void)s;
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < NX; c++)
             first[r * NX + c] = root ? 0 : mhe_scaled(factor, scale, r) * weight[r * NX + c];
@@ -175,14 +165,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     for (int j = 0; k->damping > 0 && j < NX; j++)
         first[j * NX + j] += k->damping * (first[j * NX + j] + k->seen[j]);
     mhe_root(NX, first, k->prior_root);
-#if MHE_PRIOR_ROOTS
-    if (root) {
-        real scaled[NX * NX];
-        for (int j = 0; j < NX * NX; j++) scaled[j] = sqrt(factor) * root[j];
-        mhe_join_roots(scaled, k->prior_root, first);
-        memcpy(k->prior_root, first, sizeof first);
-    }
-#endif
+    if (root) mhe_join_prior_root(k, root, factor);
     for (int i = 0; i < count; i++) {
         const real next = mhe_floored(k->factors[i + 1]);
         const mhe_terms *t = k->at[i];
@@ -215,39 +198,39 @@ static void mhe_add_inequalities(const mhe_estimator *e, mhe_workspace *k, int i
     const real *weights = k->rows.weight + at;
     real row[NX > NY ? NX : NY];
     (void)s; (void)row;
-#if MHE_W_SET
-    for (int r = 0; r < NX + MHE_W_ROWS && i < e->length; r++) {
-        if (weights[r] == 0) continue;
-        for (int c = 0; c < MHE_FREE; c++) {
-            row[c] = r < NX ? s->free[r * MHE_FREE + c] : 0;
-            for (int j = 0; r >= NX && j < NX; j++)
-                row[c] += s->disturbances.rows[(r - NX) * NX + j] * s->free[j * MHE_FREE + c];
+    if (MHE_W_SET) {
+        for (int r = 0; r < NX + MHE_W_ROWS && i < e->length; r++) {
+            if (weights[r] == 0) continue;
+            for (int c = 0; c < MHE_FREE; c++) {
+                row[c] = r < NX ? s->free[r * MHE_FREE + c] : 0;
+                for (int j = 0; r >= NX && j < NX; j++)
+                    row[c] += s->disturbances.rows[(r - NX) * NX + j] * s->free[j * MHE_FREE + c];
+            }
+            mhe_add_row(b, at + r, weights[r], 0, MHE_FREE, row, 1);
         }
-        mhe_add_row(b, at + r, weights[r], 0, MHE_FREE, row, 1);
+        weights += W_COUNT, at += W_COUNT;
     }
-    weights += W_COUNT, at += W_COUNT;
-#endif
-#if MHE_V_SET
-    for (int r = 0; r < NY + MHE_V_ROWS && i < e->length; r++) {
-        const real *C = k->at[i]->h_jacobian;
-        if (weights[r] == 0) continue;
-        for (int c = 0; c < NX; c++) {
-            row[c] = r < NY ? C[r * NX + c] : 0;
-            for (int j = 0; r >= NY && j < NY; j++)
-                row[c] += s->noises.rows[(r - NY) * NY + j] * C[j * NX + c];
+    if (MHE_V_SET) {
+        for (int r = 0; r < NY + MHE_V_ROWS && i < e->length; r++) {
+            const real *C = k->at[i]->h_jacobian;
+            if (weights[r] == 0) continue;
+            for (int c = 0; c < NX; c++) {
+                row[c] = r < NY ? C[r * NX + c] : 0;
+                for (int j = 0; r >= NY && j < NY; j++)
+                    row[c] += s->noises.rows[(r - NY) * NY + j] * C[j * NX + c];
+            }
+            mhe_add_row(b, at + r, weights[r], MHE_FREE, NX, row, -1);
         }
-        mhe_add_row(b, at + r, weights[r], MHE_FREE, NX, row, -1);
+        weights += V_COUNT, at += V_COUNT;
     }
-    weights += V_COUNT, at += V_COUNT;
-#endif
-#if MHE_X_SET
-    for (int r = 0; r < NX; r++) {
-        const real one = 1;
-        mhe_add_row(b, at + r, weights[r], MHE_FREE + r, 1, &one, 1);
+    if (MHE_X_SET) {
+        for (int r = 0; r < NX; r++) {
+            const real one = 1;
+            mhe_add_row(b, at + r, weights[r], MHE_FREE + r, 1, &one, 1);
+        }
+        for (int r = 0; r < MHE_X_ROWS; r++)
+            mhe_add_row(b, at + NX + r, weights[NX + r], MHE_FREE, NX, s->states.rows + r * NX, 1);
     }
-    for (int r = 0; r < MHE_X_ROWS; r++)
-        mhe_add_row(b, at + NX + r, weights[NX + r], MHE_FREE, NX, s->states.rows + r * NX, 1);
-#endif
     (void)at; (void)weights;
 }
 
@@ -296,10 +279,8 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
                 }
             }
         }
-#if MHE_X_SET
-        else if (weighted)
+        else if (MHE_X_SET && weighted)
             mhe_add_inequalities(e, k, i);
-#endif
         for (int c = 0; c < MHE_FREE + NX && b->rank < b->count; c++) {
             b->rank += mhe_reflect(b, b->rank, c);
             if (c < MHE_FREE) b->free = b->rank;
@@ -396,13 +377,13 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
         for (int j = 0; j < b->inequalities; j++, at++) {
             const int row = b->source[j];
             side[at] = k->rows.load[row] / b->root[j];
-#if MHE_W_SET
-            const int r = row - i * ROWS;
-            if (push || r >= W_COUNT) continue;
-            side[at] -= b->root[j] *
-                        (r < NX ? drift[r]
-                                : mhe_dot(NX, s->disturbances.rows + (r - NX) * NX, drift));
-#endif
+            if (MHE_W_SET) {
+                const int r = row - i * ROWS;
+                if (push || r >= W_COUNT) continue;
+                side[at] -= b->root[j] *
+                            (r < NX ? drift[r]
+                                    : mhe_dot(NX, s->disturbances.rows + (r - NX) * NX, drift));
+            }
         }
         for (int j = later->free; i < count && j < later->rank; j++, at++) {
             side[at] = side[EQUATIONS + j];
@@ -509,4 +490,14 @@ static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset
     mhe_set_targets(e, k, 0, nearest);
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);
     return mhe_solve(e, k, 0, k->step);
+}
+
+/* The trial that the QP is around. */
+static void mhe_set_around(mhe_workspace *k, const mhe_trial *around) { k->around = around; }
+
+/* Roots need no ridge. */
+static int mhe_set_ridge(mhe_workspace *k, int has_ridge)
+{
+    (void)k; (void)has_ridge;
+    return 0;
 }

@@ -50,11 +50,13 @@ typedef $real mhe_real;
 #define MHE_CLOCK $clock /* whether time_budget is kept */
 #define MHE_OUTPUT_RESIDUAL $output_residual /* 1: outputs have angles; 2: a function for differences */
 #define MHE_STATE_RESIDUAL $state_residual /* the same of states */
-#define MHE_OBSERVER $observer /* 0: a gain; 1, 2: extended, unscented filter; 3: a function */
 #define MHE_COVARIANCE $covariance /* whether the observer's covariance is computed */
 #define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
-#define MHE_INNOVATION $innovation /* 0: all innovations count; 1: a gate; 2: Huber's weights */
+#define MHE_CONSTANT_GAIN $constant_gain /* whether the observer corrects with a constant gain */
+#define MHE_NEEDS_JACOBIANS $needs_jacobians /* whether it reads those of f and h */
+#define MHE_DEVIATIONS $deviations /* rows with which a Kalman filter represents its covariance */
 #define MHE_SENSORS $sensors    /* sensors whose innovations are tested */
+#define MHE_REJECTS $rejects    /* whether those that fail are rejected */
 #define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_QUIET $quiet /* directions of x(t+1) - f without a disturbance */
 #define MHE_ROLLED $rolled /* whether some directions of x(t+1) - f have no disturbance in any trial */
@@ -64,19 +66,8 @@ typedef $real mhe_real;
 /* Step lengths, tolerances and thresholds. */
 $limits
 
-/* Values of MHE_OBSERVER, and of MHE_INNOVATION. */
-#define MHE_GAIN 0
-#define MHE_EXTENDED 1
-#define MHE_UNSCENTED 2
-#define MHE_FUNCTION 3 /* of its state and the fitting error */
-#define MHE_GATED 1
-#define MHE_WEIGHTED 2
-
-/* Whether the covariance is propagated by its root where it has lost digits. */
-#define MHE_ROOTS (MHE_OBSERVER == MHE_EXTENDED || MHE_OBSERVER == MHE_UNSCENTED)
-
-/* Whether such a root gives one of the prior's weight. */
-#define MHE_PRIOR_ROOTS (MHE_ROOTS && MHE_OBSERVER_PRIOR)
+/* Whether a root of its covariance gives one of the prior's weight. */
+#define MHE_PRIOR_ROOTS (MHE_DEVIATIONS && MHE_OBSERVER_PRIOR)
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
@@ -151,30 +142,17 @@ typedef struct {
 typedef struct {
     mhe_real initial[MHE_NX * MHE_NX]; /* of the initial error */
     mhe_real disturbance[MHE_NX * MHE_NX], noise[MHE_NY * MHE_NY];
-    /* Jacobians of a constant gain's error. */
-    mhe_real f_jacobian[MHE_NX * MHE_NX], h_jacobian[MHE_NY * MHE_NX];
 #if MHE_OBSERVER_PRIOR
     /* What is added to the covariance that weighs the prior, and to its inverse. */
     mhe_real added[MHE_NX * MHE_NX], least_weight[MHE_NX * MHE_NX];
 #endif
     mhe_real least;           /* eigenvalue of the correlations that are inverted */
-    mhe_real spread;          /* of sigma points, in standard deviations */
     mhe_real noise_share;     /* least variance of an output's noise given the others', over its own */
     mhe_real typical[MHE_NX]; /* variances where states may be known exactly, else 0 */
 } mhe_covariances;
 #endif
-$term_types
-#if MHE_SENSORS
+$part_types
 typedef struct {
-    mhe_real limits[MHE_NY];   /* of squared innovations of sensors with 1, 2, ... outputs there */
-    int32_t sensor_of[MHE_NY]; /* the sensor of each output */
-    int32_t reopen;            /* failures in a row after which a sensor is due */
-} mhe_innovation;
-#endif
-
-typedef struct {
-    mhe_real gain[MHE_NX * MHE_NY];
-    mhe_real filter_gain[MHE_NX * MHE_NY]; /* of the observer's own measurement update */
     mhe_real prior_weight[MHE_NX * MHE_NX];
     mhe_real disturbance_weight[MHE_NX * MHE_NX];
     mhe_real noise_weight[MHE_NY * MHE_NY];
@@ -185,10 +163,7 @@ typedef struct {
 #if MHE_COVARIANCE
     mhe_covariances covariances; /* of the observer */
 #endif
-$term_fields#if MHE_SENSORS
-    mhe_innovation innovation;
-#endif
-    mhe_real discount;         /* factor on a stage's cost for each step of age */
+$part_fields    mhe_real discount;         /* factor on a stage's cost for each step of age */
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
     mhe_real tolerance;        /* relative decrease of the cost that counts as converged */
     mhe_real solver_tolerance; /* residuals of a constrained QP that is solved */

@@ -10,6 +10,19 @@
  * that losses have not touched: above rounding, and far below what a useful step depends on. */
 #define RIDGE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-4)
 
+/* A QP around a trial knows it by its terms. */
+static void mhe_set_around(mhe_workspace *k, const mhe_trial *around)
+{
+    (void)k; (void)around;
+}
+
+/* Give the next QPs a ridge, or none; whether they can have one. */
+static int mhe_set_ridge(mhe_workspace *k, int has_ridge)
+{
+    k->has_ridge = has_ridge;
+    return 1;
+}
+
 /* Add damping to the panels. */
 static void mhe_damp(mhe_estimator *e, mhe_workspace *k)
 {

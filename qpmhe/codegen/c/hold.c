@@ -112,6 +112,12 @@ static void mhe_trust(mhe_estimator *e, const mhe_workspace *k, const real *traj
         following[j] += mhe_dot(MHE_HELD, k->prior.follow + j * MHE_HELD, offset);
 }
 
+/* The values for the next window are those for this one now. */
+static void mhe_trust_on(mhe_estimator *e)
+{
+    memcpy(e->trusted, e->trusted + MHE_HELD, sizeof e->trusted / 2);
+}
+
 static void mhe_trust_start(mhe_estimator *e)
 {
     for (int j = 0; j < 2 * MHE_HELD; j++)

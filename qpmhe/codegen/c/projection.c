@@ -1,7 +1,5 @@
 /* Projection of the observer onto X: the nearest point in the observer's own metric. */
 
-#if MHE_X_SET
-
 /* One-sided inequalities a's <= b: components from above and from below, then rows likewise. */
 #define SIDES (2 * (NX + MHE_X_ROWS))
 
@@ -10,9 +8,6 @@
 
 /* Most corrections that put a point on its active sides. */
 #define REFINEMENTS 4
-
-/* E^(2^k) of a stable matrix has vanished by then, unless its spectral radius is 1 within 1e-12. */
-#define DOUBLINGS 40
 
 static real mhe_limit(const mhe_x_set *set, int r)
 {
@@ -309,160 +304,22 @@ static int mhe_keep_inside(const mhe_x_set *set, const real *P, const real *pred
     return reached ? events : events | MHE_METRIC_SINGULAR;
 }
 
-/* Whether a power of E halves every vector: all eigenvalues are within the unit circle. */
-static int mhe_is_stable(int n, const real *E)
+/* The metric in which the observer is projected, as a covariance. With `project` of 2 that is the
+ * diagonal of its own, which is made in `other`. */
+static const real *mhe_projected_in(const mhe_estimator *e, const real *own, real *other)
 {
-    real power[NX * NX], square[NX * NX];
-    memcpy(power, E, sizeof(real) * (size_t)(n * n));
-    for (int i = 0; i < DOUBLINGS; i++) {
-        real size = 0;
-        for (int r = 0; r < n; r++) {
-            real sum = 0;
-            for (int c = 0; c < n; c++) sum += fabs(power[r * n + c]);
-            if (!isfinite(sum)) return 0;
-            size = mhe_max(sum, size);
-        }
-        if (size <= (real)0.5) return 1;
-        mhe_multiply(n, n, n, power, power, square);
-        memcpy(power, square, sizeof(real) * (size_t)(n * n));
-    }
-    return 0;
-}
-
-/* M := the sum over k of E'^k M E^k, by doubling: 2^j terms after j products. E is overwritten. */
-static void mhe_lyapunov(int n, real *E, real *M)
-{
-    real left[NX * NX], added[NX * NX];
-    const int size = n * n;
-    for (int i = 0; i < DOUBLINGS; i++) {
-        real change = 0, most = 0;
-        mhe_multiply(n, n, n, M, E, left);
-        memset(added, 0, sizeof added);
-        mhe_add_product(n, n, n, E, left, added);
-        for (int j = 0; j < size; j++) {
-            M[j] += added[j];
-            change = mhe_max(fabs(added[j]), change);
-            most = mhe_max(fabs(M[j]), most);
-        }
-        mhe_multiply(n, n, n, E, E, left);
-        memcpy(E, left, sizeof(real) * (size_t)size);
-        if (!(change > EPSILON * most)) break;
-    }
-    mhe_symmetrise(n, M);
-}
-
-/* Take the Lyapunov matrix of the error E = A - K C at a stage for the metric, M = E'ME + Gamma, if E
- * is stable. Parameters that the observer does not correct are left out of E, and keep their
- * block of Gamma. `covariance` gets the inverse; whether it did. */
-static int mhe_settle(const mhe_settings *s, const real *K, const mhe_terms *t, real *covariance)
-{
-    const real *A = t->f_jacobian, *C = t->h_jacobian;
-    real E[NX * NX], M[NX * NX], metric[NX * NX], scale[NX];
-    int moving[NX], count = NX;
-    if (!mhe_all_finite(NX * NX, A) || !mhe_all_finite(NY * NX, C) || !mhe_all_finite(NX * NY, K))
-        return 0;
-    for (int j = 0; j < NX; j++) moving[j] = j, scale[j] = sqrt(s->metric_weight[j * (NX + 1)]);
-    for (int stage = 0;; stage++) {
-        for (int r = 0; r < count; r++)
-            for (int c = 0; c < count; c++) {
-                const int i = moving[r], j = moving[c];
-                real sum = A[i * NX + j];
-                for (int q = 0; q < NY; q++) sum -= K[i * NY + q] * C[q * NX + j];
-                E[r * count + c] = scale[i] * sum / scale[j];
-            }
-        if (mhe_is_stable(count, E)) break;
-        if (stage) return 0;
-        count = 0;
-        for (int i = 0; i < NX; i++) {
-            int moves = 0;
-            for (int q = 0; q < NY; q++) moves |= K[i * NY + q] != 0;
-            for (int j = 0; j < NX; j++) moves |= A[i * NX + j] != (i == j);
-            if (moves) moving[count++] = i;
-        }
-        if (count == 0 || count >= NX) return 0;
-    }
-    for (int r = 0; r < count; r++)
-        for (int c = 0; c < count; c++)
-            M[r * count + c] = s->metric_weight[moving[r] * NX + moving[c]] /
-                               (scale[moving[r]] * scale[moving[c]]);
-    mhe_lyapunov(count, E, M);
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++)
-            metric[i * NX + j] = s->metric_weight[i * NX + j] / (scale[i] * scale[j]);
-    for (int r = 0, i = 0; i < NX; i++) {
-        const int own = r < count && moving[r] == i;
-        for (int c = 0, j = 0; j < NX; j++) {
-            const int other = c < count && moving[c] == j;
-            if (own && other) metric[i * NX + j] = M[r * count + c];
-            else if (own != other) metric[i * NX + j] = 0;
-            c += other;
-        }
-        r += own;
-    }
-    if (!mhe_invert(NX, metric, M)) return 0;
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) M[i * NX + j] /= scale[i] * scale[j];
-    if (!mhe_all_finite(NX * NX, M)) return 0;
-    memcpy(covariance, M, sizeof M);
-    return 1;
-}
-
-/* X of the state behind a stage: that of the next sample, if it has come. */
-static const mhe_x_set *mhe_x_set_behind(const mhe_estimator *e, const mhe_stage *stage)
-{
-    const int at = (int)(stage - e->stages), newest = (e->first + e->length - 1) % MHE_HORIZON;
-    return mhe_x_set_at(e->settings, e->stages + (at == newest ? at : (at + 1) % MHE_HORIZON));
-}
-
-/* The metric in which the observer is projected, as a covariance: its own if it has one. With
- * `project` of 2 that is its diagonal, which is made in `other`. */
-static const real *mhe_metric(const mhe_estimator *e, const real *covariance, real *other)
-{
-    const real *own = MHE_COVARIANCE ? covariance : e->metric;
     if (e->settings->project < 2) return own;
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) other[i * NX + j] = i == j ? own[i * NX + j] : 0;
     return other;
 }
 
-/* Keep the observer's next state in X, or in another set; bits of the status. The stage's Jacobians are there as long
- * as the metric has not settled. */
-static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const mhe_x_set *onto,
-                           const real *predicted, real *next, const real *covariance)
-{
-    const mhe_settings *s = e->settings;
-    const mhe_x_set *set = onto ? onto : mhe_x_set_behind(e, stage);
-    if (!e->metric_settled) {
-        real slope[NX * NY];
-        mhe_correction_slope(s, stage, slope);
-        e->metric_settled = mhe_settle(s, slope, &stage->terms, e->metric);
-    }
-    if (mhe_is_inside(set, next)) return 0;
-    real other[NX * NX];
-    const real *P = mhe_metric(e, covariance, other);
-    const int events = mhe_keep_inside(set, P, predicted, next, stage->w);
-    mhe_wrap_state(s, next, stage->w);
-    return events;
-}
-
 /* Put a state of the observer into a set to which no correction leads. */
-static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, const real *covariance,
+static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, const real *metric,
                            real *state)
 {
     real point[NX], other[NX * NX];
     if (!e->settings->project || mhe_is_inside(set, state)) return;
-    mhe_project(set, mhe_metric(e, covariance, other), state, point);
+    mhe_project(set, mhe_projected_in(e, metric, other), state, point);
     memcpy(state, point, sizeof point);
 }
-
-static int mhe_has_sides_of(const mhe_x_set *one, const mhe_x_set *other)
-{
-    int same = 1;
-    for (int j = 0; j < NX; j++)
-        same &= one->lower[j] == other->lower[j] && one->upper[j] == other->upper[j];
-    for (int r = 0; r < MHE_X_ROWS; r++)
-        same &= one->row_lower[r] == other->row_lower[r] && one->row_upper[r] == other->row_upper[r];
-    return same;
-}
-
-#endif

@@ -1,8 +1,5 @@
 /* The sets W, V and X: their rows, and by how much a trajectory misses them. */
 
-#define CONSTRAINED (MHE_W_SET || MHE_V_SET || MHE_X_SET)
-
-#if CONSTRAINED
 #define ROWS MHE_STAGE_ROWS
 #define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
 #define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
@@ -54,41 +51,41 @@ static void mhe_stage_scales(mhe_estimator *e, int i, real *scale, real *deviati
 {
     const mhe_settings *s = e->settings;
     const mhe_stage *stage = mhe_stage_of_state(e, i);
-#if MHE_W_SET
-    const mhe_w_set *W = mhe_w_set_at(s, stage);
-    for (int j = 0; j < NX; j++) {
-        scale[j] = W->scale[j];
-        deviation[j] = mhe_max(W->deviation[j], scale[j]);
+    if (MHE_W_SET) {
+        const mhe_w_set *W = mhe_w_set_at(s, stage);
+        for (int j = 0; j < NX; j++) {
+            scale[j] = W->scale[j];
+            deviation[j] = mhe_max(W->deviation[j], scale[j]);
+        }
+        for (int j = 0; j < MHE_W_ROWS; j++) {
+            scale[NX + j] = W->row_scale[j];
+            deviation[NX + j] = mhe_max(W->row_deviation[j], scale[NX + j]);
+        }
+        scale += W_COUNT, deviation += W_COUNT;
     }
-    for (int j = 0; j < MHE_W_ROWS; j++) {
-        scale[NX + j] = W->row_scale[j];
-        deviation[NX + j] = mhe_max(W->row_deviation[j], scale[NX + j]);
+    if (MHE_V_SET) {
+        const mhe_v_set *V = mhe_v_set_at(s, stage);
+        for (int j = 0; j < NY; j++) {
+            scale[j] = V->scale[j];
+            deviation[j] = mhe_max(V->deviation[j], scale[j]);
+        }
+        for (int j = 0; j < MHE_V_ROWS; j++) {
+            scale[NY + j] = V->row_scale[j];
+            deviation[NY + j] = mhe_max(V->row_deviation[j], scale[NY + j]);
+        }
+        scale += V_COUNT, deviation += V_COUNT;
     }
-    scale += W_COUNT, deviation += W_COUNT;
-#endif
-#if MHE_V_SET
-    const mhe_v_set *V = mhe_v_set_at(s, stage);
-    for (int j = 0; j < NY; j++) {
-        scale[j] = V->scale[j];
-        deviation[j] = mhe_max(V->deviation[j], scale[j]);
+    if (MHE_X_SET) {
+        const mhe_x_set *X = mhe_x_set_at(s, stage);
+        for (int j = 0; j < NX; j++) {
+            scale[j] = X->scale[j];
+            deviation[j] = mhe_max(X->deviation[j], scale[j]);
+        }
+        for (int j = 0; j < MHE_X_ROWS; j++) {
+            scale[NX + j] = X->row_scale[j];
+            deviation[NX + j] = mhe_max(X->row_deviation[j], scale[NX + j]);
+        }
     }
-    for (int j = 0; j < MHE_V_ROWS; j++) {
-        scale[NY + j] = V->row_scale[j];
-        deviation[NY + j] = mhe_max(V->row_deviation[j], scale[NY + j]);
-    }
-    scale += V_COUNT, deviation += V_COUNT;
-#endif
-#if MHE_X_SET
-    const mhe_x_set *X = mhe_x_set_at(s, stage);
-    for (int j = 0; j < NX; j++) {
-        scale[j] = X->scale[j];
-        deviation[j] = mhe_max(X->deviation[j], scale[j]);
-    }
-    for (int j = 0; j < MHE_X_ROWS; j++) {
-        scale[NX + j] = X->row_scale[j];
-        deviation[NX + j] = mhe_max(X->row_deviation[j], scale[NX + j]);
-    }
-#endif
     (void)stage;
 }
 
@@ -98,21 +95,21 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const re
 {
     const mhe_settings *s = e->settings;
     const mhe_stage *stage = mhe_stage_of_state(e, i);
-#if MHE_X_SET
-    DISTANCES(*mhe_x_set_at(s, stage), NX, MHE_X_ROWS, x + i * NX, 0, low + W_COUNT + V_COUNT,
-              high + W_COUNT + V_COUNT);
-    if (i == e->length) {
-        for (int r = 0; r < W_COUNT + V_COUNT; r++) low[r] = -INFINITY, high[r] = INFINITY;
-        return;
+    if (MHE_X_SET) {
+        DISTANCES(*mhe_x_set_at(s, stage), NX, MHE_X_ROWS, x + i * NX, 0, low + W_COUNT + V_COUNT,
+                  high + W_COUNT + V_COUNT);
+        if (i == e->length) {
+            for (int r = 0; r < W_COUNT + V_COUNT; r++) low[r] = -INFINITY, high[r] = INFINITY;
+            return;
+        }
     }
-#endif
-#if MHE_W_SET
-    DISTANCES(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, w + i * NX, 0, low, high);
-#endif
-#if MHE_V_SET
-    DISTANCES(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, v + i * NY,
-              stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
-#endif
+    if (MHE_W_SET) {
+        DISTANCES(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, w + i * NX, 0, low, high);
+    }
+    if (MHE_V_SET) {
+        DISTANCES(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, v + i * NY,
+                  stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
+    }
     (void)x; (void)w; (void)v; (void)s; (void)stage;
 }
 
@@ -160,24 +157,41 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const real *
         uint8_t *in = missed ? missed + i * ROWS : 0;
         const mhe_stage *stage = mhe_stage_of_state(e, i);
         mhe_stage_distances(e, i, trial->x, w, trial->v, low, high);
-#if MHE_X_SET
-        worst = mhe_max(worst, MISSED(*mhe_x_set_at(s, stage), s->states, NX, MHE_X_ROWS,
-                                      low + W_COUNT + V_COUNT, high + W_COUNT + V_COUNT,
-                                      trial->x + i * NX,
-                                      out ? out + W_COUNT + V_COUNT : 0,
-                                      in ? in + W_COUNT + V_COUNT : 0));
-        if (i == e->length) break;
-#endif
-#if MHE_W_SET
-        worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), s->disturbances, NX, MHE_W_ROWS,
-                                      low, high, trial->x + (i + 1) * NX, out, in));
-#endif
-#if MHE_V_SET
-        worst = mhe_max(worst, MISSED(*mhe_v_set_at(s, stage), s->noises, NY, MHE_V_ROWS,
-                                      low + W_COUNT, high + W_COUNT, stage->y,
-                                      out ? out + W_COUNT : 0, in ? in + W_COUNT : 0));
-#endif
+        if (MHE_X_SET) {
+            worst = mhe_max(worst, MISSED(*mhe_x_set_at(s, stage), s->states, NX, MHE_X_ROWS,
+                                          low + W_COUNT + V_COUNT, high + W_COUNT + V_COUNT,
+                                          trial->x + i * NX,
+                                          out ? out + W_COUNT + V_COUNT : 0,
+                                          in ? in + W_COUNT + V_COUNT : 0));
+            if (i == e->length) break;
+        }
+        if (MHE_W_SET) {
+            worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), s->disturbances, NX, MHE_W_ROWS,
+                                          low, high, trial->x + (i + 1) * NX, out, in));
+        }
+        if (MHE_V_SET) {
+            worst = mhe_max(worst, MISSED(*mhe_v_set_at(s, stage), s->noises, NY, MHE_V_ROWS,
+                                          low + W_COUNT, high + W_COUNT, stage->y,
+                                          out ? out + W_COUNT : 0, in ? in + W_COUNT : 0));
+        }
     }
     return worst;
 }
-#endif
+
+/* Put a state behind w into the components of W that have no width. */
+static void mhe_keep_equations(const mhe_settings *s, const real *predicted, real *next)
+{
+    const mhe_w_set *set = &s->disturbances;
+    if (!MHE_W_SET) return;
+    for (int j = 0; j < NX; j++)
+        if (set->lower[j] == set->upper[j]) next[j] = predicted[j] + set->lower[j];
+    mhe_enter_turn(s, next);
+}
+
+static void mhe_fill_dropped(const mhe_workspace *k, int rows_dropped, mhe_estimate *out)
+{
+    if (rows_dropped)
+        memcpy(out->dropped, k->left_out, sizeof out->dropped);
+    else
+        memset(out->dropped, 0, sizeof out->dropped);
+}

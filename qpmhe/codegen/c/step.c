@@ -29,14 +29,8 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
         if (!(o->events & MHE_MODEL_FAILED)) o->events |= MHE_FAILED_STAGE;
     }
     mhe_watch(e, k, o);
-#if MHE_WIDENED
-    memcpy(e->trajectory, o->followed ? k->followed : o->best->x, size);
-#else
-    memcpy(e->trajectory, o->best->x, size);
-#endif
-#if MHE_HELD
+    memcpy(e->trajectory, mhe_next_start(k, o), size);
     mhe_trust(e, k, o->best != o->candidate ? o->best->x : 0);
-#endif
     e->has_trajectory = 1;
     if (!isfinite(newest->cost) && o->best != o->candidate)
         memcpy(e->z_end, o->best->x + e->length * NX, sizeof e->z_end);
@@ -47,16 +41,7 @@ static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
 {
     const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
     if (o->best == o->candidate) {
-#if MHE_X_SET && MHE_COVARIANCE
-        real covariance[NX * NX];
-        mhe_filter(e->settings, newest, out, covariance);
-        mhe_enter_turn(e->settings, out);
-        if (isfinite(newest->cost))
-            mhe_put_inside(e, mhe_x_set_at(e->settings, newest), covariance, out);
-#else
-        mhe_filter(e->settings, newest, out, 0);
-        mhe_enter_turn(e->settings, out);
-#endif
+        mhe_filter_inside(e, newest, out);
     } else
         memcpy(out, o->best->x + (e->length - 1) * NX, sizeof(real) * NX);
 }
@@ -70,12 +55,8 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
         memcpy(e->smoothed_prior, e->trajectory + NX, sizeof e->smoothed_prior);
         e->has_smoothed = 1;
     }
-#if MHE_HELD
-    memcpy(e->trusted, e->trusted + MHE_HELD, sizeof e->trusted / 2);
-#endif
-#if CONSTRAINED
+    mhe_trust_on(e);
     if (before == MHE_HORIZON) mhe_shift_places(e);
-#endif
     int events = mhe_push(e, sample);
     if (e->settings->reinitialize) {
         mhe_stage *oldest = mhe_stage_at(e, 0);
@@ -85,16 +66,6 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
     mhe_estimate_now(e, k, o, events, before);
     memcpy(e->history_end, o->best->x + e->length * NX, sizeof e->history_end);
 }
-
-#if MHE_SENSORS
-/* Which sensors the observer rejected at the newest stage. */
-static void mhe_fill_rejected(mhe_estimator *e, uint8_t *out)
-{
-    const mhe_stage *newest = mhe_stage_at(e, e->length - 1);
-    for (int k = 0; k < MHE_SENSORS; k++)
-        out[k] = MHE_INNOVATION == MHE_GATED && e->rejections_end[k] > newest->rejections[k];
-}
-#endif
 
 static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome *o,
                      mhe_estimate *out)
@@ -123,17 +94,9 @@ static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome
     out->nearest_points = o->nearest_points;
     memcpy(out->observer_state, e->z_end, sizeof e->z_end);
     mhe_filtered(e, o, out->filtered);
-#if MHE_SENSORS
-    mhe_fill_rejected(e, out->rejected);
-#endif
-#if CONSTRAINED
-    if (o->rows_dropped)
-        memcpy(out->dropped, k->left_out, sizeof out->dropped);
-    else
-        memset(out->dropped, 0, sizeof out->dropped);
-#else
+    mhe_fill_sensors(e, out);
+    mhe_fill_dropped(k, o->rows_dropped, out);
     (void)k;
-#endif
 }
 
 void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
@@ -142,24 +105,11 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
     e->settings = settings;
     memcpy(e->z_end, x0, sizeof e->z_end);
     mhe_enter_turn(settings, e->z_end);
-#if MHE_X_SET
-    memcpy(e->metric, settings->metric, sizeof e->metric);
-    e->metric_settled = settings->metric_settled;
-    real inside[NX];
-    if (!mhe_is_inside(&settings->states, e->z_end)) {
-        mhe_project(&settings->states, settings->metric, e->z_end, inside);
-        memcpy(e->z_end, inside, sizeof inside);
-    }
-#endif
+    mhe_start_inside(e);
     memcpy(e->last_good, e->z_end, sizeof e->last_good);
     memcpy(e->history_end, e->z_end, sizeof e->z_end);
-#if MHE_HELD
     mhe_trust_start(e);
-#endif
-#if MHE_COVARIANCE
-    memcpy(e->last_good_covariance, settings->covariances.initial, sizeof e->covariance_end);
-    memcpy(e->covariance_end, settings->covariances.initial, sizeof e->covariance_end);
-#endif
+    mhe_start_observer(e);
 }
 
 static mhe_sample mhe_usual_sample(const real *y, const real *u)
@@ -264,12 +214,7 @@ void mhe_set(mhe_estimator *e, mhe_workspace *k, const mhe_settings *settings, i
         mhe_set_noise_weight(settings, stage);
         mhe_complete_own_sets(settings, stage);
     }
-#if MHE_X_SET
-    /* The window's first state, or the only one there is. */
-    mhe_put_inside(e, e->length ? mhe_x_set_at(settings, mhe_stage_at(e, 0)) : &settings->states,
-                   mhe_next_covariance(e, -1), mhe_next_state(e, -1));
-    if (!e->length) memcpy(e->history_end, e->z_end, sizeof e->z_end);
-#endif
+    mhe_put_first_inside(e);
     if (e->length) mhe_estimate_again(e, k, mhe_replay(e, 0), out);
 }
 
@@ -293,9 +238,7 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *k, int64
             if (log->status) log->status[at] = o.events;
             if (log->qps) log->qps[at] = o.qps;
             if (log->iterations) log->iterations[at] = o.iterations;
-#if MHE_SENSORS
-            if (log->rejected) mhe_fill_rejected(e, log->rejected + at * MHE_SENSORS);
-#endif
+            mhe_log_sensors(e, log, at);
         }
     }
 }

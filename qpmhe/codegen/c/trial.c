@@ -1,18 +1,5 @@
 /* A trajectory, judged by the true model. */
 
-#if MHE_QUIET
-/* Make next = predicted + keep (next - predicted) + shift; `shift` may be a null pointer. */
-static void mhe_follow(const mhe_settings *s, const real *predicted, const real *keep,
-                       const real *shift, real *next)
-{
-    real ahead[NX];
-    for (int j = 0; j < NX; j++) ahead[j] = next[j] - predicted[j];
-    mhe_wrap_state(s, next, ahead);
-    for (int j = 0; j < NX; j++)
-        next[j] = predicted[j] + mhe_dot(NX, keep + j * NX, ahead) + (shift ? shift[j] : 0);
-}
-#endif
-
 /* Judge the trajectory of a trial by the true model: infinite cost where the model is not
  * finite or a row is missed. Where there is no disturbance, the trial first becomes what the
  * model makes of it; the candidate along the directions of the cost alone, and no set judges it. */
@@ -27,18 +14,8 @@ static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
         real *w = trial->w + i * NX, *v = trial->v + i * NY, predicted[NX], output[NY];
         mhe_f(x, stage->u, stage->u[NU], predicted);
         mhe_h(x, stage->u, output);
-#if MHE_W_SET
-        const mhe_w_set *set = &s->disturbances;
-        for (int j = 0; j < NX; j++)
-            if (set->lower[j] == set->upper[j]) x[NX + j] = predicted[j] + set->lower[j];
-        mhe_enter_turn(s, x + NX);
-#endif
-#if MHE_QUIET
-        if (is_candidate)
-            mhe_follow(s, predicted, s->candidate_keep, 0, x + NX);
-        else
-            mhe_follow(s, predicted, s->keep, s->shift, x + NX);
-#endif
+        mhe_keep_equations(s, predicted, x + NX);
+        mhe_follow_model(s, predicted, is_candidate, x + NX);
         for (int j = 0; j < NX; j++) w[j] = x[NX + j] - predicted[j];
         /* A model that fails in a missing output fails, as it does everywhere. */
         for (int j = 0; j < NY; j++) v[j] = stage->y[j] - output[j];
@@ -56,13 +33,9 @@ static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
         trial->cost = trial->violation = INFINITY;
         return;
     }
-#if CONSTRAINED
     if (is_candidate) return;
     trial->violation = mhe_violation(e, trial, trial->w, k->left_out, 0);
     if (trial->violation > MHE_FEASIBLE) trial->cost = INFINITY;
-#else
-    (void)is_candidate;
-#endif
 }
 
 static void mhe_evaluate(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)

@@ -1,0 +1,45 @@
+/* What a search has found so far. */
+
+#define CONSTRAINED (MHE_STAGE_ROWS > 0)
+
+/* What becomes of a QP. */
+enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
+
+typedef struct {
+    mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */
+    int outside; /* the candidate misses rows: as a trial, it has no finite cost */
+    int events, qps, iterations, corrections, nearest_points, rows_dropped;
+    int unsolved;   /* the last QPs that were not solved to the tolerance */
+    int followed;   /* the next step starts from a surrogate's minimiser */
+    real damping;   /* with which a search for a shorter step begins, at least */
+    real present, growth; /* that of the present QP, and what it is multiplied with next */
+    int has_seen;   /* its scale is known */
+    int rolled_out; /* the candidate's cost is that of its roll-out */
+    int is_curved;   /* the last whole step leaves the sets, as curvature may have it */
+    int factorised; /* the QP's matrix, with its active rows, is in the panels */
+} mhe_outcome;
+
+/* Other reasons for the end of a sequence than its cap, and what no longer holds in another one. */
+#define ENDS (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED | MHE_MODEL_FAILED | MHE_TIME_UP)
+#define OUTDATED (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED | MHE_CAP_REACHED)
+
+/* Whether no time is left; it is an event then. */
+static int mhe_is_late(const mhe_workspace *k, mhe_outcome *o)
+{
+    if (!mhe_time_is_up(k)) return 0;
+    o->events |= MHE_TIME_UP;
+    return 1;
+}
+
+/* Cost of the best trajectory as a trial. */
+static real mhe_best_cost(const mhe_outcome *o)
+{
+    return o->outside && o->best == o->candidate ? INFINITY : o->best->cost;
+}
+
+/* The cost below which a trial is better than the best one. */
+static real mhe_target(const mhe_outcome *o)
+{
+    const real cost = mhe_best_cost(o);
+    return isfinite(cost) ? cost - MHE_ROUNDING * fabs(cost) : INFINITY;
+}

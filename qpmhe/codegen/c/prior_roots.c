@@ -1,0 +1,72 @@
+/* The prior's weight from a root of the observer's covariance. */
+
+/* out = U'^-1 for an upper triangular U. */
+static void mhe_invert_root(const real *U, real *out)
+{
+    for (int i = 0; i < NX; i++)
+        for (int c = 0; c < NX; c++) {
+            real sum = i == c;
+            for (int l = c; l < i; l++) sum -= U[l * NX + i] * out[l * NX + c];
+            out[i * NX + c] = c > i ? 0 : sum / U[i * NX + i];
+        }
+}
+
+/* out = a root of the covariance with the variances of some states increased. */
+static void mhe_widen_root(const mhe_covariances *o, const real *root, const real *plus,
+                           real factor, real *out)
+{
+    real added[NX * NX], other[NX * NX];
+    memcpy(added, o->added, sizeof added);
+    for (int j = 0; j < NX; j++) added[j * NX + j] += factor * plus[j];
+    mhe_root(NX, added, other);
+    mhe_join_roots(root, other, out);
+}
+
+/* The weight and a root of it, from a root of the covariance. */
+static void mhe_weight_from_root(const mhe_covariances *o, const real *covariance_root, real *out,
+                                 real *root)
+{
+    real inverse[NX * NX], least[NX * NX];
+    mhe_invert_root(covariance_root, inverse);
+    mhe_root(NX, o->least_weight, least);
+    mhe_join_roots(inverse, least, root);
+    mhe_square(root, out);
+}
+
+/* Whether the weight loses fewer digits by a root of the covariance than by its inverse. With r the least
+ * variance of a component given those before it, as a share of its variance, and d the largest factor
+ * by which the window's data reduce a variance, rounding of the weight has a share of eps / (r d) in a
+ * variance behind the window, and the least eigenvalue l of an inverse one of l d. */
+static int mhe_root_is_better(const mhe_covariances *o, const real *root, const real *later)
+{
+    real pivot = 1, shrunk = 0;
+    for (int j = 0; j < NX; j++) {
+        real own = 0;
+        for (int i = 0; i <= j; i++) own += root[i * NX + j] * root[i * NX + j];
+        const real share = root[j * NX + j] * root[j * NX + j] / own;
+        const real behind = later[j * NX + j];
+        if (!(share >= pivot)) pivot = share;
+        if (behind > 0) shrunk = mhe_max(own / behind, shrunk);
+    }
+    return pivot * o->least * shrunk * shrunk > EPSILON;
+}
+
+/* The prior's weight by the root of a vague covariance, where that is better; `count`: states that are
+ * known exactly, with these variances. */
+static int mhe_weigh_prior_by_root(mhe_estimator *e, mhe_prior *prior, const real *known, int count)
+{
+    const mhe_covariances *o = &e->settings->covariances;
+    const mhe_stage *first = mhe_stage_at(e, 0);
+    real wider[NX * NX];
+    prior->root = prior->distance_root = 0;
+    if (!first->is_vague) return 0;
+    mhe_widen_root(o, first->root, known, MHE_KNOWN, wider);
+    if (!mhe_root_is_better(o, wider, mhe_next_covariance(e, e->length - 1))) return 0;
+    prior->root = prior->distance_root = prior->own_root;
+    mhe_weight_from_root(o, wider, prior->own_weight, prior->own_root);
+    if (!count) return 1;
+    prior->distance_root = prior->own_distance_root;
+    mhe_widen_root(o, first->root, known, 1, wider);
+    mhe_weight_from_root(o, wider, prior->own_distance, prior->own_distance_root);
+    return 1;
+}

@@ -1,0 +1,100 @@
+"""Written C without calls of functions that do nothing, and without branches that are decided."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+# A static function that does nothing, or only returns a number.
+_IDLE = re.compile(
+    r"^static \w+ (\w+)\([^;{)]*\)\n\{\n(?: +(?:\(void\)\w+; ?)+(?:/\*[^\n]*\*/)?\n)*"
+    r"(?: +return (\d);\n)?\}\n", re.M
+)
+_BRANCH = re.compile(r"^( *)if \(", re.M)
+# Behind such numbers.
+_SIMPLER = (
+    (re.compile(r"^ +\*?\w+ \|= 0;\n", re.M), ""),
+    (re.compile(r" \|\| 0(?=\))|(?<=\()0 \|\| "), ""),
+    (re.compile(r"\bif \([^()\n]* && 0\)"), "if (0)"),
+)
+# A statement may begin behind such a line, other than that of a condition or a loop.
+_ENDS = (";", "{", "}", "*/", "\x01")
+
+
+def folded(text: str, value: Callable[[str], bool | None]) -> str:
+    """The text with such calls replaced; ``value`` says whether a condition holds, if decided."""
+    for name, number in _IDLE.findall(text):
+        text = _without_calls(text, name, number)
+    for pattern, left in _SIMPLER:
+        text = pattern.sub(left, text)
+    return _without_branches(text, value)
+
+
+def _without_calls(text: str, name: str, number: str) -> str:
+    """The text with the calls of an idle function replaced by its number, or left out."""
+    start = 0
+    while (found := re.compile(rf"(?<!static void )(?<!\w){name}\(").search(text, start)):
+        start, first = found.end(), text.rfind("\n", 0, found.start()) + 1
+        end = _closing(text, start)
+        if text.startswith("static ", first) or re.search(r"\+\+|--|[^=!<>]=[^=]", text[start:end]):
+            continue
+        if text[first : found.start()].isspace() and text.startswith(";\n", end):
+            if text[:first].rstrip().endswith(_ENDS):
+                text, start = text[:first] + text[end + 2 :], first
+        elif number:
+            text, start = text[: found.start()] + number + text[end:], found.start()
+    return text
+
+
+def _without_branches(text: str, value: Callable[[str], bool | None]) -> str:
+    """The text without conditions that are decided, unless there is an alternative."""
+    start = 0
+    while (found := _BRANCH.search(text, start)):
+        start, indent = found.end(), found[1]
+        close = _closing(text, start)
+        condition = text[start : close - 1]
+        holds = value(condition)
+        if holds is None and "||" not in condition:
+            known = {one: value(one) for one in condition.split(" && ")}
+            holds = False if False in known.values() else None
+            if holds is None and True in known.values():
+                left = " && ".join(one for one in known if not known[one])
+                text = text[:start] + left + text[close - 1 :]
+        if holds is None:
+            continue
+        if text.startswith(" {\n", close):
+            first = close + 3
+            last = text.index(f"\n{indent}}}", first) + 1
+            end = text.index("\n", last) + 1
+            if text[last:end] != f"{indent}}}\n":
+                continue
+        else:
+            first = close + 1
+            last = end = _statement_end(text, first)
+            if text.startswith(f"{indent}else", end):
+                continue
+            if text[close] == " ":  # on the same line
+                text, last = f"{text[:first]}\n{indent}    {text[first:]}", last + 1
+                first, last = first + 1, last + len(indent) + 4
+                end = last
+        kept = re.sub(r"^    ", "", text[first:last], flags=re.M) if holds else ""
+        text, start = text[: found.start()] + kept + text[end:], found.start()
+    return text
+
+
+def _closing(text: str, start: int) -> int:
+    """Behind the parenthesis that closes one before ``start``."""
+    depth = 1
+    while depth:
+        depth += {"(": 1, ")": -1}.get(text[start], 0)
+        start += 1
+    return start
+
+
+def _statement_end(text: str, start: int) -> int:
+    """Behind the line in which a statement without braces ends."""
+    while True:
+        end = text.index("\n", start) + 1
+        if text[:end].rstrip().endswith(";"):
+            return end
+        start = end
