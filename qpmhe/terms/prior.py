@@ -282,6 +282,16 @@ class Prior(FirstStateTerm):
         """See `Term.root_of_first`."""
         return self._root(self.offset(trial))
 
+    def rows_of_first(self, trial: Trial) -> tuple[Array, Array]:
+        """See `FirstStateTerm.rows_of_first`."""
+        offset = self.offset(trial)
+        root = self._root(offset)
+        if root is None:
+            root = cholesky(self._majorised(offset)).T
+        if trial.trajectory is self._zero:
+            return root, np.zeros(len(root))
+        return root, root.dot(offset)
+
     def force(self, trial: Trial) -> Array | None:
         """See `FirstStateTerm.force`; None for a candidate that starts at the mean."""
         if trial.trajectory is self._zero:
