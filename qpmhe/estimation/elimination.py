@@ -1,22 +1,26 @@
-"""The QP where some directions of x(i+1) - f have no disturbance, in as many unknowns as are free."""
+"""The QP where some directions of x(i+1) - f have no disturbance, in the unknowns that are free."""
 
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.qp import band_of
-from qpmhe_solvers.solver import ContainedSolver
 
 from .._linalg import cholesky
 from .constraints import Constraints
 
 Array = NDArray[np.float64]
 
-_SINGULAR = "the factorisation failed: the weights leave a direction undetermined, or not finite"
+# Shorter columns are zeros.
+_LEAST = 1e-150
+
+#: Why there is no minimiser.
+SINGULAR = "the factorisation failed: the weights leave a direction undetermined, or not finite"
 
 
 class Elimination:
@@ -51,53 +55,31 @@ class Elimination:
         self._range[:n, :r], self._range[n:, r:] = self._basis, np.eye(p)
         self._qp: QP | None = None
 
-    def solve(
-        self, around: Around, qp: QP, w_rows: slice, solver: ContainedSolver, limit: float | None
-    ) -> Solution:
-        """Solve a QP of the subproblem, whose rows on d have these places, within a time limit."""
+    def of(self, around: Around, qp: QP, w_rows: slice) -> Eliminated | None:
+        """A QP of the subproblem without these directions; None where no minimiser is finite.
+
+        Its rows on d have the places ``w_rows``.
+        """
         kept = np.ones(qp.rows, np.bool_)
         kept[w_rows] = ~self._fixed
         drift = qp.row_lower[:-1, w_rows][:, self._fixed] @ self._back.T
-        free = self._minimiser(around, drift)
-        if free is None:
-            return Solution(None, SolveStatus.FAILED, 0, message=_SINGULAR)
-        step = free.moved(free.start, drift)
+        factors = self._minimiser(around, drift)
+        if factors is None:
+            return None
+        step = factors.moved(factors.start, drift)
         if not np.isfinite(step).all():
-            return Solution(None, SolveStatus.FAILED, 0, message=_SINGULAR)
-        values = qp.rows_times(step)
-        lower, upper = qp.row_lower - values, qp.row_upper - values
-        missed = np.maximum(lower, -upper)[:, kept].max(initial=0.0)
-        if qp.bounded:
-            missed = max(missed, np.maximum(qp.lower - step, step - qp.upper).max())
-        none = np.zeros(qp.size), np.zeros(qp.stages * qp.rows)
-        if around.curvature is None and missed <= 0.0:
-            return Solution(step, SolveStatus.SOLVED, 0, None, *none)
-        bounds = np.flatnonzero(
-            (np.isfinite(qp.lower) | np.isfinite(qp.upper)).any(axis=0)
-            if qp.bounded else np.zeros(self._n, np.bool_)
-        )
-        along = free.directions()
-        reduced = self._reduced(qp, along, kept, bounds)
-        reduced.row_lower[...] = np.concatenate(
-            (lower[:, kept], (qp.lower - step)[:, bounds]), axis=1
-        ).ravel()
-        reduced.row_upper[...] = np.concatenate(
-            (upper[:, kept], (qp.upper - step)[:, bounds]), axis=1
-        ).ravel()
-        if around.curvature is not None:
-            _bend(reduced, along, step, *around.curvature)
-        solution = solver.solve(reduced, None, limit)
-        d = None if solution.d is None else step + along @ solution.d[0]
-        duals: tuple[Array | None, Array | None] = (None, None)
-        if solution.row_duals is not None:
-            found = solution.row_duals.reshape(qp.stages, -1)
-            bound_duals, row_duals = none[0].reshape(qp.stages, -1), none[1].reshape(qp.stages, -1)
-            count = int(kept.sum())
-            row_duals[:, kept], bound_duals[:, bounds] = found[:, :count], found[:, count:]
-            duals = none
-        return Solution(
-            d, solution.status, solution.iterations, None, *duals, message=solution.message
-        )
+            return None
+        return Eliminated(self, factors, step, qp, kept, around.curvature)
+
+    def empty(self, size: int, rows: int) -> QP:
+        """A QP in z with half of its square for an objective."""
+        found = self._qp
+        if found is None or found.sizes != (1, size, rows):
+            self._qp = found = QP(1, size, rows)
+            found.bounded = False
+        found.gradient[...] = 0.0
+        found.band[...], found.band[0, :, 0] = 0.0, 1.0
+        return found
 
     def _minimiser(self, around: Around, drift: Array) -> _Factors | None:
         """The factors and the minimiser without inequalities; None where there is none."""
@@ -123,25 +105,87 @@ class Elimination:
         except np.linalg.LinAlgError:
             return None
 
-    def _reduced(
-        self, qp: QP, along: Array, kept: NDArray[np.bool_], bounds: NDArray[np.intp]
-    ) -> QP:
-        """The QP in z, with the rows that are left and the bounds as rows."""
-        stages, size = qp.stages, along.shape[-1]
-        count = int(kept.sum()) + bounds.size
-        reduced = self._qp
-        if reduced is None or reduced.sizes != (1, size, stages * count):
-            self._qp = reduced = QP(1, size, stages * count)
-            reduced.bounded = False
-        reduced.gradient[...] = 0.0
-        reduced.band[...], reduced.band[0, :, 0] = 0.0, 1.0
+
+class Eliminated:
+    """One QP without its noise-free directions.
+
+    Attributes
+    ----------
+    step : (K + 1, n) array
+        The minimiser d* without inequalities.
+    """
+
+    def __init__(
+        self, elimination: Elimination, factors: _Factors, step: Array, qp: QP,
+        kept: NDArray[np.bool_], curvature: tuple[Array, Array] | None,
+    ) -> None:
+        self.step = step
+        self._elimination, self._factors, self._base, self._kept = elimination, factors, qp, kept
+        self._curvature = curvature
+        values = qp.rows_times(step)
+        self._lower, self._upper = (
+            (side - values)[:, kept] for side in (qp.row_lower, qp.row_upper)
+        )
+        if qp.bounded:
+            self._bounds = np.flatnonzero(
+                (np.isfinite(qp.lower) | np.isfinite(qp.upper)).any(axis=0)
+            )
+            # Bounds are rows behind the others.
+            self._lower, self._upper = (
+                np.hstack((rows, (side - step)[:, self._bounds]))
+                for rows, side in ((self._lower, qp.lower), (self._upper, qp.upper))
+            )
+
+    @property
+    def solution(self) -> Solution | None:
+        """The minimiser, where it is the solution."""
+        missed = max(self._lower.max(initial=0.0), -self._upper.min(initial=0.0))
+        if self._curvature is not None or not missed <= 0.0:
+            return None
+        base = self._base
+        none = np.zeros(base.size), np.zeros(base.stages * base.rows)
+        return Solution(self.step, SolveStatus.SOLVED, 0, None, *none)
+
+    @cached_property
+    def along(self) -> Array:
+        """The derivatives (K + 1, n, n + K r) of d by z."""
+        return self._factors.directions()
+
+    @cached_property
+    def qp(self) -> QP:
+        """The QP in z, until the next one."""
+        base, kept, along = self._base, self._kept, self.along
+        stages, count, size = base.stages, self._lower.shape[1], along.shape[-1]
         rows = np.empty((stages, count, size))
-        mine = rows[:, : count - bounds.size]
-        np.matmul(qp.row_own[:, kept], along, out=mine)
-        mine[:-1] += qp.row_next[:-1, kept] @ along[1:]
-        rows[:, count - bounds.size :] = along[:, bounds]
-        reduced.row_own[0] = rows.reshape(-1, size)
-        return reduced
+        general = int(kept.sum())
+        np.matmul(base.row_own[:, kept], along, out=rows[:, :general])
+        rows[:-1, :general] += base.row_next[:-1, kept] @ along[1:]
+        if base.bounded:
+            rows[:, general:] = along[:, self._bounds]
+        found = self._elimination.empty(size, stages * count)
+        found.row_own[0] = rows.reshape(-1, size)
+        found.row_lower[0], found.row_upper[0] = self._lower.ravel(), self._upper.ravel()
+        if self._curvature is not None:
+            _bend(found, along, self.step, *self._curvature)
+        return found
+
+    def restored(self, solution: Solution) -> Solution:
+        """A solution of the QP in z, or of one with more rows, as one of the QP."""
+        base, general, along = self._base, int(self._kept.sum()), self.along
+        d = None
+        if solution.d is not None:
+            d = self.step + along @ solution.d[0, : along.shape[-1]]
+        duals: tuple[Array | None, Array | None] = (None, None)
+        if solution.row_duals is not None:
+            found = solution.row_duals[: self._lower.size].reshape(self._lower.shape)
+            bound_duals, row_duals = np.zeros((base.stages, base.n)), np.zeros(base.row_lower.shape)
+            row_duals[:, self._kept] = found[:, :general]
+            if base.bounded:
+                bound_duals[:, self._bounds] = found[:, general:]
+            duals = bound_duals.ravel(), row_duals.ravel()
+        return Solution(
+            d, solution.status, solution.iterations, None, *duals, message=solution.message
+        )
 
 
 class Around:
@@ -187,25 +231,25 @@ class _Factors:
         along = np.empty((count, n, r + n + 1))
         along[:, :, :r], along[:, :, r:-1], along[:, :, -1] = basis, a, drift
         turned, later = np.empty((count, r, r + n + 1)), np.zeros((n, n + 1))
+        triangle = _Triangle(r + n + 1)
         for i in range(count - 1, -1, -1):
             block = rows[i]
-            np.matmul(later[:, :-1], along[i], out=block[own:])
+            later[:, :-1].dot(along[i], out=block[own:])
             block[own:, -1] += later[:, -1]
-            sizes = np.abs(block[:, :-1]).max(axis=0)
-            triangle = _triangle(block, 1.0 / np.where(sizes > 0.0, sizes, 1.0))
-            turned[i], later = triangle[:r], triangle[r : r + n, r:]
+            made = triangle(block, np.maximum.reduce(np.abs(block), axis=0)[:-1])
+            turned[i], later = made[:r], made[r : r + n, r:]
         back = np.linalg.inv(turned[:, :, :r])
         self._added = basis @ back
         self._moved = a - self._added @ turned[:, :, r:-1]
         self._constant = -(self._added @ turned[:, :, -1:])[:, :, 0]
         everything = np.concatenate((np.column_stack((first, first_side)), later))
-        units = np.ldexp(1.0, -np.frexp(np.abs(first).max(axis=0))[1])
-        order = _order(everything[:, :-1] * units)
-        triangle = _triangle(everything[:, np.append(order, n)], units[order])
+        units = np.ldexp(1.0, np.frexp(np.abs(first).max(axis=0))[1])
+        order = _order(everything[:, :-1] / units)
+        made = _Triangle(n + 1)(everything[:, np.append(order, n)], units[order])
         self._first = np.empty((n, n))
-        self._first[order] = np.linalg.inv(triangle[:n, :n])
+        self._first[order] = np.linalg.inv(made[:n, :n])
         #: d_0 of the minimiser.
-        self.start: Array = -(self._first @ triangle[:n, n])
+        self.start: Array = -(self._first @ made[:n, n])
 
     def moved(self, start: Array, drift: Array) -> Array:
         """The trajectory (K + 1, n) with the best disturbances behind a first state."""
@@ -228,14 +272,27 @@ class _Factors:
         return along
 
 
-def _triangle(rows: Array, units: Array) -> Array:
-    """R of a factorisation Q R of rows and their sides, which are the last column.
+class _Triangle:
+    """R of a factorisation Q R of rows and their sides, which are the last of some columns.
 
     The longest rows come first, in units of the columns: rounding in a row is then small beside
     this row, however long others are.
     """
-    order = np.argsort(-(np.abs(rows[:, :-1]) * units).max(axis=1), kind="stable")
-    return np.asarray(np.linalg.qr(rows[order], mode="r"))
+
+    def __init__(self, columns: int) -> None:
+        from scipy.linalg.lapack import dgeqrf  # late: most estimators do without
+
+        self._dgeqrf, self._work = dgeqrf, 32 * columns
+        self._upper = np.triu(np.ones((columns - 1, columns)))
+
+    def __call__(self, rows: Array, units: Array) -> Array:
+        """The triangle (columns - 1, columns), for units (columns - 1,)."""
+        sizes = np.abs(rows[:, :-1])
+        sizes /= np.maximum(units, _LEAST)
+        # Of equal ones those of the disturbances, whose columns come first.
+        order = np.negative(np.maximum.reduce(sizes, axis=1)).argsort(kind="stable")
+        factors = self._dgeqrf(rows.take(order, axis=0), self._work)[0]
+        return np.asarray(factors[: len(self._upper)] * self._upper)
 
 
 def _order(rows: Array) -> NDArray[np.intp]:

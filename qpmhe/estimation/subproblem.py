@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers import QP, Solution
+from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.qp import band_of
 from qpmhe_solvers.solver import ContainedSolver
 
@@ -22,7 +22,7 @@ from ..terms.rows import Rows
 from ..terms.soft import BEYOND, Penalties
 from ..terms.sum import rows_of_first, weight_of_first
 from .constraints import Constraints
-from .elimination import Around, Elimination
+from .elimination import SINGULAR, Around, Eliminated, Elimination
 from .problem import Problem
 
 Array = NDArray[np.float64]
@@ -76,6 +76,7 @@ class Subproblem:
         if w is not None and w.fixed.any():
             self._elimination = Elimination(constraints, n, p)
         self._around: Around  # what that reads of the present QP
+        self._eliminated: Eliminated | None = None  # the last QP without them
         self._functions = system.constraints
         #: Whether there are soft rows or nonlinear constraints.
         self.extended: bool = self._functions is not None or penalties is not None
@@ -181,7 +182,13 @@ class Subproblem:
         """Solve a QP by a backend, within a time limit in seconds."""
         if self._elimination is None or qp is not self._qp:
             return solver.solve(qp, None, limit)
-        return self._elimination.solve(self._around, qp, self._w, solver, limit)
+        eliminated = self._eliminated = self._elimination.of(self._around, qp, self._w)
+        if eliminated is None:
+            return Solution(None, SolveStatus.FAILED, 0, message=SINGULAR)
+        found = eliminated.solution
+        if found is None:
+            found = eliminated.restored(solver.solve(eliminated.qp, None, limit))
+        return found
 
     def correct_rows(self, qp: QP, problem: Problem, around: Trial, trial: Trial) -> None:
         """Shift the rows of the QP around a trajectory by its linearisation error at a trial.
@@ -228,13 +235,21 @@ class Subproblem:
         soft = self._softened
         if soft is None or solution.d is None or not soft.misses(solution.d).any():
             return None
-        return soft.lifted(qp)
+        if self._eliminated is None:
+            return soft.lifted(qp)
+        return soft.along(self._eliminated.step, self._eliminated.along).lifted(self._eliminated.qp)
 
     def lowered(self, qp: QP, solution: Solution) -> Solution:
         """A solution of the QP with slack variables, as one of the QP without."""
-        assert self._softened is not None
-        self._note(qp, solution, self._softened.forces(qp, solution))
-        return self._softened.lowered(qp, solution)
+        base, soft, eliminated = qp, self._softened, self._eliminated
+        if eliminated is not None and soft is not None:
+            base, soft = eliminated.qp, soft.stacked
+        assert soft is not None
+        forces, found = soft.forces(base, solution), soft.lowered(base, solution)
+        if eliminated is not None:
+            solution, found = eliminated.restored(solution), eliminated.restored(found)
+        self._note(qp, solution, forces)
+        return found
 
     def start(self) -> None:
         """Start a new sequence of QPs, with unknown multipliers."""

@@ -96,7 +96,8 @@ static void mhe_weight_from_root(const mhe_covariances *o, const real *covarianc
     mhe_square(root, out);
 }
 
-/* Whether the weight loses fewer digits by a root of the covariance than by its inverse. With r the least
+/* Whether the weight loses fewer digits by a root of the covariance than by its inverse: always, where
+ * elimination.c takes the root as it is. Where the QP takes its square: with r the least
  * variance of a component given those before it, as a share of its variance, and d the largest factor
  * by which the window's data reduce a variance, rounding of the weight has a share of eps / (r d) in a
  * variance behind the window, and the least eigenvalue l of an inverse one of l d. */
@@ -111,7 +112,7 @@ static int mhe_root_is_better(const mhe_covariances *o, const real *root, const 
         if (!(share >= pivot)) pivot = share;
         if (behind > 0) shrunk = mhe_max(own / behind, shrunk);
     }
-    return pivot * o->least * shrunk * shrunk > EPSILON;
+    return MHE_ROLLED ? pivot > 0 : pivot * o->least * shrunk * shrunk > EPSILON;
 }
 #endif
 
@@ -138,15 +139,20 @@ static void mhe_set_prior(mhe_estimator *e, mhe_workspace *k)
     if (count) prior->distance_weight = prior->own_distance;
 #if MHE_PRIOR_ROOTS
     prior->root = prior->distance_root = 0;
-    if (first->is_vague) {
-        real wider[NX * NX];
-        mhe_widen_root(o, first->root, known, MHE_KNOWN, wider);
+    if (MHE_ROLLED || first->is_vague) {
+        real wider[NX * NX], own_root[NX * NX];
+        const real *root = first->root;
+        if (!first->is_vague) {
+            mhe_root(NX, first->covariance, own_root);
+            root = own_root;
+        }
+        mhe_widen_root(o, root, known, MHE_KNOWN, wider);
         if (mhe_root_is_better(o, wider, mhe_next_covariance(e, e->length - 1))) {
             prior->root = prior->distance_root = prior->own_root;
             mhe_weight_from_root(o, wider, prior->own_weight, prior->own_root);
             if (!count) return;
             prior->distance_root = prior->own_distance_root;
-            mhe_widen_root(o, first->root, known, 1, wider);
+            mhe_widen_root(o, root, known, 1, wider);
             mhe_weight_from_root(o, wider, prior->own_distance, prior->own_distance_root);
             return;
         }
