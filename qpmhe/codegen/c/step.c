@@ -52,7 +52,7 @@ static void mhe_filtered(mhe_estimator *e, const mhe_outcome *o, real *out)
         mhe_filter(e->settings, newest, out, covariance);
         mhe_enter_turn(e->settings, out);
         if (isfinite(newest->cost))
-            mhe_put_inside(e, mhe_x_set_at(e->settings, newest), covariance, out);
+            mhe_put_inside(e, mhe_x_set_at(e->settings, newest), covariance, 0, out);
 #else
         mhe_filter(e->settings, newest, out, 0);
         mhe_enter_turn(e->settings, out);
@@ -147,7 +147,9 @@ void mhe_reset(mhe_estimator *e, const mhe_settings *settings, const real *x0)
     e->metric_settled = settings->metric_settled;
     real inside[NX];
     if (!mhe_is_inside(&settings->states, e->z_end)) {
-        mhe_project(&settings->states, settings->metric, e->z_end, inside);
+        mhe_metric metric;
+        mhe_set_metric(&metric, settings->metric, 0);
+        mhe_project(&settings->states, &metric, e->z_end, inside);
         memcpy(e->z_end, inside, sizeof inside);
     }
 #endif
@@ -267,7 +269,7 @@ void mhe_set(mhe_estimator *e, mhe_workspace *k, const mhe_settings *settings, i
 #if MHE_X_SET
     /* The window's first state, or the only one there is. */
     mhe_put_inside(e, e->length ? mhe_x_set_at(settings, mhe_stage_at(e, 0)) : &settings->states,
-                   mhe_next_covariance(e, -1), mhe_next_state(e, -1));
+                   mhe_next_covariance(e, -1), mhe_next_root(e, -1), mhe_next_state(e, -1));
     if (!e->length) memcpy(e->history_end, e->z_end, sizeof e->z_end);
 #endif
     if (e->length) mhe_estimate_again(e, k, mhe_replay(e, 0), out);

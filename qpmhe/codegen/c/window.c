@@ -22,6 +22,21 @@ static real *mhe_next_covariance(mhe_estimator *e, int i)
 #endif
 }
 
+#if MHE_X_SET
+/* The root of that covariance, where the observer has one. */
+static const real *mhe_next_root(const mhe_estimator *e, int i)
+{
+#if MHE_ROOTS
+    if (i + 1 >= e->length) return e->is_vague_end ? e->root_end : 0;
+    const mhe_stage *behind = e->stages + (e->first + i + 1) % MHE_HORIZON;
+    return behind->is_vague ? behind->root : 0;
+#else
+    (void)e; (void)i;
+    return 0;
+#endif
+}
+#endif
+
 /* How often in a row each sensor has failed behind stage i. */
 static int32_t *mhe_next_rejections(mhe_estimator *e, int i)
 {
@@ -187,7 +202,7 @@ static real mhe_advance(mhe_estimator *e, int i, int linear, real *next, const m
     if (!mhe_all_finite(NX, next)) return INFINITY;
 #if MHE_X_SET
     if (s->project) *events |= mhe_stay_inside(e, stage, onto, predicted, next,
-                                               mhe_next_covariance(e, i));
+                                               mhe_next_covariance(e, i), mhe_next_root(e, i));
 #else
     (void)onto;
 #endif
@@ -273,7 +288,8 @@ static int mhe_move_state(mhe_estimator *e, const mhe_sample *sample)
     mhe_x_set set = *after;
     TAKE_SIDES(set, s->states, NX, MHE_X_ROWS);
     if (!newest || !isfinite(newest->cost)) {
-        mhe_put_inside(e, &set, mhe_next_covariance(e, e->length - 1), e->z_end);
+        mhe_put_inside(e, &set, mhe_next_covariance(e, e->length - 1),
+                       mhe_next_root(e, e->length - 1), e->z_end);
         return 0;
     }
     const int events = mhe_enter(e, e->length - 1, &set);
