@@ -67,6 +67,7 @@ benchmarks: $(VENV)/.test
 	$(BIN)/python examples/benchmarks/constrained.py --out results/benchmarks
 	$(BIN)/python examples/benchmarks/batch.py --out results/benchmarks
 	$(BIN)/python examples/benchmarks/backends.py $(QUICK) --out results/benchmarks
+	$(BIN)/python examples/benchmarks/latency.py --out results/benchmarks
 
 # The page docs/comparison.md, of a run of the default study: ten minutes on two cores.
 comparison: $(VENV)/.test

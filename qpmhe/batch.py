@@ -19,8 +19,9 @@ from .errors import InvalidInputError, OptionError, ShapeError, UnknownOptionErr
 from .estimation.engine import PythonEngine
 from .estimation.engines import ModelChangedError
 from .estimation.estimate import Status
-from .estimation.estimator import MovingHorizonEstimator, check_start
+from .estimation.estimator import MovingHorizonEstimator
 from .estimation.settings import Settings
+from .estimation.start import check_start
 from .model.system import System, checked_system
 from .model.traces import warn_of
 from .observers import Observer

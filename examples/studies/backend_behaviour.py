@@ -385,7 +385,7 @@ that does not fit counts as inaccurate, whatever the solver claims.""",
 convex QPs without rows and bounds: right to 1 %, or wrong although the solver claims to have
 found the solution. The last two have no solution; x is what the solver leaves there. qpmhe's QPs
 are strictly convex. A solver that needs a row gets one that never binds; any x is a trial, which
-the true cost accepts or rejects.""",
+the true cost accepts or rejects, but osqp's 2143289344, which stands for none, counts as none.""",
     "Left behind": """Residuals of the first problem at default tolerances, as qpsolvers computes
 them (absolute; the problem's numbers are about 1), and side effects. qpmhe gives a solver copies
 of the arrays.""",

@@ -30,7 +30,8 @@ from ..model.expressions import CasadiModel, casadi_model, import_casadi
 from ..model.functions import Trusted
 from ..model.model import Origin
 from ..model.sets import ConvexSet
-from ..model.system import System, SystemOptions, checked_set, timed_options
+from ..model.system import System
+from ..model.system_arguments import SystemOptions, checked_set, timed_options
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ from .._checks import need, numbers, positive
 from ..errors import ModelError, OptionError
 from ..model.functions import Trusted
 from ..model.points import FEW, points
-from ..model.system import System, SystemOptions
+from ..model.system import System
+from ..model.system_arguments import SystemOptions
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]

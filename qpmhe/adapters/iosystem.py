@@ -31,8 +31,9 @@ def to_iosystem(
     r"""Make a discrete-time python-control block: :math:`y(t), u(t)` in, :math:`\hat x(t)` out.
 
     Its state and output are :math:`\hat x(t)`, which uses the measurements before t, so the block
-    has no direct feedthrough and causes no algebraic loop. Its initial state is the initial
-    estimate.
+    has no direct feedthrough and causes no algebraic loop; the block of
+    ``control.optimal.OptimalEstimationProblem.create_mhe_iosystem`` has the same index. Its initial
+    state is the initial estimate.
 
     Parameters
     ----------

@@ -15,7 +15,8 @@ from ..model.augmentation import Augmentation
 from ..model.functions import Trusted, takes_input
 from ..model.model import Origin
 from ..model.points import FEW, points
-from ..model.system import System, SystemOptions, checked_set, timed_options
+from ..model.system import System
+from ..model.system_arguments import SystemOptions, checked_set, timed_options
 from .jax_programs import Programs
 
 Array = NDArray[np.float64]

@@ -15,7 +15,8 @@ from .._checks import need, positive
 from ..errors import ModelError
 from ..model.augmentation import Augmentation
 from ..model.functions import Trusted
-from ..model.system import System, SystemOptions
+from ..model.system import System
+from ..model.system_arguments import SystemOptions
 
 Array = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ from ..costs import Cost, CostConstants
 from ..errors import InvalidInputError, ShapeError
 from ..model.system import System, checked_system
 from ..observers import Observer
+from ..terms.sum import further_terms
 from .branch_and_bound import lipschitz
 from .contraction import gain_if_constant
 from .deadline import Deadline
@@ -136,4 +137,10 @@ def checked_ingredients(system: Any, observer: Any, cost: Any) -> None:
         raise ShapeError(
             f"the cost is for {cost.n} states and {cost.p} outputs; expected {system.n} and "
             f"{system.p}, as the system has. Give its weights these sizes."
+        )
+    further = further_terms(system, cost)
+    if further:
+        raise CertificateError(
+            f"J has a term for {further}, which the theorem does not cover; certify the system and "
+            "the cost without it."
         )

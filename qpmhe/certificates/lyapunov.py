@@ -20,6 +20,8 @@ from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System, checked_system
+from ..terms.hold import Hold
+from ..terms.sum import further_terms
 from .contraction import _undetectable
 from .deadline import DEFAULT_SECONDS, Deadline
 from .evidence import Evidence, MismatchError, json_ready
@@ -218,6 +220,7 @@ class Design:
             np.array_equal(getattr(cost, name), getattr(self, name))
             for name in ("prior", "disturbance", "noise")
         )
+        further = further_terms(source.system, cost, (Hold,))
         for differs, text in (
             (source.system is not self.system, "has another system; make a design for that"),
             (not same or source.has_changed or settings.arrival != "observer",
@@ -225,6 +228,8 @@ class Design:
              "cost=design.cost() and leave arrival out"),
             (source.system.held, "holds parameters, a term of J that the bound does not have; make "
              "its system without hold"),
+            (further, f"has a term of J for {further}, which the bound does not have; make it "
+             "without"),
             (settings.candidate != "reinitialized",
              f"has candidate={settings.candidate!r}, whose prior is the running observer's; make "
              "it with candidate='reinitialized', or take the observer's bound"),

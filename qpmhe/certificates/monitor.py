@@ -14,6 +14,8 @@ from .._checks import Array
 from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
+from ..terms.hold import Hold
+from ..terms.sum import further_terms
 from .certificate import Certificate
 from .evidence import MismatchError
 from .measured_cost import MeasuredCost
@@ -346,6 +348,7 @@ class Monitor:
 def _barred(estimator: MovingHorizonEstimator) -> str:
     """Why the theorem does not cover an estimator's options; empty if it does."""
     settings = estimator.settings
+    further = further_terms(estimator.system, estimator.cost, (Hold,))
     return next((text for bars, text in (
         (settings.candidate != "observer",
          "the estimator's candidate comes from a reinitialized observer; make it with "
@@ -357,6 +360,7 @@ def _barred(estimator: MovingHorizonEstimator) -> str:
         (estimator.has_changed or settings.parameters,
          "the estimator has parameters, or its weights or bounds were changed by set(...); make "
          "it with constant ones"),
+        (further, f"J of the estimator has a term for {further}; make it without"),
     ) if bars), "")
 
 

@@ -22,8 +22,8 @@ from ..estimation.problem import Solved
 from ..estimation.run import Run
 from ..estimation.settings import Settings
 from ..memory.snapshot import reading
+from ..model.captured import Due
 from ..model.system import System
-from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
 from .exchange import empty_record, hand_over, own_fields, record_of, write
@@ -39,7 +39,7 @@ _ROWS_DROPPED = Status.ROWS_DROPPED.value
 _PIECE = 256
 
 
-class Tools(NamedTuple):
+class CompiledTools(NamedTuple):
     """What a step uses; made again when the usual conditions change."""
 
     usual: Conditions
@@ -61,7 +61,9 @@ class CompiledEngine:
         self._system, self._given_cost, self._settings = system, cost, settings
         self._reader = ConditionReader(system, cost)
         self._directions = directions = library.directions
-        self._tools = Tools(usual_conditions(settings), system, directions.cost, library.settings)
+        self._tools = CompiledTools(
+            usual_conditions(settings), system, directions.cost, library.settings
+        )
         space = directions.cost.space
         self._to_disturbances = None if space is None else space.to_disturbances
         n, p, m, horizon = system.n, system.p, system.m, settings.horizon
@@ -96,9 +98,8 @@ class CompiledEngine:
         self._time = self._memory["time"]
         # Holds the present window where that is asked for.
         self._mirror: PythonEngine | None = None
-        # The time of the next comparison of the trace with the functions that it stands for.
-        self._traces = WatchedFunctions(system, observer, cost)
-        self._next_check: float = 0 if self._traces else math.inf
+        self._traces = WatchedFunctions(system, observer, cost, settings.time_budget is None)
+        self._times = self._traces.times
 
     def reset(self, initial_state: Array, system: System | None = None) -> None:
         """Forget all measurements and start at this state."""
@@ -107,23 +108,21 @@ class CompiledEngine:
         if system is not None:
             self._system, self._mirror = self._system.evaluated_like(system), None
 
-    def _replace(self, memory: NDArray[Any], tools: Tools) -> None:
+    def _replace(self, memory: NDArray[Any], tools: CompiledTools) -> None:
         """Remember this in place of all that was; whole or, if interrupted, not at all."""
         before = self._memory.copy(), self._tools
         self._held = tools, self._tools  # the memory points to a record of these
-        next_check = self._next_check
         try:
-            self._next_check = 0 if self._traces else math.inf
+            self._times.restart(int(memory["time"].item()))
             self._memory[...], self._tools = memory, tools  # last: nothing behind it can fail
         except BaseException:
-            self._next_check = next_check
             self._memory[...], self._tools = before
             raise
 
-    def _tools_for(self, usual: Conditions) -> Tools:
+    def _tools_for(self, usual: Conditions) -> CompiledTools:
         """What a step uses under these usual conditions."""
         system, cost = usual.applied(self._system, self._directions.cost)
-        return Tools(usual, system, cost, self._library.settings_for(system, cost, usual))
+        return CompiledTools(usual, system, cost, self._library.settings_for(system, cost, usual))
 
     @property
     def usual(self) -> Conditions:
@@ -194,7 +193,7 @@ class CompiledEngine:
     ) -> Estimate:
         """Take in a sample, and estimate."""
         time = self._time.item()
-        if time >= self._next_check:
+        if time >= self._times.next:
             self._check_trace(u)
         try:
             self._y[...] = y
@@ -216,14 +215,24 @@ class CompiledEngine:
             raise
 
     def _check_trace(self, u: Array, before: NDArray[Any] | None = None) -> None:
-        """Compare trace and functions at z(t); where they differ, the Python step takes over.
+        """Compare traces and functions if it is time to."""
+        due = self._times.due(self.time)
+        if due is not Due.NOWHERE:
+            self._compare(due, u, before)
+
+    def verify(self, u: Array) -> bool:
+        """Compare traces and functions now; raises where they differ, as a step does."""
+        self._compare(Due.EVERYWHERE, u)
+        return True
+
+    def _compare(self, due: Due, u: Array, before: NDArray[Any] | None = None) -> None:
+        """Compare traces and functions at z(t); where they differ, the Python step takes over.
 
         From an earlier memory, if there is one.
         """
-        record = self._memory[0]
-        fault = self._traces.fault(record["z_end"], u)
+        fault = self._traces.fault(due, [(self._memory[0]["z_end"], u)])
         if not fault:
-            self._next_check = next_check(int(record["time"]), self._sizes[2])
+            self._times.compared(self.time)
             return
         if before is not None:
             self._memory[...] = before
@@ -277,7 +286,7 @@ class CompiledEngine:
         ys = np.ascontiguousarray(ys)
         us = None if us is None else np.ascontiguousarray(us)
         memory, workspace = self._memory.ctypes.data, self._workspace.ctypes.data
-        before = None if self._next_check == math.inf else self._memory.copy()
+        before = None if self._times.next == math.inf else self._memory.copy()
         nothing = np.zeros(0)
         for first in range(0, samples, _PIECE):
             count = min(_PIECE, samples - first)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ..estimation.conditions import Conditions
 from ..estimation.engine import PythonEngine
-from ..memory.fields import Field, Sizes
-from ..memory.record import Record
+from ..memory.fields import Field, MemorySizes
+from ..memory.record import MemoryRecord
 from ..memory.snapshot import checked_array
 from ..model.sets import ConvexSet
 from .directions import Directions
@@ -30,14 +30,14 @@ def _in_order(memory: Any) -> NDArray[np.intp]:
     return places
 
 
-def empty_record(layout: Layout, directions: Directions) -> Record:
+def empty_record(layout: Layout, directions: Directions) -> MemoryRecord:
     """A record of what both engines have, for one estimator of a library."""
     n = layout.nx
     covariance = np.zeros((n, n)) if layout.covariance else None
-    return Record(layout.sizes, np.zeros(n), covariance, directions.system.dt or 0.0)
+    return MemoryRecord(layout.sizes, np.zeros(n), covariance, directions.system.dt or 0.0)
 
 
-def record_of(memory: Any, layout: Layout, directions: Directions) -> Record:
+def record_of(memory: Any, layout: Layout, directions: Directions) -> MemoryRecord:
     """What both engines have, from an ``mhe_estimator``."""
     record, places = empty_record(layout, directions), _in_order(memory)
     length, time = len(places), int(memory["time"])
@@ -66,7 +66,7 @@ def record_of(memory: Any, layout: Layout, directions: Directions) -> Record:
     return record
 
 
-def own_fields(memory: Any, sizes: Sizes) -> dict[str, Any]:
+def own_fields(memory: Any, sizes: MemorySizes) -> dict[str, Any]:
     """Copies of what only the step in C has, from an ``mhe_estimator``."""
     stages = memory["stages"][_in_order(memory)]
     return {
@@ -75,7 +75,7 @@ def own_fields(memory: Any, sizes: Sizes) -> dict[str, Any]:
     }
 
 
-def write(memory: Any, sizes: Sizes, record: Record, own: dict[str, Any]) -> None:
+def write(memory: Any, sizes: MemorySizes, record: MemoryRecord, own: dict[str, Any]) -> None:
     """Write a record, and what `own_fields` returned, into a new ``mhe_estimator``.
 
     Raises any exception if the latter is damaged; the estimator is unusable then.
@@ -105,7 +105,7 @@ def write(memory: Any, sizes: Sizes, record: Record, own: dict[str, Any]) -> Non
         part[name] = given if kind.names is None else given.view(kind).reshape(length)
 
 
-def _own(sizes: Sizes) -> list[Field]:
+def _own(sizes: MemorySizes) -> list[Field]:
     return [
         one for one in sizes.fields("c", "once", "stage")
         if one.engine == "c" and one.name not in _OF_RING
@@ -117,7 +117,10 @@ def _plain(value: Any) -> NDArray[Any]:
     array = np.asarray(value)
     if array.dtype.names is None:
         return array
-    return np.ascontiguousarray(array).view(np.uint8).reshape(len(array), array.dtype.itemsize)
+    clean = np.zeros(array.shape, array.dtype)  # and so is what lies between the fields
+    for name in array.dtype.names:
+        clean[name] = array[name]
+    return clean.view(np.uint8).reshape(len(array), array.dtype.itemsize)
 
 
 def hand_over(

@@ -18,7 +18,7 @@ from ..estimation.constraints import Constraints
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
 from ..estimation.settings import Infeasible, Settings
-from ..memory.fields import Sizes
+from ..memory.fields import MemorySizes
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -314,10 +314,10 @@ class Layout:
         ])
 
     @property
-    def sizes(self) -> Sizes:
+    def sizes(self) -> MemorySizes:
         """What the memory's table of fields needs."""
         sets = {f"{one}_set": there for one, (there, _) in zip("wvx", self.sets, strict=True)}
-        return Sizes.of(
+        return MemorySizes.of(
             self.nx, self.ny, self.nu, self.horizon, sensors=self.sensors, held=self.held,
             rows=self.rows, covariance=self.covariance, **sets,
             roots=_OBSERVERS[self.observer] in ("extended", "unscented"),

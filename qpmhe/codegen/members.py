@@ -18,8 +18,8 @@ from ..estimation.conditions import usual_conditions
 from ..estimation.engine import PythonEngine
 from ..estimation.engines import ModelChangedError
 from ..estimation.settings import Settings
+from ..model.captured import Due
 from ..model.system import System
-from ..model.traces import next_check
 from ..observers import Observer
 from .estimate import WATCHED, CompiledWatch
 from .exchange import hand_over
@@ -42,7 +42,8 @@ class CompiledMembers:
         threads: int | None,
     ) -> None:
         self._library = library = checked_library(system, observer, cost, settings)
-        self._traces, self._settings = WatchedFunctions(system, observer, cost), settings
+        self._traces = WatchedFunctions(system, observer, cost, settings.time_budget is None)
+        self._settings = settings
         self._m, self._horizon = system.m, settings.horizon
         self._watch = CompiledWatch(settings.horizon)
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -56,8 +57,7 @@ class CompiledMembers:
     def reset(self, states: Array) -> None:
         """Forget all samples and start at these states."""
         self._memory = self._library.estimators(states)
-        # The time of the next comparison of the trace with the functions that it stands for.
-        self._next_check: float = 0 if self._traces else math.inf
+        self._traces.times.restart()
 
     @property
     def time(self) -> int:
@@ -82,13 +82,16 @@ class CompiledMembers:
             hand_over(record, library.layout, library.directions, usual, engine, True)
 
     def _check_trace(self, u: Array) -> None:
-        """Compare trace and functions at z(t) of some members; raise where they differ."""
-        self._next_check = next_check(self.time, self._horizon)
-        count = len(self._memory)
-        for k in np.linspace(0, count - 1, min(count, _COMPARED)).astype(int):
-            fault = self._traces.fault(self._memory["z_end"][k], u[k])
-            if fault:
-                raise ModelChangedError(fault)
+        """Compare traces and functions at z(t) of some members; raise where they differ."""
+        times, count = self._traces.times, len(self._memory)
+        due = times.due(self.time)
+        if due is Due.NOWHERE:
+            return
+        members = np.linspace(0, count - 1, min(count, _COMPARED)).astype(int)
+        fault = self._traces.fault(due, ((self._memory["z_end"][k], u[k]) for k in members))
+        if fault:
+            raise ModelChangedError(fault)
+        times.compared(self.time)
 
     @property
     def states(self) -> Array:
@@ -105,7 +108,7 @@ class CompiledMembers:
     def step(self, y: Array, u: Array) -> dict[str, Any]:
         """Take in a sample of each member, and estimate."""
         ys, us = np.ascontiguousarray(y), np.ascontiguousarray(u)
-        if self._memory["time"][0] >= self._next_check:
+        if self._memory["time"][0] >= self._traces.times.next:
             self._check_trace(us)
         found = np.empty(len(ys), self._library.estimate_type)
 
@@ -137,7 +140,7 @@ class CompiledMembers:
         ys, us, start = np.ascontiguousarray(y), np.ascontiguousarray(u), self.states
         observers = self.observer_states
         samples, dropped = ys.shape[1], self._memory["watched"][:, 1].copy()
-        before = None if self._next_check == math.inf or not samples else self._memory.copy()
+        before = None if self._traces.times.next == math.inf or not samples else self._memory.copy()
         log = self._library.log(ys.shape[:2])
 
         def work(part: slice, workspace: NDArray[np.uint8]) -> None:

@@ -24,11 +24,11 @@ from ..errors import ModelError, QpmheError
 from ..estimation.conditions import ConditionReader, Conditions, usual_conditions
 from ..estimation.engine import PythonEngine, Tools
 from ..estimation.estimate import Estimate, Status
-from ..estimation.estimator import check_start
 from ..estimation.limits import FEASIBLE, LARGEST
 from ..estimation.optimizer import Optimizer, Outcome
 from ..estimation.problem import Problem
 from ..estimation.settings import Settings
+from ..estimation.start import check_start
 from ..model.evaluation import NAMES, RESIDUALS, Buffers, Evaluator, results_of
 from ..model.functions import Trusted
 from ..model.model import Functions, Origin

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..errors import CompilationError
+from ..model.captured import ComparisonTimes, Due
 from ..model.system import System
 from ..model.tracing import Traced
 from ..observers import Observer
@@ -19,10 +22,25 @@ Array = NDArray[np.float64]
 class WatchedFunctions:
     """f and h, and with them residual functions, losses and a correction, where they are traced.
 
-    True if there are any.
+    Parameters
+    ----------
+    system, observer, cost
+        Whose functions they are.
+    calls : bool
+        Whether they may be called after each 1000 samples.
+
+    Raises
+    ------
+    CompilationError
+        If one differs from its trace already.
+
+    Attributes
+    ----------
+    times : ComparisonTimes
+        When to call `fault`.
     """
 
-    def __init__(self, system: System, observer: Observer, cost: Cost) -> None:
+    def __init__(self, system: System, observer: Observer, cost: Cost, calls: bool) -> None:
         self.system, self._count = system, 0
         self._others: dict[str, Traced] = {}
         for name in ("output_residual", "state_residual"):
@@ -36,19 +54,23 @@ class WatchedFunctions:
         own: Any = observer.c_form
         if own is not None and own.correction is not None:
             self._others["the correction"] = own.correction(system.n, system.p)
+        others = [one.user_function for one in self._others.values()]
+        functions = [*system.evaluation.traced_functions, *(one for one in others if one)]
+        if fault := self.fault(Due.EVERYWHERE, ()):
+            raise CompilationError(fault)
+        self.times = ComparisonTimes(functions, calls)
 
-    def __bool__(self) -> bool:
-        return self.system.evaluation.is_traced or bool(self._others)
-
-    def fault(self, z: Array, u: Array) -> str:
+    def fault(self, due: Due, where: Iterable[tuple[Array, Array]]) -> str:
         """Which function differs from its trace, and how; blank if none does.
 
-        f and h are compared at the observer's state, the others at one of the points of the first
-        comparison, a different one each time.
+        f and h are compared at these states and inputs, the others at points of the first
+        comparison: at one, a different one each time, or at all if ``due`` is everywhere.
         """
-        fault = self.system.evaluation.fault(z, u)
+        everywhere = due is Due.EVERYWHERE
+        points = [*where, *(self.system.usual_points() if everywhere else ())]
+        fault = self.system.evaluation.fault(points)
         for name, one in self._others.items():
-            text = one.fault(self._count)
+            text = one.fault(None if everywhere else self._count)
             if text and not fault:
                 fault = f"{name} has changed since it was traced: {text}"
         self._count += 1

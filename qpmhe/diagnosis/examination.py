@@ -16,7 +16,8 @@ from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
 from ..terms.information import prior_units
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
-from .faults import LEAST_GAIN, SCALED, Fault, search
+from .fault_kinds import LEAST_GAIN, SCALED, Fault
+from .faults import search
 from .findings import Finding, Names, listed, number, percent
 from .sensor_memory import MemoryBank
 from .stuck import stuck

@@ -1,16 +1,16 @@
-"""The faults that a record can have: each is a filter, judged by its likelihood."""
+"""The search for the faults of a record: each is a filter, judged by its likelihood."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations, pairwise, product
-from typing import NamedTuple
+from dataclasses import replace
+from itertools import combinations, product
 
 import numpy as np
 
 from .bank import Array, FilterBank, Filtered, Hypothesis
-from .findings import Finding, Names, listed, number
+from .fault_kinds import LEAST_GAIN, MOST_PARTS, SCALED, UNIT_OFFSET, Fault, with_factor
+from .signatures import Signature, additive_faults, moments, removed, with_ends
 
 _FACTORS = (1 / 4096, 1 / 256, 1 / 16, 1 / 4, 4.0, 16.0, 64.0, 256.0, 4096.0)
 _STEPS = (0.5, 0.65, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.5, 2.0)
@@ -21,17 +21,11 @@ _GAINS, _CLOSELY = np.linspace(-7.0, 7.0, 29), 0.001
 # They are tried where the mean square of a sensor's normalised innovations is not within these, on
 # so many samples; the best ones are searched closely.
 _SUSPICIOUS, _FEW, _BEST = (0.5, 2.0), 100, 3
-# A factor, and an offset in deviations of the noise, that another unit explains.
-_UNIT, _UNIT_OFFSET = 3.0, 30.0
 # Offsets are first what so many samples say, and then found again so many times.
 _SOON, _AGAIN = 5, 4
-# Shares of the size that innovations show of a gain.
-_AROUND = (0.5, 1.0, 1.5, 2.5)
-# More components than this have no factors or pairs of their own.
-_MOST = 8
-# What a fault must gain in log likelihood: in all, up to twice that where measurements are missing;
-# unless it is local, also for each measurement, and when no sample counts for more than the last.
-LEAST_GAIN, _GAIN_EACH, _MOST_EACH = 12.0, 0.035, 3.0
+# Beside LEAST_GAIN, a fault that is not local must gain this for each measurement, and LEAST_GAIN
+# also when no sample counts for more than the second.
+_GAIN_EACH, _MOST_EACH = 0.035, 3.0
 # A further fault must gain this share of what the first did: what that has left may be its shadow.
 _BESIDE = 0.05
 _MOST_FAULTS = 3
@@ -39,146 +33,6 @@ _MOST_FAULTS = 3
 # many runs at most. Where this factor more costs less than that in log likelihood, a factor has no
 # upper end.
 _FINE, _RUNS, _BEYOND, _COSTS = 0.04, 12, 16.0, 2.0
-
-
-class _Kind(NamedTuple):
-    """The least effect worth a word, what it is in words, the remedy, and whether it is local."""
-
-    least: float
-    text: str
-    remedy: str
-    local: bool = False
-
-
-#: Kinds that multiply R or Q.
-SCALED = ("noise", "disturbance")
-# Effects: logarithms of factors, shares of a step or an input, deviations of a bias, samples.
-_KINDS = {
-    "noise": _Kind(
-        np.log(2.0),
-        "R{of} is too {small} by {about} {factor}: the measurements scatter {more} than it says.",
-        "{Multiply} the covariance of the noise{of} by {factor}{or_more}, or let qpmhe.tune choose "
-        "the weights.",
-    ),
-    "disturbance": _Kind(
-        np.log(2.0),
-        "Q{of} is too {small} by {about} {factor}: the states move {more} than the model and Q "
-        "say.",
-        "{Multiply} the covariance of the disturbance{of} by {factor}{or_more}, or let qpmhe.tune "
-        "choose the weights; look for what the model lacks.",
-    ),
-    "gain": _Kind(
-        np.log(1.05),
-        "{sensors} read{s} about {value} times what the model expects.",
-        "Check the units of the record and of the model's outputs, or correct the gain.",
-        local=True,
-    ),
-    "bias": _Kind(
-        0.5, "{sensors} {is} off by {sigmas} sigma ({value}){stretch}.",
-        "{Calibrate} it, or estimate its bias as a further state.", local=True,
-    ),
-    "swapped": _Kind(0.0, "{sensors} are swapped.", "Exchange their columns."),
-    "step": _Kind(
-        0.02, "The true steps are about {value} times as long as the model's.",
-        "Correct dt, or the unit of the record's times.",
-    ),
-    "sign": _Kind(
-        0.1, "Input {input} has the wrong sign.", "Change its sign in the record, or in the model."
-    ),
-    "input": _Kind(
-        0.1, "Input {input} acts about {value} times as strongly as the model says.",
-        "Correct its unit or its gain, or estimate the gain as a parameter.",
-    ),
-    "shift": _Kind(
-        0.3, "The measurements of {sensors} come {samples} too {late}.",
-        "Shift them against the inputs, or add the delay to the model.",
-    ),
-    "clock": _Kind(
-        0.5,
-        "The sensors' clock drifts: at the end of the run their samples are {samples} {ahead} the "
-        "inputs'.",
-        "Synchronise the clocks, or resample the measurements at the inputs' times.",
-    ),
-    "outliers": _Kind(
-        0.0, "There are outliers: {shares} beyond 4 sigma.",
-        "Use a qpmhe.RobustCost, with qpmhe.Huber for the noise.", local=True,
-    ),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Fault:
-    """A fault that explains the record better than none.
-
-    The value is a factor, the least one if there is no `upper` end; for a shift or a clock,
-    samples; for a bias, in the sensor's unit.
-    """
-
-    kind: str
-    value: float
-    hypothesis: Hypothesis  # the record and its covariances without the fault
-    subject: tuple[int, ...] = ()  # sensors, inputs or disturbances; all if empty
-    span: tuple[int, int] | None = None  # first and last sample, if not the whole record
-    gain: float = 0.0  # how much more likely the record is with it, as a logarithm
-    upper: bool = True
-
-    def in_words(self, names: Names, deviations: Array, outliers: Array) -> Finding:
-        """The finding, with the noise's deviations and the shares of outliers of each sensor."""
-        kind, value, subject = _KINDS[self.kind], self.value, self.subject
-        of, sensors = "", "the sensors"
-        if self.kind == "disturbance" and subject:
-            of = f" of {listed([names.states[i] for i in subject])}"
-        elif subject and self.kind not in ("disturbance", "sign", "input"):
-            several = "s" * (len(subject) > 1)
-            sensors = f"sensor{several} {listed([names.outputs[j] for j in subject])}"
-            of = f" of {sensors}"
-        first, last = self.span or (0, len(names.times) - 1)
-        stretch = names.between(first, last)
-        worst = [j for j in np.argsort(-outliers)[:3] if outliers[j] > 0.0]
-        grows = value > 1.0
-        words = {
-            "of": of, "sensors": sensors, "s": "s" * bool(subject),
-            "value": number(value) if self.is_wrong_unit or self.kind != "gain" else f"{value:.3g}",
-            "factor": number(float(f"{max(value, 1.0 / value):.2g}")) if value > 0.0 else "",
-            "about": "about" if self.upper else "a factor of more than",
-            "or_more": "" if self.upper else " or more",
-            "small": "small" if grows else "large", "more": "more" if grows else "less",
-            "Multiply": "Multiply" if grows else "Divide",
-            "input": names.inputs[subject[0]] if self.kind in ("sign", "input") else "",
-            "sigmas": number(abs(value) / deviations[subject[0]]) if self.kind == "bias" else "",
-            "is": "is" if len(subject) == 1 else "are",
-            "Calibrate": "Check the unit and its zero (degrees C or K?), calibrate"
-                         if self.is_wrong_unit else "Calibrate",
-            "stretch": f" for {names.duration(first, last)},{stretch}" if stretch else "",
-            "samples": names.samples(abs(value)), "late": "late" if value > 0.0 else "early",
-            "ahead": "ahead of" if value > 0.0 else "behind",
-            "shares": listed([f"{outliers[j]:.1%} of {names.outputs[j]}" for j in worst]),
-        }
-        text = kind.text.format(**words)
-        where = None if self.span is None else names.span(first, last)
-        return Finding(
-            self.kind, text[:1].upper() + text[1:], kind.remedy.format(**words), "fault", where
-        )
-
-    @property
-    def is_wrong_unit(self) -> bool:
-        """Whether it is so large that a unit explains it: then much else may follow from it."""
-        if self.kind == "bias":
-            variance = float(self.hypothesis.noise[self.subject[0], self.subject[0]])
-            return self.span is None and abs(self.value) > _UNIT_OFFSET * np.sqrt(variance)
-        return self.kind in ("gain", "input") and not 1.0 / _UNIT < self.value < _UNIT
-
-    @property
-    def matters(self) -> bool:
-        """Whether its effect is large enough to report."""
-        size, noise = self.value, self.hypothesis.noise
-        if self.kind in (*SCALED, "gain"):
-            size = np.log(size)
-        elif self.kind in ("step", "input"):
-            size -= 1.0
-        elif self.kind == "bias":
-            size /= np.sqrt(noise[self.subject[0], self.subject[0]])
-        return bool(abs(size) >= _KINDS[self.kind].least)
 
 
 def search(
@@ -224,7 +78,7 @@ def _together(
         hypothesis = base
         for k, move in zip(some, moves, strict=True):
             one = found[k]
-            hypothesis = _with_factor(
+            hypothesis = with_factor(
                 hypothesis, one.kind, one.subject, float(np.exp(move))
             ).hypothesis
         return hypothesis
@@ -288,7 +142,7 @@ def _best(
 ) -> Fault | None:
     tried = [
         *_scaled(base), *_exchanged(base), *_shifted(base), *_drifted(bank, base, null),
-        *_linear(bank, base, null), *_gains(bank, base, null, starts),
+        *additive_faults(bank, base, null), *_gains(bank, base, null, starts),
         *_offsets(bank, base, null, starts),
     ]
     logs = bank.run([base, *(one.hypothesis for one in tried)]).logs
@@ -308,55 +162,24 @@ def _best(
     # By their values: where the record is impossible without any, differences have no digits left.
     for k in np.argsort(-values[1:], kind="stable").tolist():
         one, gain = tried[k], float(gains[k])
-        if (gain > least if _KINDS[one.kind].local else enough[k]) and one.matters:
+        if (gain > least if one.is_local else enough[k]) and one.matters:
             best = replace(one, gain=gain)
             break
     has_no_ends = best is None or best.kind != "bias" or best.span is None
-    return best if best is None or has_no_ends else _with_ends(bank, base, null, best)
-
-
-def _times(covariance: Array, part: tuple[int, ...], factor: float) -> Array:
-    """A covariance with the variances of some components, or of all, multiplied."""
-    roots = np.ones(len(covariance))
-    roots[list(part) if part else slice(None)] = np.sqrt(factor)
-    scaled: Array = roots[:, None] * covariance * roots
-    return scaled
-
-
-def _with_factor(base: Hypothesis, kind: str, part: tuple[int, ...], factor: float) -> Fault:
-    where = list(part) if part else slice(None)
-    match kind:
-        case "step":
-            changed = replace(base, step=base.step * factor)
-        case "noise":
-            changed = replace(base, noise=_times(base.noise, part, factor))
-        case "disturbance":
-            changed = replace(base, disturbance=_times(base.disturbance, part, factor))
-        case "gain":
-            y, gains = base.measurements.copy(), np.ones(base.measurements.shape[1])
-            y[:, where] /= factor
-            gains[where] = factor
-            changed = replace(
-                base, measurements=y, gains=gains * (1.0 if base.gains is None else base.gains)
-            )
-        case _:  # sign, input
-            inputs = base.inputs.copy()
-            inputs[:, where] *= factor
-            changed = replace(base, inputs=inputs)
-    return Fault(kind, factor, changed, part)
+    return best if best is None or has_no_ends else with_ends(bank, base, null, best)
 
 
 def _scaled(base: Hypothesis) -> Iterator[Fault]:
     for kind, covariance in (("noise", base.noise), ("disturbance", base.disturbance)):
         there = np.flatnonzero(covariance.diagonal())
         parts: list[tuple[int, ...]] = [()]
-        if 1 < there.size <= _MOST:
+        if 1 < there.size <= MOST_PARTS:
             parts += [(int(i),) for i in there]
         for part in parts:
             for factor in _FACTORS:
-                yield _with_factor(base, kind, part, factor)
+                yield with_factor(base, kind, part, factor)
     for factor in _STEPS:
-        yield _with_factor(base, "step", (), factor)
+        yield with_factor(base, "step", (), factor)
 
 
 def _refined(base: Hypothesis, tried: list[Fault], values: Array) -> Iterator[Fault]:
@@ -374,7 +197,7 @@ def _refined(base: Hypothesis, tried: list[Fault], values: Array) -> Iterator[Fa
             continue
         curve = np.polyfit(places[k - 1 : k + 2], heights[k - 1 : k + 2], 2)
         if curve[0] < 0.0:
-            yield _with_factor(base, kind, part, float(np.exp(-0.5 * curve[1] / curve[0])))
+            yield with_factor(base, kind, part, float(np.exp(-0.5 * curve[1] / curve[0])))
 
 
 def _is_suspicious(null: Filtered) -> bool:
@@ -405,7 +228,7 @@ def _offsets(
         return
     total, p = base.measurements.shape
     parts: list[tuple[int, ...]] = [(j,) for j in range(p)]
-    if 1 < p <= _MOST:
+    if 1 < p <= MOST_PARTS:
         parts += combinations(range(p), 2)
     if p > 2:
         parts.append(tuple(range(p)))
@@ -416,17 +239,17 @@ def _offsets(
         for part in parts:
             outputs = np.zeros((total, p))
             outputs[:, part] = 1.0
-            whole = _Signature("bias", part, outputs, np.zeros((total, bank.system.n)))
+            whole = Signature("bias", part, outputs, np.zeros((total, bank.system.n)))
             one = replace(whole, outputs=outputs[:_FEW], states=whole.states[:_FEW])
             size = float(np.nanmedian(first[:, part]))
-            if not abs(size) > _UNIT_OFFSET * np.sqrt(base.noise[part[0], part[0]]):
+            if not abs(size) > UNIT_OFFSET * np.sqrt(base.noise[part[0], part[0]]):
                 continue  # smaller ones need no such start
             for _ in range(_AGAIN):
-                found = bank.run([_removed(begin, one, size).hypothesis])
-                against, own = _moments([one], found)
+                found = bank.run([removed(begin, one, size).hypothesis])
+                against, own = moments([one], found)
                 size += float(against[0] / own[0, 0])
             if np.isfinite(size):
-                yield _removed(replace(base, start=begin.start), whole, size)
+                yield removed(replace(base, start=begin.start), whole, size)
 
 
 def _gains(
@@ -443,7 +266,7 @@ def _gains(
     spacing = _GAINS[1] - _GAINS[0]
     while True:
         tried = [
-            (k, _with_factor(begins[k], *part, float(10.0**at)))
+            (k, with_factor(begins[k], *part, float(10.0**at)))
             for (part, k), found in places.items() for at in found
         ]
         likelihoods = bank.run([short, *(one.hypothesis for _, one in tried)]).likelihoods[1:]
@@ -455,7 +278,7 @@ def _gains(
         if spacing < _CLOSELY:
             for part, (k, one) in best:
                 whole = replace(base, start=begins[k].start)
-                yield _with_factor(whole, *part, one.value)
+                yield with_factor(whole, *part, one.value)
             return
         around = spacing * np.linspace(-1.0, 1.0, 9)
         places = {(part, k): np.log10(one.value) + around for part, (k, one) in best}
@@ -464,19 +287,19 @@ def _gains(
 
 def _exchanged(base: Hypothesis) -> Iterator[Fault]:
     p = base.measurements.shape[1]
-    for pair in combinations(range(p), 2) if p <= _MOST else ():
+    for pair in combinations(range(p), 2) if p <= MOST_PARTS else ():
         order = np.arange(p)
         order[list(pair)] = pair[::-1]
         yield Fault("swapped", 0.0, replace(base, measurements=base.measurements[:, order]), pair)
     for j in range(base.inputs.shape[1]):
-        yield _with_factor(base, "sign", (j,), -1.0)
+        yield with_factor(base, "sign", (j,), -1.0)
     yield Fault("outliers", 1.0, replace(base, outliers=True))
 
 
 def _shifted(base: Hypothesis) -> Iterator[Fault]:
     total, p = base.measurements.shape
     parts: list[tuple[int, ...]] = [()] if base.inputs.shape[1] else []  # late for what?
-    if 1 < p <= _MOST:
+    if 1 < p <= MOST_PARTS:
         parts += [(j,) for j in range(p)]
     for part in parts:
         columns = list(part) if part else list(range(p))
@@ -507,161 +330,3 @@ def _drifted(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fau
         moved = np.full_like(y, np.nan)
         moved[before] = y[there] - (when - before)[:, None] * moves[before]
         yield Fault("clock", float(late), replace(base, measurements=moved))
-
-
-@dataclass(frozen=True, eq=False)
-class _Signature:
-    """How a fault of size one moves the outputs (T, p) and the states (T, n) of its sample."""
-
-    kind: str
-    subject: tuple[int, ...]
-    outputs: Array
-    states: Array
-    span: tuple[int, int] | None = None
-
-
-def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[_Signature]:
-    total, p = base.measurements.shape
-    none_x = np.zeros((total, bank.system.n))
-    inputs = bank.full_inputs(base.inputs, base.step)
-    # At each sample from those before it alone: else noise would look like a fault.
-    expected, moves = bank.moves(null.states, inputs)
-    if base.inputs.shape[1]:
-        yield _Signature("shift", (), -moves, none_x)
-    if 1 < p <= _MOST:
-        for j in range(p):
-            yield _Signature("shift", (j,), -moves * (np.arange(p) == j), none_x)
-    for j in range(p) if p <= _MOST else ():
-        yield _Signature("gain", (j,), expected * (np.arange(p) == j), none_x)
-    reached = bank.following(null.corrected, inputs)
-    for j in range(base.inputs.shape[1]):
-        without = inputs.copy()
-        without[:, j] = 0.0
-        yield _Signature(
-            "input", (j,), expected - bank.expected(null.states, without),
-            reached - bank.following(null.corrected, without),
-        )
-    blocks = max(1, min(32 if p <= _MOST else 8, total // 4))
-    edges = np.linspace(0, total, blocks + 1).astype(int).tolist()
-    for j in range(p):
-        for first, end in pairwise(edges):
-            yield _bias(bank, total, j, first, end - 1)
-
-
-def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> _Signature:
-    outputs = np.zeros((total, bank.system.p))
-    outputs[first : last + 1, sensor] = 1.0
-    return _Signature(
-        "bias", (sensor,), outputs, np.zeros((total, bank.system.n)), (first, last)
-    )
-
-
-def _linear(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fault]:
-    """Additive faults, of the size that the innovations of the filter without them show.
-
-    An additive fault moves the innovations by a signature that is linear in its size; they are
-    white beside it, so that its size is a weighted mean.
-
-    References
-    ----------
-    Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation
-    of jumps in linear systems, IEEE Transactions on Automatic Control 21 (1976).
-    """
-    if not np.isfinite(null.logs).all():
-        return
-    signatures = [
-        one for one in _signatures(bank, base, null)
-        if np.isfinite(one.outputs).all() and np.isfinite(one.states).all()
-    ]
-    if not signatures:
-        return
-    against, own = _moments(signatures, null)
-    best: dict[tuple[str, tuple[int, ...]], tuple[float, float, _Signature]] = {}
-    for one, size, gain in _candidates(bank, signatures, against, own):
-        key = one.kind, one.subject
-        if gain > 0.5 * LEAST_GAIN and gain > best.get(key, (0.0,))[0]:
-            best[key] = gain, size, one
-    for _, size, one in best.values():
-        # A filter that follows the fault shows less of a gain, or more.
-        for share in _AROUND if one.kind == "gain" else (1.0,):
-            yield _removed(base, one, share * size)
-
-
-def _candidates(
-    bank: FilterBank, signatures: list[_Signature], against: Array, own: Array
-) -> Iterator[tuple[_Signature, float, float]]:
-    """Signatures with size and gain: those given, and of biases the best row of stretches."""
-    for k, one in enumerate(signatures):
-        if one.kind != "bias" and own[k, k] > 0.0:
-            yield one, against[k] / own[k, k], 0.5 * against[k] ** 2 / own[k, k]
-    for j in range(bank.system.p):
-        at = [k for k, one in enumerate(signatures) if (one.kind, one.subject) == ("bias", (j,))]
-        if not at:
-            continue
-        # Signatures add up: sums over rows of stretches by prefix sums.
-        sums = np.append(0.0, np.cumsum(against[at]))
-        squares = np.zeros((len(at) + 1, len(at) + 1))
-        squares[1:, 1:] = np.cumsum(np.cumsum(own[np.ix_(at, at)], axis=0), axis=1)
-        diagonal = squares.diagonal()
-        top = sums[None, :] - sums[:, None]  # from stretch i up to k, without k
-        bottom = diagonal[None, :] + diagonal[:, None] - squares - squares.T
-        gains = np.where(np.triu(bottom, 1) > 0.0, 0.5 * top**2 / bottom, 0.0)
-        i, k = divmod(int(np.argmax(gains)), len(gains))
-        first, last = signatures[at[i]].span, signatures[at[k - 1]].span
-        if gains[i, k] > 0.0 and first is not None and last is not None:
-            one = _bias(bank, len(signatures[0].outputs), j, first[0], last[1])
-            yield one, float(top[i, k] / bottom[i, k]), float(gains[i, k])
-
-
-def _moments(signatures: list[_Signature], null: Filtered) -> tuple[Array, Array]:
-    """Products of the signatures in the innovations with these (K,), and with each other (K, K)."""
-    outputs = np.stack([one.outputs for one in signatures], axis=2)
-    states = np.stack([one.states for one in signatures], axis=2)
-    there = np.isfinite(null.innovations)
-    errors = np.where(there, null.innovations, 0.0)
-    moved = np.zeros(states.shape[1:])
-    against, own = np.zeros(len(signatures)), np.zeros((len(signatures), len(signatures)))
-    for t in range(len(outputs)):
-        shown = null.outputs[t] @ moved + outputs[t] * there[t][:, None]
-        weighted = null.weights[t] @ shown
-        against += errors[t] @ weighted
-        own += shown.T @ weighted
-        moved = null.transitions[t] @ (moved - null.gains[t] @ shown) + states[t]
-    return against, own
-
-
-def _with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -> Fault:
-    """A bias with the first and last sample under which the record is most likely."""
-    total = len(base.measurements)
-    first, last = bias.span or (0, total - 1)
-    step = max(1, total // 64)
-    while True:
-        signatures = [
-            _bias(bank, total, bias.subject[0], begin, end)
-            for begin in sorted({max(first + d, 0) for d in (-step, 0, step)})
-            for end in sorted({min(last + d, total - 1) for d in (-step, 0, step)})
-            if end - begin >= 2
-        ]
-        against, own = _moments(signatures, null)
-        sizes = against / own.diagonal()
-        k = int(np.argmax(sizes * against))
-        same = signatures[k].span == (first, last)
-        first, last = signatures[k].span or (first, last)
-        if same and step == 1:
-            break
-        step = max(1, step // 2) if same else step
-    refined = _removed(base, signatures[k], float(sizes[k]))
-    values = bank.run([base, refined.hypothesis]).likelihoods
-    gain = float(values[1] - values[0])
-    return replace(refined, gain=gain) if gain > bias.gain else bias
-
-
-def _removed(base: Hypothesis, one: _Signature, size: float) -> Fault:
-    """The record without this fault."""
-    if one.kind == "input":
-        kind = "sign" if size < -1.0 else "input"
-        return _with_factor(base, kind, one.subject, 1.0 + size)
-    if one.kind == "gain":
-        return _with_factor(base, "gain", one.subject, float(np.exp(size)))
-    y = base.measurements - size * one.outputs
-    return Fault(one.kind, size, replace(base, measurements=y), one.subject, one.span)

@@ -15,7 +15,8 @@ from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, SetError, ShapeError
 from ..memory.snapshot import checked_array, mismatch
 from ..model.sets import ConvexSet
-from ..model.system import System, checked_set
+from ..model.system import System
+from ..model.system_arguments import checked_set
 from .description import SET_NAMES
 from .settings import Settings
 

@@ -42,7 +42,7 @@ class Constraints:
         These constants.
     basis : (n, n - k) array
         The directions in which there are disturbances.
-    directions : Directions or None
+    directions : NoiseFreeDirections or None
         The noise-free directions in place of these components, for a `LiftedCost`.
     """
 
@@ -61,7 +61,7 @@ class Constraints:
         disturbances, spread = system.disturbances, inverse(cost.disturbance)
         self.noise_free: NDArray[np.intp] = np.empty(0, np.intp)
         self.constant: Array = np.empty(0)
-        self.directions: Directions | None = None
+        self.directions: NoiseFreeDirections | None = None
         if cost.space is None:
             self.disturbances = _rows("disturbances", disturbances, spread)
             if disturbances is not None:
@@ -80,7 +80,7 @@ class Constraints:
         if through is not None:
             spread = through @ spread @ through.T
         rows = Rows("disturbances", disturbances, spread)
-        directions = Directions(rows, space)
+        directions = NoiseFreeDirections(rows, space)
         self.basis = directions.basis
         if self.basis.shape[1] < system.n:
             self.directions = directions
@@ -183,7 +183,7 @@ class Constraints:
         return other
 
 
-class Directions:
+class NoiseFreeDirections:
     """Noise-free directions: N' d = c for all d = x+ - f(x) of an estimate.
 
     They are those of the cost, with c = 0, and the components of W that have no width.

@@ -17,12 +17,13 @@ from .._checks import check_problem
 from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
-from ..memory.record import Mark, Record
+from ..memory.record import Mark, MemoryRecord
 from ..memory.snapshot import reading
+from ..model.captured import ComparisonTimes, Due
 from ..model.derivatives import Nearby
 from ..model.residuals import difference
 from ..model.system import System
-from ..model.traces import next_check, warn_of
+from ..model.traces import warn_of
 from ..observers import Observer
 from ..terms.sum import root_of_first, weight_of_first
 from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
@@ -33,7 +34,7 @@ from .optimizer import Optimizer
 from .problem import Formulation, Solved
 from .settings import Settings
 from .subproblem import Subproblem
-from .watch import ObserverWatch
+from .watch import NEAR, ObserverWatch
 from .window import Window
 
 Array = NDArray[np.float64]
@@ -105,8 +106,8 @@ class PythonEngine:
         self._smoothed = settings.arrival == "smoothed"
         self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
-        # The time of the next comparison of the trace with the functions that it stands for.
-        self._next_check: float = 0 if system.is_traced else math.inf
+        # When the traces are compared with the functions that they stand for.
+        self._times = ComparisonTimes(system.traced_functions, settings.time_budget is None)
         self._undo_point: Mark
 
     def _use_system(self, system: System) -> None:
@@ -183,7 +184,7 @@ class PythonEngine:
         self, y: Array, u: Array, dt: float | None, own: Conditions | None, began: float
     ) -> Estimate:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
-        if self._window.time >= self._next_check:
+        if self._window.time >= self._times.next:
             self._check_trace(u)
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
@@ -191,7 +192,7 @@ class PythonEngine:
         self._set_undo_point(reinitialized or (window.projects and window.moves_state(own)))
         try:
             with np.errstate(all="ignore"):
-                if window.length == self._settings.horizon:
+                if window.end - window.start == window.horizon:
                     self._solver.shift()
                     if self._smoothed and window.trajectory is not None:
                         window.smoothed_prior = window.trajectory[1].copy()
@@ -200,20 +201,30 @@ class PythonEngine:
                     window.reinitialize(window.history[window.start : window.end])
                 estimate = self._estimate(began)
             window.history[window.end] = estimate.state
-            self._warn()
+            if window.watched != NEAR:
+                self._warn()
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             self.undo()
             raise
 
     def _check_trace(self, u: Array) -> None:
-        """Compare trace and functions at z(t); take the functions for good where they differ."""
-        window = self._window
-        fault = self._system.fault(window.candidate[-1], u)
-        self._next_check = next_check(window.time, self._settings.horizon)
-        if fault:
-            self.leave_trace()
-            warn_of(fault, 5)
+        """Compare traces and functions if it is time to."""
+        due = self._times.due(self._window.time)
+        if due is not Due.NOWHERE:
+            self.verify(u, due is Due.EVERYWHERE, 6)
+
+    def verify(self, u: Array, everywhere: bool = True, level: int = 4) -> bool:
+        """Compare traces and functions at z(t); take the functions for good where they differ."""
+        window, system = self._window, self._system
+        where = [(window.candidate[-1], u), *(system.usual_points() if everywhere else ())]
+        fault = system.fault(where)
+        if not fault:
+            self._times.compared(window.time)
+            return True
+        self.leave_trace()
+        warn_of(fault, level)
+        return False
 
     def leave_trace(self) -> None:
         """Evaluate the original functions, along the window and from now on."""
@@ -224,7 +235,7 @@ class PythonEngine:
         except BaseException:  # an interrupt: the trace is still there, and compared again
             self.replace(before)
             raise
-        self._next_check = math.inf
+        self._times.end()
 
     def _warn(self) -> None:
         text = self._watch.warning(self._window.watched)
@@ -253,7 +264,8 @@ class PythonEngine:
         if candidate.values is not None and (text := problem.constraint_failure(candidate)):
             status |= Status.MODEL_FAILED
             message = f"{text} {message}".strip()
-        if not math.isfinite(candidate.cost):
+        finite = math.isfinite(candidate.cost)
+        if not finite:
             status &= ~Status.NO_DECREASE  # the model failed, not the solver
             if problem.rolled_out is not None:
                 status |= Status.MODEL_FAILED
@@ -274,7 +286,7 @@ class PythonEngine:
             if window.watched[0] >= settings.horizon:
                 status |= Status.OBSERVER_FAR
         else:
-            window.watched = 0, 0
+            window.watched = NEAR
             # The candidate's arrays are views of the window: copy.
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
@@ -300,10 +312,11 @@ class PythonEngine:
             outcome.nearest_points,
             filtered,
             self._disturbances,
-            window.observer_state.copy(),
-            window.rejected,
+            window.z[window.end].copy(),
+            window.rejected if window.rejects else None,
         )
-        if window.newest_failed and outcome.improved:
+        # Where the newest stage failed, J of the candidate is infinite.
+        if not finite and outcome.improved and window.newest_failed:
             window.restart(estimate.state)
             estimate.observer_state = estimate.state.copy()
         if problem.hold is not None:
@@ -414,10 +427,13 @@ class PythonEngine:
     def _use(self, memory: Memory) -> None:
         self._system, self._tools, self._window = memory
         self._nearby = _nearby(self._system)
-        self._next_check = 0 if self._system.is_traced else math.inf
+        if self._system.is_traced:
+            self._times.restart(self._window.time)
+        else:
+            self._times.end()
 
     def adopt(
-        self, usual: Conditions, record: Record, residuals: Array,
+        self, usual: Conditions, record: MemoryRecord, residuals: Array,
         metric: tuple[Array, bool] | None, replay: bool,
     ) -> None:
         """Continue from another engine's record.

@@ -74,6 +74,9 @@ class Engine(Protocol):
     ) -> Estimate:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
 
+    def verify(self, u: Array) -> bool:
+        """Compare functions and their traces now, with this usual input; whether they agree."""
+
     def amend(self, time: int, y: Array) -> Estimate:
         """Insert a late measurement, and estimate again."""
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
-import warnings
 from collections.abc import Mapping
-from dataclasses import fields
 from time import perf_counter
 from types import FrameType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,34 +16,29 @@ from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
 from .._checks import flag, numbers, positive, vector
-from .._linalg import inverse
 from ..costs import Cost
-from ..errors import InvalidInputError, ModelError, ObserverWarning, OptionError, ShapeError
-from ..memory.snapshot import read, written
+from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.traces import warn_of
 from ..observers import Observer
-from ..observers.projection import NearestPoint
-from ..terms.hold import WindowHold
 from .conditions import ConditionReader, Conditions
 from .contracts import check_correction, check_observer, check_prior
-from .engines import EngineChangeError, engine_for, engine_of_snapshot
+from .engines import EngineChangeError, engine_for
 from .estimate import Estimate
-from .problem import Solved
+from .estimator_memory import EstimatorMemory
+from .reach import compared
 from .run import Run, RunSource
 from .settings import Settings
+from .start import check_cost, nominal_parameters, require
 from .step_length import step_error, warn_of_step
 from .time_index import paired_record
-
-if TYPE_CHECKING:
-    from ..sensitivity import Sensitivity
 
 Array = NDArray[np.float64]
 
 
 @report_unknown_options
-class MovingHorizonEstimator:
+class MovingHorizonEstimator(EstimatorMemory):
     r"""Suboptimal moving horizon estimation with an observer-based candidate.
 
     Each measurement advances the auxiliary observer. Its last N steps are the candidate for the
@@ -155,9 +147,6 @@ class MovingHorizonEstimator:
     True
     """
 
-    #: Differentiates a solved problem; `qpmhe.sensitivity`, which stands on this room, has it.
-    differentiate: ClassVar[type[Sensitivity]]
-
     def __init__(
         self,
         system: System,
@@ -185,12 +174,12 @@ class MovingHorizonEstimator:
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
             engine, project_observer, infeasible, warm_start, candidate, time_budget,
-            isolated, arrival, _nominal(parameters),
+            isolated, arrival, nominal_parameters(parameters),
         )
         self.system, self.observer, self.cost = system, observer, cost
-        _require(system, System, "system", "qpmhe.System")
-        _require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
-        _require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
+        require(system, System, "system", "qpmhe.System")
+        require(observer, Observer, "observer", "qpmhe.Luenberger or another observer")
+        require(cost, Cost, "cost", "qpmhe.QuadraticCost or qpmhe.RobustCost")
         check_cost(system, cost)
         check_observer(system, observer)
         check_prior(observer, cost, warns=not is_copy and self.settings.max_qps != 0)
@@ -222,6 +211,10 @@ class MovingHorizonEstimator:
                 self._usual_input,
             )
             warn_of_step(error, system, 3)
+            self._own_system = compared(
+                self._own_system, cost, observer.initial_covariance(), self._initial_state,
+                self._usual_input, horizon,
+            )
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state
@@ -231,96 +224,6 @@ class MovingHorizonEstimator:
                 f"horizon is {self.settings.horizon}: the arrays of this many stages of "
                 f"{system.n} states do not fit into memory ({error}); take a shorter horizon."
             ) from error
-
-
-    def _checked_start(
-        self, initial_state: ArrayLike, system: System
-    ) -> tuple[Array, System]:
-        state = vector("initial_state", initial_state, system.n)
-        return check_start(system, self.observer, self.cost, state, u=self._usual_input)
-
-    def reset(self, initial_state: ArrayLike | None = None) -> None:
-        """Forget all measurements and restart.
-
-        Parameters
-        ----------
-        initial_state : (n,) array_like, optional
-            A new initial estimate; the former one if left out. Both are projected onto the X that
-            `set` has left.
-
-        Raises
-        ------
-        InvalidInputError
-            If the state is invalid; the estimator stays unchanged.
-        """
-        before, state, system = self._initial_state, self._initial_state, None
-        if initial_state is not None:
-            state, system = self._checked_start(initial_state, self._engine.system)
-        try:
-            self._initial_state = state
-            # X may be another one than that in which the former state is.
-            start, _ = _inside(self._engine.system, self.observer, self.cost, state)
-            self._engine.reset(start, system)
-        except BaseException:
-            self._initial_state = before
-            raise
-
-    @property
-    def initial_state(self) -> Array:
-        """The initial estimate, a copy."""
-        return self._initial_state.copy()
-
-    @property
-    def state(self) -> Array:
-        """The current estimate of x(t+1), or the initial one before the first measurement."""
-        return self._engine.state
-
-    @property
-    def observer_state(self) -> Array:
-        """z(t+1), the state from which the observer continues; at first the initial state."""
-        return self._engine.observer_state
-
-    @property
-    def engine(self) -> str:
-        """The engine in use, ``python`` or ``compiled``, also with ``engine="auto"``."""
-        return self._engine.name
-
-    @property
-    def time(self) -> int:
-        """Number of measurements taken so far."""
-        return self._engine.time
-
-    @property
-    def horizon(self) -> int:
-        """The horizon N."""
-        return self.settings.horizon
-
-    @property
-    def inputs(self) -> int:
-        """Number of inputs in the ``u`` of `update`: the system's inputs without the parameters."""
-        return self._inputs
-
-    @property
-    def has_changed(self) -> bool:
-        """Whether `set` has changed weights or bounds from those of ``cost`` and ``system``."""
-        usual = self._engine.usual
-        weights = usual.noise_weight, usual.disturbance_weight
-        return usual.has_bounds or any(one is not None for one in weights)
-
-    @property
-    def usual(self) -> Conditions:
-        """What `set` has changed, and the parameters."""
-        return self._engine.usual
-
-    @property
-    def hold(self) -> WindowHold | None:
-        """How the last step held parameters, see `augment_parameters`.
-
-        None where nothing is held: without ``hold``, without QPs, or before the first measurement.
-        """
-        if not (self.system.held and self.time):
-            return None
-        return self._engine.solved().problem.hold
 
     def update(
         self,
@@ -415,6 +318,27 @@ class MovingHorizonEstimator:
         except EngineChangeError as change:
             self._change_engine(change)
         return self._engine.step(y_array, u_array, dt, own, began)
+
+    def verify(self) -> bool:
+        """Compare the functions f and h, and others that are traced, with their traces now.
+
+        An estimator evaluates expressions in the place of functions that can be traced. It compares
+        both when it is made; later where values that the functions read have changed, at which it
+        looks before the samples; and, without ``time_budget``, at each 1000th sample. This method
+        compares them at the present state and at points of several magnitudes, whatever has
+        changed, in some hundred microseconds.
+
+        Returns
+        -------
+        bool
+            Whether they agree. If not, an `EngineWarning` names the function and the point, and the
+            estimator evaluates the functions as they are written from now on.
+        """
+        try:
+            return self._engine.verify(self._usual_input)
+        except EngineChangeError as change:
+            self._change_engine(change)
+            return False
 
     def _change_engine(self, change: EngineChangeError) -> None:
         self._engine = change.engine
@@ -630,248 +554,5 @@ class MovingHorizonEstimator:
             system, self.observer, cost, self.settings, measurements, inputs, steps
         )
 
-    def covariances(self) -> Array:
-        """Covariances of the last estimate's trajectory, by linearisation along it.
-
-        The inverse of the Gauss-Newton Hessian's diagonal blocks, computed in O(N n^3):
-        with inverse covariances as weights, the covariance of the error of each state given
-        the window's measurements and the prior. Inequalities do not enter; noise-free
-        components do.
-
-        Returns
-        -------
-        (N_t + 1, n, n) array
-            The last belongs to ``estimate.state``, the one before to ``estimate.filtered``.
-
-        Raises
-        ------
-        InvalidInputError
-            Before the first measurement, if the model cannot be linearised there, or if the
-            weights leave a direction of the states undetermined: a redescending loss takes
-            the weight from outliers.
-        """
-        return self._engine.covariances()
-
-    def sensitivity(self) -> Sensitivity:
-        """Derivatives of the last estimate with respect to weights, data and parameters.
-
-        Applies the implicit function theorem to the window's true cost, with its exact Hessian and
-        fixed active rows, for any engine. This takes a few factorisations of a banded matrix, O(N
-        n^3), and one solve per derivative.
-
-        Returns
-        -------
-        Sensitivity
-            Its `Sensitivity.adjoint` differentiates any function of the trajectory with respect to
-            everything at once.
-
-        Raises
-        ------
-        InvalidInputError
-            Before the first measurement, or if second derivatives do not exist along the
-            estimate or are not known: of a cost that the user wrote, or of an active nonlinear
-            constraint of more than the state.
-        """
-        return self._sensitivity_of(self._engine.solved())
-
-    def _sensitivity_of(self, solved: Solved) -> Sensitivity:
-        second = solved.formulation.system.evaluation.second_derivatives
-        with np.errstate(all="ignore"):
-            return self.differentiate(
-                solved, second, self.settings.tolerance, len(self.settings.parameters)
-            )
-
-    def _newest_covariance(self) -> Array:
-        try:
-            value: Array = self.covariances()[-1]
-        except InvalidInputError:  # bad luck: the record goes on
-            value = np.full((self.system.n, self.system.n), np.nan)
-        return value
-
-    def state_dict(self) -> dict[str, Any]:
-        """A snapshot of the estimator's memory: arrays by name, and one text for the rest.
-
-        Save it with ``numpy.savez(file, **state)`` or ``json.dumps(state,
-        default=numpy.ndarray.tolist)``. An estimator made with the same arguments continues from
-        there after `load_state_dict`, in the same process or another: bit for bit, unless a QP
-        solver was warm-started. What it keeps is not saved; see `forget_warm_start`. Taking a
-        snapshot changes nothing in this estimator.
-
-        Returns
-        -------
-        dict
-            Copies, safe to keep, pickle or save.
-        """
-        return written(self._engine.state_dict())
-
-    def forget_warm_start(self) -> None:
-        """Have the next QP start without what the QP solver has kept of those before.
-
-        An estimator that goes on after this call, and another that continues from its
-        `state_dict`, give the same estimates to the last bit, whatever the solver. The compiled
-        step needs no such call: snapshots have all that it keeps.
-        """
-        self._engine.forget_warm_start()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue where another estimator stopped.
-
-        Parameters
-        ----------
-        state : dict
-            The `state_dict` of an estimator with the same arguments, also as read by ``numpy.load``
-            or ``json.load``.
-
-        Raises
-        ------
-        InvalidInputError
-            If the state is damaged, or from an estimator with another model, observer, cost, sets,
-            candidate or engine. The estimator stays unchanged. QP caps, backend, tolerances,
-            ``infeasible`` and ``warm_start`` may differ.
-
-        Notes
-        -----
-        A digest shows damage. Functions are compared by their values at a few points. With
-        ``engine="auto"`` the estimator continues with the snapshot's engine.
-        """
-        memory = read(state)
-        pinned = memory.get("engine")
-        # Whole or, if interrupted, not at all.
-        if isinstance(pinned, str) and self.engine != pinned and self.settings.engine == "auto":
-            own = self._own_system.evaluated_like(self._engine.system)
-            engine = engine_of_snapshot(
-                pinned, own, self.observer, self.cost, self.settings, self._initial_state,
-            )
-            engine.load_state_dict(memory)
-            self._engine = engine
-        else:
-            self._engine.load_state_dict(memory)
-
-    def __repr__(self) -> str:
-        parts = {"system": self.system, "observer": self.observer, "cost": self.cost}
-        chosen = {
-            field.name: value for field in fields(self.settings)
-            if (value := getattr(self.settings, field.name)) != field.default
-            and field.name != "engine"
-        }
-        words = [f"{name}={value!r}" for name, value in (
-            parts | chosen | {"engine": self.engine, "time": self.time}
-        ).items()]
-        return "MovingHorizonEstimator(\n    " + ",\n    ".join(words) + "\n)"
-
-    def __getstate__(self) -> dict[str, Any]:
-        solver = self.settings.backend
-        if isinstance(solver, Solver):
-            try:
-                pickle.dumps(solver)
-            except Exception as error:
-                raise InvalidInputError(
-                    f"the solver {solver!r} given as backend cannot be pickled "
-                    f"({type(error).__name__}: {error}), nor can its estimator; name "
-                    "a registered backend instead, or save state_dict()."
-                ) from error
-        return {
-            "arguments": (self.system, self.observer, self.cost),
-            "settings": self.settings,
-            "first_state": self._first_state,
-            "initial_state": self.initial_state,
-            "engine": self.engine,
-            "state": self.state_dict(),
-        }
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        # Construction checks everything again: a snapshot is input like any other.
-        options = vars(saved["settings"]) | {"engine": saved["engine"]}
-        self.settings = saved["settings"]  # what the first construction warned of is known
-        self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
-            *saved["arguments"], initial_state=saved["first_state"], **options
-        )
-        self.settings = saved["settings"]
-        self.load_state_dict(saved["state"])
-        if not np.array_equal(saved["initial_state"], saved["first_state"]):
-            # How the model is called and scaled depends on both; X is that of `set` by now.
-            self.reset(saved["initial_state"])
-            self.load_state_dict(saved["state"])
-
 
 _UPDATE = MovingHorizonEstimator.update.__code__
-
-
-def _nominal(parameters: ArrayLike | None) -> tuple[float, ...]:
-    if parameters is None:
-        return ()
-    values = np.atleast_1d(numbers("parameters", parameters))
-    if values.ndim != 1:
-        raise ShapeError(
-            f"parameters has shape {values.shape}; expected (k,), the usual values of the system's "
-            "last k inputs."
-        )
-    return tuple(values.tolist())
-
-
-def _require(value: object, kind: type, name: str, expected: str) -> None:
-    if not isinstance(value, kind):
-        raise InvalidInputError(f"{name} is {shown(value)}; expected a {expected}.")
-
-
-def check_cost(system: System, cost: Cost) -> None:
-    """Check that a cost is for the system's states, disturbances and outputs."""
-    n = system.n if cost.observer_prior is not None and cost.r == system.r else cost.n
-    if (n, cost.p) != (system.n, system.p):
-        raise ShapeError(
-            f"the cost is for {n} states and {cost.p} outputs; expected {system.n} and "
-            f"{system.p}, the system's."
-        )
-    if cost.r != system.r:
-        raise ShapeError(
-            f"the cost is for {cost.r} disturbances; expected {system.r}, "
-            + ("one for each state. Give the system a disturbance_matrix if there are fewer."
-               if system.disturbance_matrix is None
-               else "one for each column of the system's disturbance_matrix.")
-        )
-
-
-def check_start(
-    system: System, observer: Observer, cost: Cost, state: Array, name: str = "initial_state",
-    u: Array | None = None,
-) -> tuple[Array, System]:
-    """Check that model and observer work at an initial state.
-
-    Returns the state, projected onto X, and the system as it is evaluated from there on.
-    """
-    try:
-        start, is_moved = _inside(system, observer, cost, state)
-        if is_moved:
-            warnings.warn(
-                f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the "
-                f"estimator starts at the nearest point of the set, {start.tolist()}.",
-                ObserverWarning,
-                stacklevel=4,
-            )
-        state = start
-        system = system.at(state, np.zeros(system.m) if u is None else u)
-        observer.check(system, state)
-    except ModelError as error:
-        if name == "initial_state":
-            raise
-        raise ModelError(f"{name}: {error}") from error
-    return state, system
-
-
-def _inside(
-    system: System, observer: Observer, cost: Cost, state: Array
-) -> tuple[Array, bool]:
-    """An initial state in X, in its turn, and whether it was projected."""
-    if system.states is None:
-        return state, False
-    if system.turns is not None:
-        state = system.turns(state)
-    nearest = NearestPoint(system.states)
-    if nearest.contains(state):
-        return state, False
-    weight = observer.metric
-    if weight is None:
-        weight = cost.initial_weight(observer.initial_covariance())
-    if weight.shape[0] != system.n:
-        return state, False  # `Observer.check` then reports the wrong size
-    return nearest(state, inverse(weight)).point, True

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..memory.record import Record
+from ..memory.record import MemoryRecord
 from ..terms.base import read_only
 from ..terms.linearization import Span, Stage, StageTerms
 
@@ -38,7 +38,7 @@ class StageView:
 
     __slots__ = ("arguments", "error", "terms", "u", "weight", "y", "z", "z_next")
 
-    def __init__(self, record: Record, terms: StageTerms, k: int) -> None:
+    def __init__(self, record: MemoryRecord, terms: StageTerms, k: int) -> None:
         self.z, self.z_next = record.z[k], record.z[k + 1]
         self.y, self.u = record.y[k], record.u[k, :-1]
         self.arguments: tuple[Array, ...] = tuple(
@@ -49,7 +49,7 @@ class StageView:
         self.error = read_only(self.terms.noise)
 
 
-class WindowView:
+class WindowArrays:
     """Views of a whole window.
 
     Attributes
@@ -68,7 +68,7 @@ class WindowView:
 
     __slots__ = ("candidate", "costs", "inputs", "measurements", "prior", "residuals", "span")
 
-    def __init__(self, record: Record, terms: StageTerms, first: int, last: int) -> None:
+    def __init__(self, record: MemoryRecord, terms: StageTerms, first: int, last: int) -> None:
         self.candidate, self.prior = record.z[first : last + 1], record.z[first]
         self.residuals = terms.residuals[first:last]
         self.measurements, self.inputs = record.y[first:last], record.u[first:last, :-1]

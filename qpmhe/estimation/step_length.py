@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .._linalg import inverse
 from ..costs import Cost
 from ..errors import ModelWarning
 from ..model.residuals import difference
 from ..model.system import System
+from .reach import disturbance_deviations, prior_deviations, prior_points
 
 Array = NDArray[np.float64]
 
@@ -20,9 +20,6 @@ Array = NDArray[np.float64]
 # a coarse map by choice, which often is what the data were simulated with.
 _TOO_LONG = {"euler": 10.0}
 _USUALLY_TOO_LONG = 0.1
-
-# Random points within one standard deviation of the prior.
-_DRAWN = 8
 
 
 @dataclass(frozen=True)
@@ -70,8 +67,8 @@ def step_error(
     if system.dt is None or not system.has_timed:
         return None
     try:
-        prior = np.sqrt(inverse(cost.initial_weight(covariance)).diagonal())
-        points = _points(system, state, prior)
+        prior = prior_deviations(cost, covariance)
+        points = prior_points(system, state, prior)
         step, half = (np.tile(np.append(u, one), (len(points), 1))
                       for one in (system.dt, 0.5 * system.dt))
         with np.errstate(all="ignore"):
@@ -81,7 +78,7 @@ def step_error(
             )
     except Exception:  # a model outside of its domain; the steps will report that
         return None
-    units = _deviations(system, cost)
+    units = disturbance_deviations(system, cost)
     shares = missed / np.where(units > 0.0, units, prior)
     shares[~np.isfinite(shares).all(axis=1)] = -1.0
     k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
@@ -105,25 +102,3 @@ def warn_of_step(error: StepError | None, system: System, level: int) -> None:
         ModelWarning,
         stacklevel=level + 1,
     )
-
-
-def _deviations(system: System, cost: Cost) -> Array:
-    """Standard deviations (n,) of G w; 0 where there is no disturbance."""
-    spread, directions = inverse(cost.disturbance), cost.directions(system.disturbance_matrix)
-    if directions is not None:
-        spread = directions @ spread @ directions.T
-    deviations = np.sqrt(np.maximum(spread.diagonal(), 0.0))
-    if directions is None and system.disturbances is not None:
-        deviations[system.disturbances.fixed_components] = 0.0
-    return deviations
-
-
-def _points(system: System, state: Array, prior: Array) -> Array:
-    """The initial state, and points of X within one standard deviation of the prior."""
-    n, generator = state.size, np.random.default_rng(20210829)
-    inner = generator.uniform(-1.0, 1.0, (_DRAWN, n))
-    steps = np.concatenate((np.zeros((1, n)), np.eye(n), -np.eye(n), inner))
-    points: Array = state + prior * steps
-    if system.states is None:
-        return points
-    return np.clip(points, system.states.lower, system.states.upper)

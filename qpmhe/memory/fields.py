@@ -18,7 +18,7 @@ class Field(NamedTuple):
         Whether there is one for each stage of the window, one for each state (a last one more than
         there are stages), or a single one, which is replaced and never changed in place.
     shape : str
-        Names of its dimensions, which `Sizes` has.
+        Names of its dimensions, which `MemorySizes` has.
     kind : str
         What its entries are: real numbers, flags, counts, times, or a structure of C.
     engine : {"both", "python", "c"}
@@ -127,7 +127,7 @@ _C_DIMENSIONS = {
 }
 
 
-class Sizes(NamedTuple):
+class MemorySizes(NamedTuple):
     """Dimensions by name, and the features that an estimator has."""
 
     dimensions: dict[str, int]
@@ -137,7 +137,7 @@ class Sizes(NamedTuple):
     def of(
         cls, n: int, p: int, m: int, horizon: int, *, sensors: int = 0, held: int = 0,
         memory: int = 0, rows: tuple[int, int] = (0, 0), **features: bool,
-    ) -> Sizes:
+    ) -> MemorySizes:
         """The sizes of an estimator with n states, p outputs, m inputs and this horizon.
 
         ``memory`` is the size of what a user's observer remembers; ``rows`` are the stages of a

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import Sizes
+from .fields import MemorySizes
 from .snapshot import check_size, checked_array, mismatch
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ class Mark(NamedTuple):
     rows: dict[str, Array] | None
 
 
-class Record:
+class MemoryRecord:
     """Samples and what is computed from them: a record of contiguous arrays.
 
     The arrays are longer than the window, which slides along them; at the end its stages
@@ -52,7 +52,7 @@ class Record:
 
     Parameters
     ----------
-    sizes : Sizes
+    sizes : MemorySizes
         Dimensions and features.
     initial_state, covariance : (n,) and (n, n) array
         Where the observer starts; no covariance for an observer without one.
@@ -77,7 +77,7 @@ class Record:
     next_gradient: Array
 
     def __init__(
-        self, sizes: Sizes, initial_state: Array, covariance: Array | None, step: float,
+        self, sizes: MemorySizes, initial_state: Array, covariance: Array | None, step: float,
         usual_weight: Array | None = None,
     ) -> None:
         self.sizes, self._engine = sizes, "both" if usual_weight is None else "python"
@@ -186,7 +186,7 @@ class Record:
         return Mark(
             self._values(self),
             self.own.copy() if self.own else {},
-            tuple(slot.state for slot in self.slots.values()),
+            tuple([slot.state for slot in self.slots.values()]) if self.slots else (),
             self.copies() if whole else None,
         )
 
@@ -203,7 +203,7 @@ class Record:
         if unusual:
             self._make_usual(self.end)
 
-    def copy_from(self, other: Record) -> None:
+    def copy_from(self, other: MemoryRecord) -> None:
         """Take over what both engines have from another record, which is not shared with it."""
         length = other.length
         for field in self.sizes.fields("both", "stage", "state"):

@@ -13,7 +13,8 @@ from qpmhe_solvers.values import shown
 from ..errors import InvalidInputError, SetError, ShapeError
 from .functions import BatchedFunction, Trusted
 from .sets import Box, ConvexSet, SoftSet
-from .system import System, SystemOptions
+from .system import System
+from .system_arguments import SystemOptions
 
 Array = NDArray[Any]
 Index = NDArray[np.intp]
@@ -87,11 +88,23 @@ class Augmentation:
         return Trusted(evaluate)
 
 
+# Options of a system that an augmented one has, or that `System.extensions` names.
+_KNOWN = {
+    "states", "disturbances", "noises", "scales", "output_residual", "state_residual",
+    "disturbance_matrix", "constraints",
+}
+
+
 def augmented(system: System, change: Augmentation, **options: Unpack[SystemOptions]) -> System:
     """The augmented system, made by the adapter that made the system, with exact derivatives."""
-    if system.extensions:
+    unknown = [
+        name for name in SystemOptions.__annotations__
+        if name not in _KNOWN and getattr(system, name) is not None
+    ]
+    lost = [*system.extensions, *unknown]
+    if lost:
         raise InvalidInputError(
-            f"the system has {' and '.join(system.extensions)}, which "
+            f"the system has {' and '.join(lost)}, which "
             "an augmented model does not inherit; leave them out, or write the augmented model as "
             "a System with its own functions."
         )

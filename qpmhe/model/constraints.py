@@ -220,11 +220,14 @@ class _Bound:
         has_values = found.function is not None and found.function.numel_out(0) == self.size
         return found if has_values else None
 
-    def fault(self, s: Array, u: Array) -> str:
-        """How g differs from its expression at a point; blank if it does not."""
-        if self.trace is None:
-            return ""
-        return difference(self.trace, of_both(self._user[0]), [(s, u)])
+    @property
+    def written(self) -> Callable[[Array, Array], Any]:
+        """G as the user wrote it, of (s, u)."""
+        return of_both(self._user[0])
+
+    def fault(self, where: Points) -> str:
+        """How g differs from its expression at these points; blank if it does not."""
+        return "" if self.trace is None else difference(self.trace, self.written, where)
 
     def as_written(self) -> _Bound:
         """The same, with g called as it is written."""
@@ -369,13 +372,18 @@ class ConstraintFunctions:
         """Whether some are evaluated by expressions that may become wrong."""
         return any(one.trace is not None for one in self._bound)
 
-    def fault(self, x: Array, u: Array) -> str:
-        """Which one differs from its expression at a state and input, and how; blank if none does.
+    @property
+    def traced_functions(self) -> tuple[Callable[..., Any], ...]:
+        """Those of them, as the user wrote them, that are evaluated by expressions."""
+        return tuple(one.written for one in self._bound if one.trace is not None)
 
-        Compared without disturbance and noise.
+    def fault(self, where: Points) -> str:
+        """Which one differs from its expression at these states and inputs, and how.
+
+        Blank if none does. Compared without disturbance and noise.
         """
         for one in self._bound:
-            text = one.fault(one.joined(self._start(x)), u)
+            text = one.fault([(one.joined(self._start(x)), u) for x, u in where])
             if text:
                 return f"{one.function.name} has changed since it was traced: {text}"
         return ""

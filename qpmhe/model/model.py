@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -24,7 +25,8 @@ from .traces import Pinned, warn_of
 if TYPE_CHECKING:
     from .augmentation import Augmentation
     from .constraints import ConstraintFunctions
-    from .system import System, SystemOptions
+    from .system import System
+    from .system_arguments import SystemOptions
 
 Array = NDArray[np.float64]
 Along = Callable[[Array, Array, Array], Array]
@@ -351,17 +353,22 @@ class Model:
         pinned = self._relied
         return pinned is not None and any(one.function for one in pinned.found.values())
 
-    def fault(self, x: Array, u: Array) -> str:
-        """Which function differs from its trace at a state (n,) and input (m,), and how.
+    @property
+    def traced_functions(self) -> tuple[Callable[..., Any], ...]:
+        """The user's f and h, where traces may stand in their places."""
+        return self.system.tracing.functions if self.is_traced and self.system.tracing else ()
+
+    def fault(self, where: Points) -> str:
+        """Which function differs from its trace at these states and inputs, and how.
 
         Blank if none does. Never raises, whatever the functions do.
         """
         pinned, tracing = self._relied, self.system.tracing
-        if pinned is None or tracing is None or not np.isfinite(u).all():
+        if pinned is None or tracing is None:
             return ""
         if self.system.origin.is_timed:  # compared as the model that it is made of
             return ""
-        wrong = tracing.wrong(pinned, x, u)
+        wrong = tracing.wrong(pinned, [one for one in where if np.isfinite(one[1]).all()])
         return "" if wrong is None else f"{wrong[0]} has changed since it was traced: {wrong[1]}"
 
     # Other models of the same system
@@ -423,7 +430,7 @@ class Model:
         rate = written.rate_jacobian
         for function in (written.f, written.h, *(() if rate is None else (rate,))):
             check_at(function, x, u)
-        fault = self.fault(x, u)
+        fault = self.fault([(x, u)])
         if fault:
             model = self.as_written()
             warn_of(fault)
@@ -480,3 +487,26 @@ def check_at(
         if not u.size or u.any():
             raise
         function.check(x, np.full_like(u, 0.5))
+
+
+# Models of other magnitudes than these are made again.
+_MOST_KEPT = 8
+
+
+class ModelCache:
+    """The models of a system that were made last, by the states' magnitudes."""
+
+    def __init__(self) -> None:
+        self._lock, self._kept = threading.RLock(), dict[bytes, Model]()
+
+    def of(self, written: Model, scales: Array | None) -> Model:
+        """The model for these magnitudes; made again where its functions have changed."""
+        key = b"" if scales is None else scales.tobytes()
+        with self._lock:
+            found = self._kept.pop(key, None)
+            if found is None or not found.holds():
+                found = written.scaled(scales)
+            self._kept[key] = found
+            if len(self._kept) > _MOST_KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            return found

@@ -13,7 +13,8 @@ from .augmentation import Augmentation, augmented, chosen, extended_matrix, prod
 from .functions import Trusted
 from .model import Origin
 from .residuals import extended
-from .system import System, SystemOptions, checked_system
+from .system import System, checked_system
+from .system_arguments import SystemOptions
 
 Array = NDArray[Any]
 

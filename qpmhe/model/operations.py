@@ -73,7 +73,7 @@ class ExpressionRecord(MakingRecord):
 
     @without_symbols
     def operate(self, ufunc: Any, operands: tuple[Any, ...]) -> Any:
-        """See `Record.operate`."""
+        """See `TraceRecord.operate`."""
         if ufunc in _PARTS:
             return tuple(self.operate(one, operands) for one in _PARTS[ufunc])
         name = ufunc.__name__
@@ -99,7 +99,7 @@ class ExpressionRecord(MakingRecord):
     def apply(
         self, ufunc: Any, method: str, inputs: tuple[Any, ...], options: dict[str, Any]
     ) -> Any:
-        """See `Record.apply`."""
+        """See `TraceRecord.apply`."""
         options = dict(options)
         out, mask = options.pop("out", None), options.pop("where", True)
         kind = options.pop("dtype", None)
@@ -137,7 +137,7 @@ class ExpressionRecord(MakingRecord):
         return value
 
     def call(self, function: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """See `Record.call`."""
+        """See `TraceRecord.call`."""
         form = _FUNCTIONS.get(function)
         if form is not None:
             try:
@@ -287,7 +287,7 @@ class ExpressionRecord(MakingRecord):
 
     @without_symbols
     def choice(self, condition: Any, chosen: Any, other: Any) -> Any:
-        """See `Record.choice`."""
+        """See `TraceRecord.choice`."""
         def choose(truth: Any, a: Any, b: Any) -> Any:
             if not isinstance(truth, Symbol):
                 return a if truth else b

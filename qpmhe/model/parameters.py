@@ -18,7 +18,8 @@ from .functions import BatchedFunction
 from .points import FEW, Points, points
 from .residuals import extended
 from .sets import Box, ConvexSet, SoftSet
-from .system import System, SystemOptions, checked_set
+from .system import System
+from .system_arguments import SystemOptions, checked_set
 
 Array = NDArray[Any]
 Index = NDArray[np.intp]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .symbols import Record, flat, in_arrays
+from .symbols import TraceRecord, flat, in_arrays
 
 # A spline with more pieces than this would be a long expression.
 _MOST_PIECES = 200
@@ -25,7 +25,7 @@ def forms() -> list[tuple[Any, Callable[..., Any]]]:
 
 
 def _polynomials(
-    record: Record, spline: Any, x: Any, nu: int = 0, extrapolate: Any = None
+    record: TraceRecord, spline: Any, x: Any, nu: int = 0, extrapolate: Any = None
 ) -> Any:
     """A `scipy.interpolate.PPoly`: CubicSpline, PchipInterpolator and Akima1DInterpolator too."""
     outside = spline.extrapolate if extrapolate is None else extrapolate
@@ -49,7 +49,9 @@ def _polynomials(
     return _moved(found, np.ndim(in_arrays(x)), axis)
 
 
-def _b_spline(record: Record, spline: Any, x: Any, nu: int = 0, extrapolate: Any = None) -> Any:
+def _b_spline(
+    record: TraceRecord, spline: Any, x: Any, nu: int = 0, extrapolate: Any = None
+) -> Any:
     """A `scipy.interpolate.BSpline`."""
     from scipy.interpolate import PPoly
 
@@ -63,7 +65,7 @@ def _b_spline(record: Record, spline: Any, x: Any, nu: int = 0, extrapolate: Any
     return _polynomials(record, found, x, nu)
 
 
-def _table(record: Record, table: Any, x: Any) -> Any:
+def _table(record: TraceRecord, table: Any, x: Any) -> Any:
     """A `scipy.interpolate.interp1d`, of all kinds."""
     points, values = table.x, np.moveaxis(table.y, table.axis, 0)
     kind, rest = getattr(table, "_kind", ""), values.shape[1:]
@@ -92,14 +94,14 @@ def _table(record: Record, table: Any, x: Any) -> Any:
     return _moved(found, count, table.axis)
 
 
-def _points(record: Record, x: Any, more: int) -> Any:
+def _points(record: TraceRecord, x: Any, more: int) -> Any:
     """Where to evaluate, with more axes behind."""
     array = flat(np.array(in_arrays(x), np.object_))
     return record.array(array.reshape(array.shape + (1,) * more))
 
 
 def _piecewise(
-    record: Record, at: Any, limits: Sequence[float], values: Sequence[Any], beyond: Any
+    record: TraceRecord, at: Any, limits: Sequence[float], values: Sequence[Any], beyond: Any
 ) -> Any:
     """The first of these values, and beyond each of the limits the next one."""
     if len(values) > _MOST_PIECES:
@@ -111,7 +113,7 @@ def _piecewise(
 
 
 def _filled(
-    record: Record, at: Any, found: Any, below: tuple[Any, Any], above: tuple[Any, Any]
+    record: TraceRecord, at: Any, found: Any, below: tuple[Any, Any], above: tuple[Any, Any]
 ) -> Any:
     """Other values below and above an interval."""
     found = record.choice(np.less(at, below[0]), below[1], found)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from . import splines
-from .symbols import Record, Symbol, SymbolArray, holds_symbols
+from .symbols import Symbol, SymbolArray, TraceRecord, holds_symbols
 
 # NumPy's functions that make arrays of numbers: during a trace, arrays that take symbols.
 _MAKERS = (
@@ -49,7 +49,7 @@ _traces: dict[object, bool] = {}
 _originals: dict[bool, dict[tuple[Any, str], Any]] = {False: {}, True: {}}
 
 
-class MakingRecord(Record):
+class MakingRecord(TraceRecord):
     """A record of a trace whose symbols may be written into new arrays."""
 
     @abstractmethod

@@ -53,7 +53,7 @@ def place(frame: Any) -> str:
     return found
 
 
-class Record(ABC):
+class TraceRecord(ABC):
     """What happened during one trace, which all of its symbols share."""
 
     #: A function that does more with single symbols than this is not traced any further.
@@ -154,7 +154,7 @@ class Symbol:
 
     __slots__ = ("logical", "record", "value")
 
-    def __init__(self, record: Record, value: Any, logical: bool = False) -> None:
+    def __init__(self, record: TraceRecord, value: Any, logical: bool = False) -> None:
         self.record, self.value, self.logical = record, value, logical
 
     __add__, __radd__ = _binary(np.add), _binary(np.add, True)
@@ -286,7 +286,7 @@ _BY_SYMBOLS = (
 class SymbolArray(np.ndarray[Any, Any]):
     """An array of symbols and numbers, which NumPy's functions take and return."""
 
-    record: Record
+    record: TraceRecord
 
     def __array_finalize__(self, source: Any) -> None:
         if hasattr(source, "record"):
@@ -394,7 +394,7 @@ def as_nan(value: Any) -> Any:
     return value
 
 
-def wrapped(record: Record, value: Any) -> Any:
+def wrapped(record: TraceRecord, value: Any) -> Any:
     """The same with arrays of this trace in place of arrays of objects."""
     if isinstance(value, (tuple, list)):
         return type(value)(wrapped(record, item) for item in value)
@@ -413,21 +413,21 @@ def flat(values: Any) -> Any:
 
 
 def _apply(
-    record: Record, ufunc: Any, method: str, inputs: tuple[Any, ...], options: dict[str, Any]
+    record: TraceRecord, ufunc: Any, method: str, inputs: tuple[Any, ...], options: dict[str, Any]
 ) -> Any:
     if record.closed:
         return getattr(ufunc, method)(*as_nan(inputs), **as_nan(options))
     return record.apply(ufunc, method, inputs, options)
 
 
-def _call(record: Record, function: Any, args: Any, kwargs: Any) -> Any:
+def _call(record: TraceRecord, function: Any, args: Any, kwargs: Any) -> Any:
     if record.closed:
         return function(*as_nan(args), **as_nan(kwargs))
     return record.call(function, args, kwargs)
 
 
 def run(
-    record: Record, function: Callable[..., Any], arguments: Sequence[SymbolArray]
+    record: TraceRecord, function: Callable[..., Any], arguments: Sequence[SymbolArray]
 ) -> tuple[Any, BaseException | None]:
     """What the function returns for symbols, or what it raises.
 

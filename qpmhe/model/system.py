@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypedDict, Unpack
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,41 +13,28 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import shown
 
-from .._checks import SINGULAR, dimension, numbers, positive, vector
-from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
+from .._checks import dimension
+from ..errors import InvalidInputError, ModelError
 from .constraints import Constraint, ConstraintFunctions, checked_constraints
 from .derivatives import Jacobian
-from .discretize import discretize
-from .functions import BatchedFunction, Trusted, check_inputs
-from .model import Expression, Functions, Model, Origin, check_at
-from .points import FEW, Points, points
+from .functions import BatchedFunction, Trusted
+from .model import Model, ModelCache, Origin, check_at
+from .ode import made_from_ode
+from .points import FEW, USUAL, Points, points
 from .residuals import Residual, Turns, checked_residual
-from .sets import ConvexSet, SoftSet, equilibrated
+from .sets import ConvexSet, SoftSet
+from .system_arguments import (
+    SystemOptions,
+    check_soft_angles,
+    checked_matrix,
+    checked_scales,
+    checked_set,
+    tried_functions,
+)
 from .traces import ModelTrace
-
-if TYPE_CHECKING:
-    from .augmentation import Augmentation
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
-
-
-class SystemOptions(TypedDict, total=False):
-    """The options of `System` that every function that makes a system hands on to it."""
-
-    states: ConvexSet | SoftSet | None
-    disturbances: ConvexSet | SoftSet | None
-    noises: ConvexSet | SoftSet | None
-    scales: ArrayLike | None
-    output_residual: Residual | Function | None
-    state_residual: Residual | Function | None
-    disturbance_matrix: ArrayLike | None
-    constraints: Sequence[Constraint] | None
-
-
-def timed_options(options: SystemOptions) -> SystemOptions:
-    """The options of a timed system: its constraints are those of the usual one."""
-    return {**options, "constraints": None}
 
 
 @report_unknown_options
@@ -187,7 +173,7 @@ class System:
         n, p = dimension("n", given["n"], 1), dimension("p", given["p"], 1)
         m = dimension("m", get("m", 0), 0)
         own.update(n=n, p=p, m=m, origin=origin)
-        own["disturbance_matrix"] = _checked_matrix(get("disturbance_matrix"), n)
+        own["disturbance_matrix"] = checked_matrix(get("disturbance_matrix"), n)
         for name, size in (("states", n), ("disturbances", self.r), ("noises", p)):
             own[name] = checked_set(name, get(name), size)
         own["soft"] = {
@@ -200,8 +186,8 @@ class System:
         if self.states is not None and self.state_residual is not None:
             turns = Turns(self.state_residual, self.states)
             own["states"], own["turns"] = turns.states, turns or None
-        self._check_soft_angles()
-        functions = self._functions(given)
+        check_soft_angles(self.soft.get("states"), self.state_residual, n)
+        functions = tried_functions(self, given)
         own["constraints"] = None
         listed = checked_constraints(get("constraints"))
         if listed:
@@ -209,7 +195,7 @@ class System:
                 listed, {"x": n, "u": m, "w": self.r, "v": p},
                 {"x": self.states, "w": self.disturbances, "v": self.noises},
             )
-        scales = None if get("scales") is None else _checked_scales(given["scales"], n)
+        scales = None if get("scales") is None else checked_scales(given["scales"], n)
         if scales is not None:
             functions.take_scales(scales, self.probes(scales))
         own["has_scales"] = scales is not None
@@ -221,25 +207,7 @@ class System:
                 origin.dt if known else None, origin.method if known else None, origin.sources,
             )
         own["evaluation"] = Model(self, functions, functions, scales)
-        own["_models"] = _Models()
-
-    def _functions(self, given: Mapping[str, Any]) -> Functions:
-        """The functions as they were given, tried at some points."""
-        m, origin, probes = self.m, self.origin, points(FEW, self.n, self.m, self.states)
-        f = BatchedFunction("f", given["f"], (self.n,), m, probes)
-        h = BatchedFunction("h", given["h"], (self.p,), m, probes)
-        first = ("f", f) if origin.rate is None else ("rate", origin.rate)
-        check_inputs(m, **{first[0]: first[1].takes_input, "h": h.takes_input})
-        a, c = (
-            Jacobian(
-                function, given.get(f"{function.name}_jacobian"), m, probes, self.states, residual,
-                origin.jacobians, origin.remedy.format(name=function.name),
-            )
-            for function, residual in ((f, self.state_residual), (h, self.output_residual))
-        )
-        if origin.kernel is not None:
-            return Expression(f, h, a, c, origin.kernel)
-        return Functions(f, h, a, c, origin.rate_jacobian)
+        own["_models"] = ModelCache()
 
     if TYPE_CHECKING:
         n: int
@@ -266,7 +234,7 @@ class System:
         tracing: ModelTrace | None
         #: What evaluates f and h: as they are written, or as an estimator does.
         evaluation: Model
-        _models: _Models
+        _models: ModelCache
 
     def __setattr__(self, name: str, value: Any) -> NoReturn:
         raise AttributeError(
@@ -286,7 +254,7 @@ class System:
 
     def with_origin(self, **changes: Any) -> System:
         """The same system, made of something else: see `Origin`."""
-        other = self._changed(origin=replace(self.origin, **changes), _models=_Models())
+        other = self._changed(origin=replace(self.origin, **changes), _models=ModelCache())
         other.__dict__["evaluation"] = replace(self.evaluation, system=other)
         return other
 
@@ -308,7 +276,7 @@ class System:
             If a given Jacobian is not the derivative at points of these magnitudes.
         """
         given = self.has_scales or scales is None
-        known = None if given or scales is None else _checked_scales(scales, self.n)
+        known = None if given or scales is None else checked_scales(scales, self.n)
         return self._models.of(self.evaluation.system.evaluation, known)
 
     def evaluated_by(self, model: Model) -> System:
@@ -344,22 +312,31 @@ class System:
         constraints = self.constraints
         return self.evaluation.is_traced or (constraints is not None and constraints.is_traced)
 
-    def fault(self, x: Array, u: Array) -> str:
-        """Which function differs from its trace at a state (n,) and input (m,), and how.
+    @property
+    def traced_functions(self) -> tuple[Callable[..., Any], ...]:
+        """The user's functions in whose places traces are evaluated."""
+        constraints = () if self.constraints is None else self.constraints.traced_functions
+        return *self.evaluation.traced_functions, *constraints
+
+    def fault(self, where: Points) -> str:
+        """Which function differs from its trace at these states and inputs, and how.
 
         Blank if none does.
 
         Parameters
         ----------
-        x : (n,) array
-            The state.
-        u : (m,) array
-            The input.
+        where : list of (x, u)
+            States (n,) and inputs (m,); what is not finite is left out.
         """
-        fault = self.evaluation.fault(x, u)
-        if not fault and self.constraints is not None and np.isfinite(u).all():
-            return self.constraints.fault(x, u)
+        fault = self.evaluation.fault(where)
+        if not fault and self.constraints is not None:
+            return self.constraints.fault([one for one in where if np.isfinite(one[1]).all()])
         return fault
+
+    def usual_points(self) -> Points:
+        """States and inputs of several magnitudes, in the units of `scales`, within X's bounds."""
+        units = 1.0 if self.scales is None else self.scales
+        return points(USUAL, self.n, self.m, self.states, units)
 
     def as_written(self) -> System:
         """The same system, whose functions are called as they are written."""
@@ -497,50 +474,10 @@ class System:
         ModelError, SetError
             As for `System`.
         """
-        n, m = dimension("n", n, 1), dimension("m", m, 0)
-        states = checked_set("states", options.get("states"), n)
-        probes = points(FEW, n, m, states)
-        batched = BatchedFunction("rate", rate, (n,), m, probes)
-        given = compared = None
-        if rate_jacobian is not None:
-            compared = Jacobian(batched, rate_jacobian, m, probes, states)
-            given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
-        step, step_jacobian = discretize(
-            _over_leading(batched), given and _over_leading(given), method
+        return made_from_ode(
+            cls, rate, h, dt=dt, n=n, p=p, m=m, method=method, rate_jacobian=rate_jacobian,
+            h_jacobian=h_jacobian, options=options,
         )
-        length = positive("dt", dt)
-
-        def timed(system: System) -> System:
-            return cls.made(
-                Trusted(_timed_by_input(step, m)), Trusted(_without_last(system.h.batch, m)),
-                Origin(is_timed=True), n=n, p=p, m=m + 1,
-                f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
-                h_jacobian=h_jacobian and Trusted(
-                    _without_last(system.evaluation.functions.h_jacobian.batch, m)
-                ),
-                **timed_options(options),
-            )
-
-        def augmented(change: Augmentation, others: SystemOptions) -> System:
-            return cls.from_ode(
-                change.over_leading(batched, 0.0), change.over_leading(system.h),
-                dt=dt, method=method, n=change.n, p=p, m=change.m, **others,
-            )
-
-        system = cls.made(
-            Trusted(partial(step, length)), h,
-            Origin(
-                dt=length, method=method, rate=batched, rate_jacobian=compared,
-                make_timed=timed, make_augmented=augmented,
-                recipe=(cls.from_ode, {
-                    "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
-                    "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **options,
-                }),
-            ),
-            n=n, p=p, m=m, f_jacobian=step_jacobian and Trusted(partial(step_jacobian, length)),
-            h_jacobian=h_jacobian, **options,
-        )
-        return system
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Made again from the user's functions: the closures inside cannot be pickled.
@@ -633,20 +570,6 @@ class System:
             changed["soft"] = others
         return self._changed(**changed)
 
-    def _check_soft_angles(self) -> None:
-        soft, residual = self.soft.get("states"), self.state_residual
-        if soft is None or residual is None:
-            return
-        angles = np.zeros(self.n, np.bool_)
-        angles[residual.components] = True
-        bounded = np.isin(soft.convex.bounded_components, residual.components)
-        if bounded.any() or soft.convex.touched(angles).any():
-            raise SetError(
-                f"the soft set of states, {soft.convex!r}, bounds an angle (components "
-                f"{residual.components.tolist()}), which is known only up to whole turns; leave it "
-                "out, or write a qpmhe.Constraint of its sine and cosine."
-            )
-
     @property
     def extensions(self) -> tuple[str, ...]:
         """Its soft sets and nonlinear constraints, in words."""
@@ -682,49 +605,8 @@ _METHODS = {
     "jax": "exact, by JAX",
     "finite differences": "by finite differences",
 }
-# Models of other magnitudes than these are made again.
-_MOST_KEPT = 8
-
-
-class _Models:
-    """The models of a system that were made last, by the states' magnitudes."""
-
-    def __init__(self) -> None:
-        self._lock, self._kept = threading.RLock(), dict[bytes, Model]()
-
-    def of(self, written: Model, scales: Array | None) -> Model:
-        """The model for these magnitudes; made again where its functions have changed."""
-        key = b"" if scales is None else scales.tobytes()
-        with self._lock:
-            found = self._kept.pop(key, None)
-            if found is None or not found.holds():
-                found = written.scaled(scales)
-            self._kept[key] = found
-            if len(self._kept) > _MOST_KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            return found
-
-
 def _made(maker: Function, arguments: dict[str, Any]) -> Any:
     return maker(**arguments)
-
-
-def checked_set(
-    name: str, value: ConvexSet | SoftSet | None, dimension: int, meaning: str = ""
-) -> ConvexSet | None:
-    """The set if it is a hard one, else None, after a check of its type and dimension.
-
-    The dimension may have a meaning.
-    """
-    if value is None:
-        return None
-    if not isinstance(value, (ConvexSet, SoftSet)):
-        raise SetError(
-            f"{name} is {shown(value)}; expected a qpmhe.Box, a qpmhe.Polytope or None."
-        )
-    if value.dimension != dimension:
-        raise SetError(f"{name} has dimension {value.dimension}; expected {dimension}{meaning}.")
-    return value if isinstance(value, ConvexSet) else None
 
 
 def checked_system(value: Any) -> System:
@@ -732,63 +614,3 @@ def checked_system(value: Any) -> System:
     if not isinstance(value, System):
         raise ModelError(f"system is {shown(value)}; expected a qpmhe.System.")
     return value
-
-
-def _checked_matrix(given: ArrayLike | None, n: int) -> Array | None:
-    """G, if it has full column rank; None for the identity."""
-    if given is None:
-        return None
-    matrix = numbers("disturbance_matrix", given)
-    if matrix.ndim != 2 or matrix.shape[0] != n or not 1 <= matrix.shape[1] <= n:
-        raise ShapeError(
-            f"disturbance_matrix has shape {matrix.shape}; expected (n, r) = ({n}, r) with r from "
-            f"1 to {n}: one column for each disturbance. Leave it out if every state has its own "
-            "disturbance."
-        )
-    # In numbers of order one, so that no unit makes a column look small.
-    rows, columns = equilibrated(matrix)
-    values = np.linalg.svd(rows[:, None] * matrix * columns, compute_uv=False)
-    if values[-1] <= SINGULAR * values[0]:
-        raise ModelError(
-            f"disturbance_matrix is {matrix.tolist()}, whose columns are linearly dependent; "
-            f"expected rank {matrix.shape[1]}. Merge the disturbances that act alike."
-        )
-    return None if np.array_equal(matrix, np.eye(n)) else matrix
-
-
-def _checked_scales(given: ArrayLike, n: int) -> Array:
-    scales = vector("scales", given, n)
-    if not (scales > 0.0).all():
-        raise OptionError(
-            f"scales is {scales.tolist()}; expected a number > 0 for each state, its "
-            "typical magnitude in its unit. Leave scales out if they are unknown."
-        )
-    return scales
-
-
-def _over_leading(function: BatchedFunction) -> Function:
-    """A function of (..., n), however the user wrote it."""
-    simple = function.shape[0] > 1 and function.takes_input == function.has_inputs
-
-    def evaluate(x: Array, *inputs: Array) -> Any:
-        if simple and x.ndim == 1 and function.reads_only:
-            value = function.function(x, *inputs)
-            return value if type(value) is np.ndarray else np.asarray(value)
-        u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))
-        return function.batch(x, u) if x.ndim > 1 else np.asarray(function(x, u))
-
-    return evaluate
-
-
-def _timed_by_input(step: Function, m: int) -> Function:
-    def evaluate(x: Array, u: Array) -> Any:
-        return step(u[..., m:], x, u[..., :m]) if m else step(u, x)
-
-    return evaluate
-
-
-def _without_last(function: Function, m: int) -> Function:
-    def evaluate(x: Array, u: Array) -> Any:
-        return function(x, u[..., :m]) if x.ndim > 1 else function(x[None], u[None, :m])[0]
-
-    return evaluate

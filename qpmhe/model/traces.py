@@ -216,13 +216,23 @@ class ModelTrace:
             compared += 1
         return compared > 0
 
-    def wrong(self, pinned: Pinned, x: Array, u: Array) -> tuple[str, str] | None:
-        """Which function differs from its trace at a point, and how; None if none does."""
+    @property
+    def functions(self) -> tuple[Callable[[Array, Array], Any], ...]:
+        """What was traced, as the user wrote it."""
+        return tuple(self._functions.values())
+
+    def forget(self) -> None:
+        """Trace the functions again when a trace is needed next: they have changed."""
+        with self._lock:
+            self._now = None
+
+    def wrong(self, pinned: Pinned, where: Points) -> tuple[str, str] | None:
+        """Which function differs from its trace at these points, and how; None if none does."""
         for name, one in pinned.found.items():
             if one.function is None:
                 continue
             try:
-                text = self._difference(name, one, [(x, u)])
+                text = self._difference(name, one, where)
             except Exception as error:  # whatever a user's function returns now
                 text = f"it raises {type(error).__name__}"
             if text:
@@ -261,13 +271,3 @@ def of_both(function: BatchedFunction) -> Callable[[Array, Array], Any]:
     """The user's function as one of x and u."""
     called = function.function
     return called if function.takes_input else lambda x, u: called(x)  # noqa: ARG005
-
-
-def next_check(time: int, horizon: int) -> int:
-    """The time of the next comparison after this one.
-
-    At each sample of the first window, then at powers of two, then at each thousandth.
-    """
-    if time < horizon:
-        return time + 1
-    return min(1 << time.bit_length(), (time // 1000 + 1) * 1000)

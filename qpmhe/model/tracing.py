@@ -29,7 +29,7 @@ from .symbols import (
     _MACHINERY,
     INSTEAD,
     NotTraceableError,
-    Record,
+    TraceRecord,
     place,
     plain,
     run,
@@ -63,15 +63,22 @@ class Traced(NamedTuple):
     points: Sequence[Sequence[Array]] | None = None
     made_of: Any = None
 
-    def fault(self, k: int) -> str:
+    @property
+    def user_function(self) -> Callable[..., Any] | None:
+        """What was traced, or what this function was made of."""
+        one: Traced = self if self.made_of is None else self.made_of
+        return one.original
+
+    def fault(self, k: int | None) -> str:
         """Where the traced function now differs from its trace; blank if nowhere.
 
-        Compares at one of the points only, another one for each k.
+        Compares at one of the points, another one for each k, or at all without k.
         """
         one: Traced = self if self.made_of is None else self.made_of
         if one.function is None or one.original is None or not one.points:
             return ""
-        return difference(one, one.original, [one.points[k % len(one.points)]])
+        points = one.points if k is None else [one.points[k % len(one.points)]]
+        return difference(one, one.original, points)
 
 
 def traced(
@@ -169,7 +176,7 @@ _STANDARD = str(Path(dis.__file__).parent)
 
 
 @contextlib.contextmanager
-def _watch(record: Record) -> Iterator[None]:
+def _watch(record: TraceRecord) -> Iterator[None]:
     """Refuse, meanwhile, exceptions in the user's code, and looks at types and identities."""
 
     def within(_: Any, event: str, argument: Any) -> Any:

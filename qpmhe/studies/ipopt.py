@@ -19,6 +19,7 @@ from ..model.expressions import import_casadi
 from ..model.residuals import Angles, Residual
 from ..model.system import System
 from ..observers import Observer
+from ..terms.sum import further_terms
 
 
 class IpoptEstimator:
@@ -53,6 +54,11 @@ class IpoptEstimator:
             raise InvalidInputError(
                 f"the comparison with Ipopt does not have {' and '.join(system.extensions)}; leave "
                 "them out."
+            )
+        further = further_terms(system, cost)
+        if further:
+            raise InvalidInputError(
+                f"the comparison with Ipopt has no term of J for {further}; leave it out."
             )
         self._system, self._cost, self._f, self._h = system, cost, f, h
         self._prior = cost.prior

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from qpmhe_solvers.qp import band_of
 
 from .._linalg import cholesky, inverse, solve
+from ..costs import Cost
+from ..model.system import System
 from .base import FirstStateDerivative, FirstStateTerm, TermForm, Trial, WindowData, WindowView
 from .information import prior_units, window_information
 
@@ -45,6 +48,8 @@ class Hold:
         gamma.
     """
 
+    name: ClassVar[str] = "held parameters"
+
     def __init__(
         self, held: Mapping[int, float], prior: Array, basis: Array, disturbance: Array,
         discount: float,
@@ -63,6 +68,17 @@ class Hold:
         spread = cholesky(inverse(basis.T @ disturbance @ basis)) if basis.size else basis.T @ basis
         spread = basis @ spread / self.deviations[:, None]
         self.spread: Array = spread @ spread.T
+
+    @staticmethod
+    def belongs(system: System, cost: Cost) -> bool:
+        """Whether the system holds parameters."""
+        del cost
+        return bool(system.held)
+
+    @classmethod
+    def of(cls, system: System, cost: Cost, prior: Array, basis: Array) -> Hold:
+        """The hold of a system's parameters."""
+        return cls(system.held, prior, basis, cost.disturbance, cost.discount)
 
     @property
     def c_form(self) -> TermForm:

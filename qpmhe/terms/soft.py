@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from copy import copy
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,8 @@ class Penalties:
     do not count at the newest state.
     """
 
+    name: ClassVar[str] = "soft sets or soft constraints"
+
     def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
         self.parts: list[_Part] = []
         self.size, self._n, self._discounted = 0, system.n, cost.discount < 1.0
@@ -89,8 +91,19 @@ class Penalties:
         self.parts.append(_Part(rows, place, (linear, quadratic)))
         self.size = place.stop
 
-    def __bool__(self) -> bool:
-        return self.size > 0
+    @staticmethod
+    def belongs(system: System, cost: Cost) -> bool:
+        """Whether the system has soft sets or soft constraints."""
+        del cost
+        functions = system.constraints
+        return bool(system.soft) or (functions is not None and bool(functions.soft.any()))
+
+    @classmethod
+    def of(cls, system: System, cost: Cost, prior: Array, basis: Array) -> Penalties | None:
+        """The soft rows of a system; None where its soft sets have no sides."""
+        del basis
+        found = cls(system, cost, prior)
+        return found if found.size else None
 
     @property
     def c_form(self) -> None:

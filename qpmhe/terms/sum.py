@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,50 @@ Array = NDArray[np.float64]
 
 
 class TermRule(Protocol):
-    """A term of J for all windows of an estimator."""
+    """A term of J for all windows of an estimator, which not every estimator has."""
+
+    #: What it is of, in words, for those who do not have it.
+    name: ClassVar[str]
+
+    @staticmethod
+    def belongs(system: System, cost: Cost) -> bool:
+        """Whether an estimator of these has the term."""
+
+    @classmethod
+    def of(cls, system: System, cost: Cost, prior: Array, basis: Array) -> TermRule | None:
+        """The term, with the covariance of the first prior and the basis of `CostSum`.
+
+        None where it is always zero.
+        """
 
     @property
     def c_form(self) -> TermForm | None:
         """The term as the step in C computes it; None if it cannot."""
 
-    def of_window(self, window: WindowData, view: WindowView) -> Term:
-        """The term of a window."""
+    def of_window(self, window: WindowData, view: WindowView) -> Term | None:
+        """The term of a window; None where it is zero for all trajectories."""
+
+
+#: The terms that not every estimator has, in the order of the sum; a new one joins here.
+KINDS: list[type[TermRule]] = [Hold, Penalties]
+
+
+def further_terms(system: System, cost: Cost, known: Sequence[type[TermRule]] = ()) -> str:
+    """What J has beside its stages, its prior and the terms known to the caller, in words.
+
+    Who states something about J without its sum asks here, and refuses what it does not know.
+    Blank where J has nothing else.
+
+    Parameters
+    ----------
+    system, cost
+        Those of the estimator.
+    known : sequence of TermRule classes
+        Terms that the caller has, or refuses itself.
+    """
+    return " and ".join(
+        kind.name for kind in KINDS if kind not in known and kind.belongs(system, cost)
+    )
 
 
 class CostSum:
@@ -53,16 +89,15 @@ class CostSum:
 
     def __init__(self, system: System, cost: Cost, prior: PriorCost, basis: Array) -> None:
         self._stages, self._prior = StageCosts(cost), prior
-        self._hold: Hold | None = None
-        if system.held:
-            self._hold = Hold(
-                system.held, prior.covariance, basis, cost.disturbance, cost.discount
-            )
-        penalties = Penalties(system, cost, prior.covariance)
+        #: The terms that not every estimator has, in the order of the sum.
+        self._further: list[TermRule] = [
+            one for kind in KINDS if kind.belongs(system, cost)
+            if (one := kind.of(system, cost, prior.covariance, basis)) is not None
+        ]
         #: The soft sets and soft constraints; None without any.
-        self.penalties: Penalties | None = penalties if penalties else None
-        # What not every estimator has, in the order of the sum; a new term joins here.
-        self._others: list[TermRule] = [one for one in (self.penalties,) if one is not None]
+        self.penalties: Penalties | None = next(
+            (one for one in self._further if isinstance(one, Penalties)), None
+        )
 
     @property
     def c_forms(self) -> tuple[TermForm, ...]:
@@ -70,9 +105,8 @@ class CostSum:
 
         Raises an `OptionError` where it cannot compute one.
         """
-        rules: list[TermRule] = [*(() if self._hold is None else (self._hold,)), *self._others]
         forms = []
-        for one in rules:
+        for one in self._further:
             form = one.c_form
             if form is None:
                 raise OptionError(
@@ -91,12 +125,12 @@ class CostSum:
         stages = Stages(self._stages, window, view, weights)
         prior, hold = self._prior.of_window(window, view), None
         terms: tuple[Term, ...] = (stages, prior)
-        if self._hold is not None:
-            hold = self._hold.of_window(window, view)
-            if hold is not None:
-                terms = (*terms, hold)
-        for one in self._others:
-            terms = (*terms, one.of_window(window, view))
+        for one in self._further:
+            term = one.of_window(window, view)
+            if term is not None:
+                terms = (*terms, term)
+                if isinstance(term, WindowHold):
+                    hold = term
         return prior, hold, terms
 
 

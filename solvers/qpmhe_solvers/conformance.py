@@ -16,14 +16,20 @@ from .registry import backend, create
 from .sample_qps import Bounds, Sides, contradiction, sample
 from .solution import Solution, SolveStatus
 from .solver import Solver
+from .traps import CLAIMED, PATIENCE, SAME, TRAPS, printed_lines, tight
 
 # Caps at which backends are tried.
 _CAPS = (1, 2, 5)
-# A cap for QPs without solution: some backends take all the time there is to give up.
-_PATIENCE = 200
-# What counts as another iterate, and error in d that counts as the same solution.
-_OTHER, _SAME = 1e-9, 1e-4
-_CLAIMED = (SolveStatus.SOLVED, SolveStatus.INACCURATE)
+# What counts as another iterate.
+_OTHER = 1e-9
+# What is often behind a capability that is declared, and not there.
+_HINTS = {
+    "iteration_cap": "the cap is ignored, check the name of the solver's option: some solvers "
+    "ignore a misspelt one",
+    "warm_start": "the start is ignored",
+    "time_limit": "the limit is ignored, check the name of the solver's option",
+    "iterate_at_cap": "return the solver's iterate where it does not claim success, too",
+}
 _all_kinds = partial(sample, 7, 3, 2, bounds="part", sides="mixed")
 
 
@@ -83,7 +89,9 @@ class Conformance:
         for one in fields(Capabilities):
             says, does = getattr(self.declared, one.name), getattr(self.measured, one.name)
             if says != does:
-                lines.append(f"  {one.name} is declared {says}, but measured {does}")
+                told = says and self.measured.inequalities and one.name in _HINTS
+                hint = f": {_HINTS[one.name]}" if told else ""
+                lines.append(f"  {one.name} is declared {says}, but measured {does}{hint}")
         lines += [f"  {one.check}: {one.detail}" for one in self.findings if not one.passed]
         return "\n".join(lines)
 
@@ -91,17 +99,24 @@ class Conformance:
 def check(name: str) -> Conformance:
     """Run all checks on the backend registered as ``name``, built in or your own.
 
+    Besides wrong answers and capabilities, it looks for traps that a wrong answer does not name,
+    such as multipliers of the other sign, a tolerance that does not arrive, or threads left behind.
+    Lines that the solver prints once a process are seen if the process has not used it before.
+
     Raises
     ------
     BackendError
         If there is no such backend, or its package is not installed.
     """
+    # First what a solver may print once a process.
+    outcomes = {"printed lines": "; ".join(printed_lines(name))}
     measured = measure(name)
-    findings = []
     for title, look in _CHECKS.items():
         if measured.inequalities or title in _WITHOUT_INEQUALITIES:
-            detail = "; ".join(look(name, measured))
-            findings.append(CheckOutcome(title, not detail, detail))
+            outcomes[title] = "; ".join(look(name, measured))
+    for title, trap in TRAPS.items():
+        outcomes[title] = "; ".join(trap(name, measured.inequalities))
+    findings = [CheckOutcome(title, not detail, detail) for title, detail in outcomes.items()]
     return Conformance(
         name, Capabilities.declared(backend(name)), measured, tuple(findings)
     )
@@ -116,11 +131,11 @@ def measure(name: str) -> Capabilities:
         If there is no such backend, or its package is not installed.
     """
     qp = _all_kinds()
-    if create(name, _tight()).solve(qp).status not in _CLAIMED:
+    if create(name, tight()).solve(qp).status not in CLAIMED:
         return Capabilities(*[False] * len(fields(Capabilities)))
-    capped = [create(name, _tight(cap)).solve(qp) for cap in _CAPS]
-    cap = capped[0].status not in _CLAIMED
-    infeasible = create(name, SolverOptions(max_iterations=_PATIENCE)).solve(contradiction())
+    capped = [create(name, tight(cap)).solve(qp) for cap in _CAPS]
+    cap = capped[0].status not in CLAIMED
+    infeasible = create(name, SolverOptions(max_iterations=PATIENCE)).solve(contradiction())
     return Capabilities(
         inequalities=True,
         iteration_cap=cap,
@@ -132,15 +147,11 @@ def measure(name: str) -> Capabilities:
     )
 
 
-def _tight(cap: int | None = None) -> SolverOptions:
-    return SolverOptions(cap, absolute_tolerance=1e-9)
-
-
 def _uses_a_start(name: str, qp: QP) -> bool:
     """Whether any number of iterations ends elsewhere, started at the solution."""
-    best = create(name, _tight()).solve(qp).d
+    best = create(name, tight()).solve(qp).d
     return any(
-        _differ(create(name, _tight(cap)).solve(qp, best), create(name, _tight(cap)).solve(qp))
+        _differ(create(name, tight(cap)).solve(qp, best), create(name, tight(cap)).solve(qp))
         for cap in _CAPS
     )
 
@@ -148,7 +159,7 @@ def _uses_a_start(name: str, qp: QP) -> bool:
 def _minds_the_time(name: str) -> bool:
     qp = sample(40, 3, 2, bounds="part", sides="mixed")
     hurried = create(name, SolverOptions(absolute_tolerance=1e-9, time_limit=1e-9)).solve(qp)
-    return hurried.status not in _CLAIMED
+    return hurried.status not in CLAIMED
 
 
 def _keeps_duals(name: str) -> bool:
@@ -156,7 +167,7 @@ def _keeps_duals(name: str) -> bool:
     # From a QP where little binds, by steps that change little each.
     path = [_all_kinds(around=0.0, push=push) for push in np.linspace(0.1, 5.0, 50)]
     for cap in _CAPS:
-        fresh, again, shifted = (create(name, _tight(cap)) for _ in range(3))
+        fresh, again, shifted = (create(name, tight(cap)) for _ in range(3))
         for qp in path[:-1]:
             again.solve(qp)
             shifted.solve(qp)
@@ -198,15 +209,15 @@ def _as_fresh(
     name: str, qps: list[QP], what: str, *, shift: bool = False, back: bool = False
 ) -> Iterator[str]:
     """Where one solver's answers to QPs in turn are not those of solvers made anew."""
-    kept = create(name, _tight())
-    fresh = [create(name, _tight()).solve(qp).d for qp in qps]
+    kept = create(name, tight())
+    fresh = [create(name, tight()).solve(qp).d for qp in qps]
     for k in [*range(len(qps)), *reversed(range(len(qps) if back else 0))]:
         if shift:
             kept.shift()
         found, faults = _judged(kept, qps[k], f"{what} {k}")
         yield from faults
         anew = fresh[k]
-        if anew is None or found is None or np.abs(anew - found).max() > _SAME:
+        if anew is None or found is None or np.abs(anew - found).max() > SAME:
             yield f"{what} {k}: differs from the solution of a new solver"
 
 
@@ -214,7 +225,7 @@ def _each(qps: Callable[[Bounds, Sides], dict[str, QP]]) -> _Check:
     """A check of QPs, each by a fresh solver; of the kinds of limits that a backend can take."""
     def look(name: str, can: Capabilities) -> Iterator[str]:
         for what, qp in qps(*_kinds(can)).items():
-            yield from _wrong(create(name, _tight()), qp, what)
+            yield from _wrong(create(name, tight()), qp, what)
 
     return look
 
@@ -226,10 +237,10 @@ def _kinds(can: Capabilities) -> tuple[Bounds, Sides]:
 def _no_inequality(name: str, _: Capabilities) -> Iterator[str]:
     for stages, n, rows in ((6, 2, 0), (1, 1, 0), (4, 3, 2)):
         qp, what = sample(stages, n, rows), f"{stages} stages of {n}, {rows} rows"
-        d, faults = _judged(create(name, _tight()), qp, what)
+        d, faults = _judged(create(name, tight()), qp, what)
         yield from faults
         exact = np.linalg.solve(qp.dense(), -qp.gradient.ravel())
-        if d is None or np.abs(d.ravel() - exact).max() > _SAME * (1.0 + np.abs(exact).max()):
+        if d is None or np.abs(d.ravel() - exact).max() > SAME * (1.0 + np.abs(exact).max()):
             yield f"{what}: not the minimiser"
 
 
@@ -271,16 +282,16 @@ def _scaled(bounds: Bounds, sides: Sides) -> dict[str, QP]:
 def _caps(name: str, can: Capabilities) -> Iterator[str]:
     qp = _all_kinds()
     for cap in _CAPS:
-        solution = create(name, _tight(cap)).solve(qp)
+        solution = create(name, tight(cap)).solve(qp)
         if can.iteration_cap and (solution.iterations or 0) > cap:
             yield f"it reports {solution.iterations} iterations at the cap {cap}"
         if solution.d is None and can.iterate_at_cap:
             yield f"no iterate at the cap {cap}: {solution.message}"
-    yield from _wrong(create(name, _tight(5000)), qp, "at a cap of 5000")
+    yield from _wrong(create(name, tight(5000)), qp, "at a cap of 5000")
 
 
 def _infeasible(name: str, _: Capabilities) -> Iterator[str]:
-    solver = create(name, SolverOptions(max_iterations=_PATIENCE, absolute_tolerance=1e-9))
+    solver = create(name, SolverOptions(max_iterations=PATIENCE, absolute_tolerance=1e-9))
     crossed = sample(6, 2, 2, bounds="all", sides="two")
     crossed.lower[2, 0] = crossed.upper[2, 0] + 1.0
     for what, qp in {"contradicting rows": contradiction(), "crossed bounds": crossed}.items():
@@ -291,7 +302,7 @@ def _infeasible(name: str, _: Capabilities) -> Iterator[str]:
 
 
 def _not_finite(name: str, _: Capabilities) -> Iterator[str]:
-    solver, qp = create(name, _tight()), sample(6, 2)
+    solver, qp = create(name, tight()), sample(6, 2)
     yield from _wrong(solver, qp, "before it")
     qp.gradient[3, 1] = math.nan
     if solver.solve(qp).d is not None:
@@ -339,7 +350,7 @@ def _shifted(name: str, _: Capabilities) -> Iterator[str]:
         qp.row_lower[-1], qp.row_upper[-1] = -np.inf, np.inf
         qps.append(qp)
     yield from _as_fresh(name, qps, "window", shift=True)
-    solver = create(name, _tight())
+    solver = create(name, tight())
     for qp, what in zip(qps, ("before the first solve", "beyond its end"), strict=False):
         for _moved in range(9):
             solver.shift()

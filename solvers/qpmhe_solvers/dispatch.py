@@ -60,8 +60,11 @@ class DispatchSolver(NativeSolver):
             handle, self.name, initvals=initial, verbose=False, **self._keywords
         )
         iterations, message = _report(answer.extras)
+        # osqp then leaves 2143289344 everywhere, the bits of a NaN read as an integer.
+        nothing = self.name == "osqp" and "infeasible" in message
         return NativeAnswer(
-            answer.x, _multipliers(layout, answer), bool(answer.found), True, iterations, message
+            None if nothing else answer.x, _multipliers(layout, answer), bool(answer.found), True,
+            iterations, message,
         )
 
 

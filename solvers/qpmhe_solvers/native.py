@@ -360,8 +360,10 @@ class OsqpSolver(NativeSolver):
         status = result.info.status
         # Anything else comes without an iterate, or with a certificate in its place.
         stopped = status.startswith(("solved", "maximum", "run time"))
+        # Without a solution x is 2143289344 everywhere, the bits of a NaN read as an integer.
+        x, y = (None, None) if "infeasible" in status else (result.x, result.y)
         return NativeAnswer(
-            result.x, layout.duals(result.y, None, None), status == "solved", stopped,
+            x, None if y is None else layout.duals(y, None, None), status == "solved", stopped,
             int(result.info.iter), status,
         )
 

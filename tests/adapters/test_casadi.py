@@ -211,3 +211,18 @@ def test_an_expression_is_compared_with_the_function_on_numbers():
         qpmhe.from_casadi(lambda x: x, other_for_symbols, n=1, compiled=False)
     for fine in (lambda x: ca.sqrt(x - 5.0), lambda x: ca.if_else(x > 0.5, x, -x), ca.log):
         qpmhe.from_casadi(fine, lambda x: x, n=1, compiled=False)
+
+
+def test_a_model_that_overflows_is_compared_without_a_warning():
+    """Warnings are errors here; other components are compared as ever."""
+    def model(x):
+        return ca.vertcat(ca.exp(1e3 * x[0]), 0.5 * x[1])
+
+    system = from_casadi(model, lambda x: x[1], n=2, p=1)
+    assert system.f(np.array([0.0, 4.0])).tolist() == [1.0, 2.0]
+
+    def another(x):
+        return ca.vertcat(ca.exp(1e3 * x[0]), (0.5 if isinstance(x, ca.DM) else 0.6) * x[1])
+
+    with pytest.raises(ModelError, match="one formula for both"):
+        from_casadi(another, lambda x: x[1], n=2, p=1)

@@ -167,3 +167,40 @@ def test_labels_and_options_of_a_block():
             qpmhe.to_iosystem(mhe, **options)
     with pytest.raises(InvalidInputError, match="mhe is a System"):
         qpmhe.to_iosystem(mhe.system)
+
+
+@pytest.mark.slow
+def test_a_block_outputs_the_prediction_as_python_controls_own_does():
+    """Neither sees y(t); `filtered` does, one sample earlier."""
+    optimal = pytest.importorskip("control.optimal")
+    Q, R = np.diag([1e-3, 1e-2]), np.array([[0.1]])
+    plant = control.ss(F, np.eye(2), OUTPUT, 0, True)
+    problem = optimal.OptimalEstimationProblem(
+        plant, np.arange(5), optimal.gaussian_likelihood_cost(plant, Q, R),
+        terminal_cost=lambda x, prior: (x - prior) @ (x - prior), disturbance_indices=[0, 1],
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        from_control(control.ss(F, np.zeros((2, 1)), OUTPUT, 0, True)),
+        qpmhe.ExtendedKalman(prior=np.eye(2), disturbance=Q, noise=R),
+        qpmhe.QuadraticCost.from_covariances(disturbance=Q, noise=R), horizon=5,
+        initial_state=[0.0, 0.0],
+    )
+    times, at = np.arange(12), 8
+    y = 1.0 + 0.1 * np.sin(times)
+    records = y, y + 0.5 * (times == at)
+    ours, zero = qpmhe.to_iosystem(mhe), np.zeros(12)
+    for block, signals in (
+        (problem.create_mhe_iosystem(), list), (ours, lambda y: np.array([y, zero]))
+    ):
+        one, other = (
+            control.input_output_response(block, times, signals(each)).outputs for each in records
+        )
+        np.testing.assert_array_equal(one[:, : at + 1], other[:, : at + 1])
+        assert np.abs(one - other)[0, at + 1] > 0.1
+    runs = []
+    for each in records:
+        mhe.reset([0.0, 0.0])
+        runs.append(mhe.run(each[:, None], zero[:, None]))
+    np.testing.assert_array_equal(runs[1].states[:12].T, other)
+    changed = np.abs(runs[1].filtered - runs[0].filtered)[:, 0]
+    assert changed[at - 1] == 0.0 < 0.1 < changed[at]

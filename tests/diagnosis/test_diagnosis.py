@@ -11,7 +11,8 @@ import qpmhe
 from qpmhe.cli.app import app
 from qpmhe.diagnosis import observability
 from qpmhe.diagnosis.bank import FilterBank, Hypothesis
-from qpmhe.diagnosis.faults import Fault, _disjoint
+from qpmhe.diagnosis.fault_kinds import Fault
+from qpmhe.diagnosis.faults import _disjoint
 from qpmhe.diagnosis.sensor_memory import MemoryBank
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 from qpmhe.estimation.observability import prior_shares

@@ -55,3 +55,29 @@ def test_few_disturbances_and_robust_costs_take_their_own_snapshots(robust, stil
         expected = one.update([0.5])
         assert_same(restored.update([0.5]), expected)
         assert_same(copied.update([0.5]), expected)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+def test_a_snapshot_has_nothing_of_the_memory_beside_it():
+    """C aligns the sides of sets: the bytes between them are zero, not what was there before."""
+    system = qpmhe.System(
+        lambda x: 0.9 * x, lambda x: x[..., :1], n=3, p=1,
+        **dict.fromkeys(("states", "disturbances"), qpmhe.Box(np.full(3, -9.0), np.full(3, 9.0))),
+    )
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(np.full((3, 1), 0.1)),
+        qpmhe.QuadraticCost(prior=np.eye(3), disturbance=np.eye(3), noise=[[1.0]]),
+        horizon=15, initial_state=np.zeros(3), engine="compiled",
+    )
+    for t in range(20):
+        mhe.update([1.0], bounds={"states": qpmhe.Box(np.full(3, -8.0), np.full(3, 8.0 + t))})
+    first = mhe.state_dict()
+    for byte in (0, 85, 170):
+        # Memory that NumPy takes next is full of that byte.
+        dirt = [
+            np.full(array.nbytes, byte, np.uint8)
+            for array in first.values() if isinstance(array, np.ndarray) for _ in range(5)
+        ]
+        del dirt
+        again = mhe.state_dict()
+        assert again["structure"] == first["structure"], byte  # with the digest of all bytes

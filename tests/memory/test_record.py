@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from qpmhe.errors import InvalidInputError
-from qpmhe.memory.fields import FIELDS, Sizes
-from qpmhe.memory.record import Record
+from qpmhe.memory.fields import FIELDS, MemorySizes
+from qpmhe.memory.record import MemoryRecord
 from qpmhe.memory.snapshot import read, written
 
 SIZES = {
-    "plain": Sizes.of(2, 1, 0, 3),
-    "all": Sizes.of(
+    "plain": MemorySizes.of(2, 1, 0, 3),
+    "all": MemorySizes.of(
         3, 2, 1, 5, sensors=2, held=1, memory=4, covariance=True, roots=True, majorised=True
     ),
 }
@@ -24,7 +24,7 @@ CHECKED = {"u", "is_irregular", "cost", "rejections", "history"}
 def record_of(sizes):
     n, q = sizes.dimensions["n"], sizes.dimensions["q"]
     covariance = np.eye(n) if "covariance" in sizes.features else None
-    return Record(sizes, np.arange(1.0, n + 1.0), covariance, 0.5, np.eye(q))
+    return MemoryRecord(sizes, np.arange(1.0, n + 1.0), covariance, 0.5, np.eye(q))
 
 
 def random_row(array, generator):
@@ -145,7 +145,7 @@ def test_what_another_estimator_lacks_is_named(missing):
 def test_the_structures_of_c_have_the_table_s_names_and_sizes():
     """As text and as NumPy's type, member by member."""
     n, p, m, horizon = 3, 2, 1, 5
-    sizes = Sizes.of(
+    sizes = MemorySizes.of(
         n, p, m, horizon, sensors=2, held=1, covariance=True, roots=True, rows=(6, 4), x_set=True
     )
     numbers = {

@@ -11,6 +11,7 @@ import pytest
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import EngineWarning, OptionError
+from qpmhe.model.captured import Due
 from qpmhe.model.tracing import traced
 from tests.estimation import spoil
 from tests.estimation.same import Interruption
@@ -268,8 +269,9 @@ def test_what_a_compiled_estimator_hands_over_is_all_it_knew(options):
         expected, expectation = one.update(y, **own), contextlib.nullcontext()
         if t == 20:
             # As if its trace had failed, without any difference.
-            vars(two._engine._system.evaluation)["fault"] = lambda x, u: "no difference"
-            two._engine._next_check = 0
+            vars(two._engine._system.evaluation)["fault"] = lambda where: "no difference"
+            two._engine._times.due = lambda time: Due.HERE
+            two._engine._times.next = 0
             expectation = pytest.warns(EngineWarning, match="no difference")
         with expectation:
             found = two.update(y, **own)

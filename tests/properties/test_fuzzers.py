@@ -5,6 +5,7 @@ A few hundred steps of each fuzzer by default, ``--fuzz-steps 100000`` for as ma
 """
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from qpmhe.estimation.problem import Problem
 from qpmhe.observers.projection import NearestPoint
 from tests.properties import fuzz_general, fuzz_promise, problems
 
+from .campaign import engines
+from .campaign.run import Run, run
 from .fuzz_independent import fuzz, table
 from .independent import Held
 from .problems import WRITINGS
@@ -158,3 +161,72 @@ def test_a_mistake_is_noticed(monkeypatch, name):
     monkeypatch.setattr(*make())
     _, failures = fuzz(800, 2, source="numpy", writing="batched", until=words)
     assert any(words in failure for failure in failures)
+
+
+COMPILED = [pytest.mark.slow, pytest.mark.skipif(
+    find_compiler() is None, reason="there is no C compiler"
+)]
+
+
+@pytest.mark.parametrize(("engine", "seed"), [
+    *(("python", seed) for seed in range(8)),
+    *(pytest.param("compiled", seed, marks=COMPILED) for seed in range(3)),
+])
+def test_estimators_of_the_campaign_have_no_faults(engine, seed):
+    counts, faults, words = run(seed, engine, samples=40 if engine == "python" else 120)
+    assert faults == [], words
+    assert counts["steps"] >= 40
+
+
+def handing_out(window, estimate):
+    estimate.candidate = window.z[window.start : window.end + 1]
+
+
+# A mistake, and the words of the campaign's judge.
+LIES = {
+    "candidate's cost": lambda mhe, estimate: setattr(estimate, "candidate_cost", (
+        estimate.candidate_cost * (1.0 + 1e-7)
+    )),
+    "cost differs": flattering,
+    "negative cost": lambda mhe, estimate: setattr(estimate, "cost", -1.0),
+    "a twin": lambda mhe, estimate: handing_out(mhe._engine._window, estimate),
+    "not the candidate": lambda mhe, estimate: setattr(
+        estimate, "trajectory", estimate.trajectory * (1.0 + 1e-12)
+    ),
+}
+
+
+@pytest.mark.parametrize("words", LIES)
+def test_the_campaign_notices_a_mistake(monkeypatch, words):
+    monkeypatch.setattr(*wrong_update(LIES[words]))
+    found = []
+    for seed in range(40):
+        try:
+            one = Run(seed, samples=40)
+        except qpmhe.QpmheError:
+            continue
+        if words == "a twin" and one.twin is None:
+            continue
+        found += one.go().faults
+        if any(words in kind for kind, _ in found):
+            break
+    assert any(words in kind for kind, _ in found), found
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+def test_the_campaign_notices_engines_that_differ(monkeypatch):
+    compare, kinds = engines.Beside.compare, set()
+
+    def wrong(self, estimate, y, inputs, given):
+        told = SimpleNamespace(**{name: getattr(estimate, name) for name in (
+            "candidate", "candidate_cost", "status", "solver_iterations", "dropped",
+        )})
+        told.trajectory = estimate.trajectory + 1e-3 * self.case.x_units
+        told.cost = 1.001 * estimate.cost
+        return compare(self, told, y, inputs, given)
+
+    monkeypatch.setattr(engines.Beside, "compare", wrong)
+    for seed in range(3, 7):
+        kinds |= {kind for kind, _ in Run(seed, "compiled", samples=40).go().faults}
+    assert any("engines: estimate" in kind and "open" in kind for kind in kinds), kinds

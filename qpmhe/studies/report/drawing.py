@@ -91,7 +91,7 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Mark:
+class PlotMark:
     """A series in the style of its backend.
 
     Kinds: "points", "line" (with markers), "level" (a horizontal line), "steps", "curve" (a plain
@@ -121,7 +121,7 @@ class Panel:
 
     x: Axis
     y: Axis
-    marks: list[Mark]
+    marks: list[PlotMark]
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Drawing:
 
     def choose(self, **meta: Any) -> Drawing:
         """The marks that have these values, or none of these keys."""
-        def fits(mark: Mark) -> bool:
+        def fits(mark: PlotMark) -> bool:
             return all(mark.meta.get(key, value) == value for key, value in meta.items())
 
         panels = [Panel(one.x, one.y, [*filter(fits, one.marks)]) for one in self.panels]
@@ -203,7 +203,7 @@ def draw(
     return picture
 
 
-def _draw(picture: Picture, axes: Any, mark: Mark, panel: Panel, style: Style) -> None:
+def _draw(picture: Picture, axes: Any, mark: PlotMark, panel: Panel, style: Style) -> None:
     color, dash = style.color, style.line
     x = _positions(panel.x, mark.x) if mark.kind != "box" else mark.x
     y = _positions(panel.y, mark.y)

@@ -11,7 +11,7 @@ from ..._checks import Array
 from ..row import CONFIGURATION
 from ..summary import PROBLEM, RANKED_BY, measure
 from .answers import NEAR
-from .drawing import Axis, Drawing, Mark, Panel, Style, styles
+from .drawing import Axis, Drawing, Panel, PlotMark, Style, styles
 from .words import (
     cap_words,
     configuration_words,
@@ -41,12 +41,12 @@ def accuracy(summary: DataFrame) -> Drawing | None:
     if rows.empty:
         return None
     best = rows[rows["pareto"]].sort_values("time_median")
-    marks = [Mark(
+    marks = [PlotMark(
         "front", best["time_median"].tolist(), best[by].tolist(),
         words=[configuration_words(row) for _, row in best.iterrows()],
     )]
     for backend, mine in rows.groupby("backend", sort=False):
-        marks.append(Mark(
+        marks.append(PlotMark(
             "points", mine["time_median"].tolist(), mine[by].tolist(), str(backend),
             [_told(row, by) for _, row in mine.iterrows()], _bars(mine, by),
             sizes=[_SIZES.get(qps_words(one), _LARGEST) for one in mine["qps"]],
@@ -79,11 +79,11 @@ def anytime(summary: DataFrame, start: str) -> Drawing | None:
     metrics = [(name, label) for name, label in metrics if rest[name].notna().any()]
     for metric, label in metrics:
         marks = [
-            Mark("level", order, [float(row[metric])] * len(order), "observer")
+            PlotMark("level", order, [float(row[metric])] * len(order), "observer")
             for _, row in observer.iterrows() if not missing(row[metric])
         ]
         for (backend, qps), rows in rest.groupby(["backend", "qps"], dropna=False, sort=False):
-            marks.append(Mark(
+            marks.append(PlotMark(
                 "line", [cap_words(one) for one in rows["solver_iterations"]],
                 rows[metric].astype(float).tolist(), str(backend), bars=_bars(rows, metric),
                 meta={"qps": qps_words(qps)},
@@ -153,7 +153,8 @@ def _sweep(rows: DataFrame, name: str, lines: str | None) -> tuple[Drawing, dict
         looks.append(look)
         mine = mine.sort_values(name, na_position="last")
         x = [qps_words(one) for one in mine[name]] if name == "qps" else mine[name].tolist()
-        marks.append(Mark("line", x, mine[by].astype(float).tolist(), look, bars=_bars(mine, by)))
+        y = mine[by].astype(float).tolist()
+        marks.append(PlotMark("line", x, y, look, bars=_bars(mine, by)))
     axis = Axis(words, "values", sorted(set(rows[name].dropna().astype(float))))
     if name == "qps":
         axis = Axis(words, "category", ranked(map(qps_words, rows["qps"])))
@@ -171,7 +172,7 @@ def times(found: list[Spread], deadline: float | None) -> Drawing | None:
     marks = []
     for one in found:
         low, first, median, third, high, most = map(seconds, one.quantiles)
-        marks.append(Mark(
+        marks.append(PlotMark(
             "box", one.quantiles, [one.backend], one.backend,
             [f"{one.backend}, {one.steps} steps\n1 % {low}, 25 % {first}, median {median}\n"
              f"75 % {third}, 99 % {high}, longest {most}"],
@@ -195,7 +196,7 @@ def performance(found: list[Profile]) -> Drawing | None:
     marks = []
     for one in found:
         x, y = one.steps(last)
-        marks.append(Mark(
+        marks.append(PlotMark(
             "steps", x.tolist(), y.tolist(), one.backend, label=one.words,
         ))
     return Drawing([Panel(

@@ -1,0 +1,173 @@
+"""Additive faults: how one moves outputs and states, and its size, which the innovations show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from .bank import Array, FilterBank, Filtered, Hypothesis
+from .fault_kinds import LEAST_GAIN, MOST_PARTS, Fault, with_factor
+
+# Shares of the size that innovations show of a gain.
+_AROUND = (0.5, 1.0, 1.5, 2.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """How a fault of size one moves the outputs (T, p) and the states (T, n) of its sample."""
+
+    kind: str
+    subject: tuple[int, ...]
+    outputs: Array
+    states: Array
+    span: tuple[int, int] | None = None
+
+
+def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Signature]:
+    total, p = base.measurements.shape
+    none_x = np.zeros((total, bank.system.n))
+    inputs = bank.full_inputs(base.inputs, base.step)
+    # At each sample from those before it alone: else noise would look like a fault.
+    expected, moves = bank.moves(null.states, inputs)
+    if base.inputs.shape[1]:
+        yield Signature("shift", (), -moves, none_x)
+    if 1 < p <= MOST_PARTS:
+        for j in range(p):
+            yield Signature("shift", (j,), -moves * (np.arange(p) == j), none_x)
+    for j in range(p) if p <= MOST_PARTS else ():
+        yield Signature("gain", (j,), expected * (np.arange(p) == j), none_x)
+    reached = bank.following(null.corrected, inputs)
+    for j in range(base.inputs.shape[1]):
+        without = inputs.copy()
+        without[:, j] = 0.0
+        yield Signature(
+            "input", (j,), expected - bank.expected(null.states, without),
+            reached - bank.following(null.corrected, without),
+        )
+    blocks = max(1, min(32 if p <= MOST_PARTS else 8, total // 4))
+    edges = np.linspace(0, total, blocks + 1).astype(int).tolist()
+    for j in range(p):
+        for first, end in pairwise(edges):
+            yield _bias(bank, total, j, first, end - 1)
+
+
+def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> Signature:
+    outputs = np.zeros((total, bank.system.p))
+    outputs[first : last + 1, sensor] = 1.0
+    return Signature(
+        "bias", (sensor,), outputs, np.zeros((total, bank.system.n)), (first, last)
+    )
+
+
+def additive_faults(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fault]:
+    """Additive faults, of the size that the innovations of the filter without them show.
+
+    An additive fault moves the innovations by a signature that is linear in its size; they are
+    white beside it, so that its size is a weighted mean.
+
+    References
+    ----------
+    Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation
+    of jumps in linear systems, IEEE Transactions on Automatic Control 21 (1976).
+    """
+    if not np.isfinite(null.logs).all():
+        return
+    signatures = [
+        one for one in _signatures(bank, base, null)
+        if np.isfinite(one.outputs).all() and np.isfinite(one.states).all()
+    ]
+    if not signatures:
+        return
+    against, own = moments(signatures, null)
+    best: dict[tuple[str, tuple[int, ...]], tuple[float, float, Signature]] = {}
+    for one, size, gain in _candidates(bank, signatures, against, own):
+        key = one.kind, one.subject
+        if gain > 0.5 * LEAST_GAIN and gain > best.get(key, (0.0,))[0]:
+            best[key] = gain, size, one
+    for _, size, one in best.values():
+        # A filter that follows the fault shows less of a gain, or more.
+        for share in _AROUND if one.kind == "gain" else (1.0,):
+            yield removed(base, one, share * size)
+
+
+def _candidates(
+    bank: FilterBank, signatures: list[Signature], against: Array, own: Array
+) -> Iterator[tuple[Signature, float, float]]:
+    """Signatures with size and gain: those given, and of biases the best row of stretches."""
+    for k, one in enumerate(signatures):
+        if one.kind != "bias" and own[k, k] > 0.0:
+            yield one, against[k] / own[k, k], 0.5 * against[k] ** 2 / own[k, k]
+    for j in range(bank.system.p):
+        at = [k for k, one in enumerate(signatures) if (one.kind, one.subject) == ("bias", (j,))]
+        if not at:
+            continue
+        # Signatures add up: sums over rows of stretches by prefix sums.
+        sums = np.append(0.0, np.cumsum(against[at]))
+        squares = np.zeros((len(at) + 1, len(at) + 1))
+        squares[1:, 1:] = np.cumsum(np.cumsum(own[np.ix_(at, at)], axis=0), axis=1)
+        diagonal = squares.diagonal()
+        top = sums[None, :] - sums[:, None]  # from stretch i up to k, without k
+        bottom = diagonal[None, :] + diagonal[:, None] - squares - squares.T
+        gains = np.where(np.triu(bottom, 1) > 0.0, 0.5 * top**2 / bottom, 0.0)
+        i, k = divmod(int(np.argmax(gains)), len(gains))
+        first, last = signatures[at[i]].span, signatures[at[k - 1]].span
+        if gains[i, k] > 0.0 and first is not None and last is not None:
+            one = _bias(bank, len(signatures[0].outputs), j, first[0], last[1])
+            yield one, float(top[i, k] / bottom[i, k]), float(gains[i, k])
+
+
+def moments(signatures: list[Signature], null: Filtered) -> tuple[Array, Array]:
+    """Products of the signatures in the innovations with these (K,), and with each other (K, K)."""
+    outputs = np.stack([one.outputs for one in signatures], axis=2)
+    states = np.stack([one.states for one in signatures], axis=2)
+    there = np.isfinite(null.innovations)
+    errors = np.where(there, null.innovations, 0.0)
+    moved = np.zeros(states.shape[1:])
+    against, own = np.zeros(len(signatures)), np.zeros((len(signatures), len(signatures)))
+    for t in range(len(outputs)):
+        shown = null.outputs[t] @ moved + outputs[t] * there[t][:, None]
+        weighted = null.weights[t] @ shown
+        against += errors[t] @ weighted
+        own += shown.T @ weighted
+        moved = null.transitions[t] @ (moved - null.gains[t] @ shown) + states[t]
+    return against, own
+
+
+def with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -> Fault:
+    """A bias with the first and last sample under which the record is most likely."""
+    total = len(base.measurements)
+    first, last = bias.span or (0, total - 1)
+    step = max(1, total // 64)
+    while True:
+        signatures = [
+            _bias(bank, total, bias.subject[0], begin, end)
+            for begin in sorted({max(first + d, 0) for d in (-step, 0, step)})
+            for end in sorted({min(last + d, total - 1) for d in (-step, 0, step)})
+            if end - begin >= 2
+        ]
+        against, own = moments(signatures, null)
+        sizes = against / own.diagonal()
+        k = int(np.argmax(sizes * against))
+        same = signatures[k].span == (first, last)
+        first, last = signatures[k].span or (first, last)
+        if same and step == 1:
+            break
+        step = max(1, step // 2) if same else step
+    refined = removed(base, signatures[k], float(sizes[k]))
+    values = bank.run([base, refined.hypothesis]).likelihoods
+    gain = float(values[1] - values[0])
+    return replace(refined, gain=gain) if gain > bias.gain else bias
+
+
+def removed(base: Hypothesis, one: Signature, size: float) -> Fault:
+    """The record without this fault."""
+    if one.kind == "input":
+        kind = "sign" if size < -1.0 else "input"
+        return with_factor(base, kind, one.subject, 1.0 + size)
+    if one.kind == "gain":
+        return with_factor(base, "gain", one.subject, float(np.exp(size)))
+    y = base.measurements - size * one.outputs
+    return Fault(one.kind, size, replace(base, measurements=y), one.subject, one.span)

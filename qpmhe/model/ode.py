@@ -1,0 +1,105 @@
+"""A system that is the discretisation of an ODE with a fixed step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._checks import dimension, positive
+from .derivatives import Jacobian
+from .discretize import discretize
+from .functions import BatchedFunction, Trusted
+from .model import Origin
+from .points import FEW, points
+from .system_arguments import SystemOptions, checked_set, timed_options
+
+if TYPE_CHECKING:
+    from .augmentation import Augmentation
+    from .system import System
+
+Array = NDArray[np.float64]
+Function = Callable[..., Any]
+
+
+def made_from_ode(
+    cls: type[System], rate: Function | Trusted, h: Function | Trusted, *, dt: float, n: int,
+    p: int, m: int, method: str, rate_jacobian: Function | Trusted | None,
+    h_jacobian: Function | Trusted | None, options: SystemOptions,
+) -> System:
+    """The system that `System.from_ode` describes."""
+    n, m = dimension("n", n, 1), dimension("m", m, 0)
+    states = checked_set("states", options.get("states"), n)
+    probes = points(FEW, n, m, states)
+    batched = BatchedFunction("rate", rate, (n,), m, probes)
+    given = compared = None
+    if rate_jacobian is not None:
+        compared = Jacobian(batched, rate_jacobian, m, probes, states)
+        given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
+    step, step_jacobian = discretize(
+        _over_leading(batched), given and _over_leading(given), method
+    )
+    length = positive("dt", dt)
+
+    def timed(system: System) -> System:
+        return cls.made(
+            Trusted(_timed_by_input(step, m)), Trusted(_without_last(system.h.batch, m)),
+            Origin(is_timed=True), n=n, p=p, m=m + 1,
+            f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
+            h_jacobian=h_jacobian and Trusted(
+                _without_last(system.evaluation.functions.h_jacobian.batch, m)
+            ),
+            **timed_options(options),
+        )
+
+    def augmented(change: Augmentation, others: SystemOptions) -> System:
+        return cls.from_ode(
+            change.over_leading(batched, 0.0), change.over_leading(system.h),
+            dt=dt, method=method, n=change.n, p=p, m=change.m, **others,
+        )
+
+    system = cls.made(
+        Trusted(partial(step, length)), h,
+        Origin(
+            dt=length, method=method, rate=batched, rate_jacobian=compared,
+            make_timed=timed, make_augmented=augmented,
+            recipe=(cls.from_ode, {
+                "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
+                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **options,
+            }),
+        ),
+        n=n, p=p, m=m, f_jacobian=step_jacobian and Trusted(partial(step_jacobian, length)),
+        h_jacobian=h_jacobian, **options,
+    )
+    return system
+
+
+def _over_leading(function: BatchedFunction) -> Function:
+    """A function of (..., n), however the user wrote it."""
+    simple = function.shape[0] > 1 and function.takes_input == function.has_inputs
+
+    def evaluate(x: Array, *inputs: Array) -> Any:
+        if simple and x.ndim == 1 and function.reads_only:
+            value = function.function(x, *inputs)
+            return value if type(value) is np.ndarray else np.asarray(value)
+        u = inputs[0] if inputs else np.empty((*x.shape[:-1], 0))
+        return function.batch(x, u) if x.ndim > 1 else np.asarray(function(x, u))
+
+    return evaluate
+
+
+def _timed_by_input(step: Function, m: int) -> Function:
+    def evaluate(x: Array, u: Array) -> Any:
+        return step(u[..., m:], x, u[..., :m]) if m else step(u, x)
+
+    return evaluate
+
+
+def _without_last(function: Function, m: int) -> Function:
+    def evaluate(x: Array, u: Array) -> Any:
+        return function(x, u[..., :m]) if x.ndim > 1 else function(x[None], u[None, :m])[0]
+
+    return evaluate

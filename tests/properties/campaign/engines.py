@@ -1,0 +1,218 @@
+"""The Python step beside the step in C: each step of both begins at the same memory.
+
+A difference is explained, in this order: by rounding, where an engine differs as much from itself
+when its memory and its data change in their last digits; by the tolerance of the Python step's QPs,
+where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
+where it differs as much from itself when the QPs change in their last digits; by a direction in
+which J is nearly flat, where the step in C loses digits to the weights of active rows; by a cap or
+by a QP that a method has not solved. What is left is a fault.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from qpmhe import QpmheError, Status
+from qpmhe.codegen.exchange import hand_over
+from qpmhe_solvers import RawSolution, Solver, SolveStatus, create
+from qpmhe_solvers.options import SolverOptions
+
+from .judge import EPS, nudged
+
+CLOSE = 1e-6  # of two estimates in units, and of their J as a share
+FLAT = 1e8  # condition of a Hessian from which on J is nearly flat in a direction
+STOPPED = Status.SOLVER_STOPPED
+# Fields of the memory in C that are no data.
+_KEPT = ("metric", "damping", "u")
+_MEASURED = 4  # differences of a kind that are explained, of each estimator
+_TRIES = 6
+_TIGHT = (
+    {"solver_tolerance": 1e-12}, {"backend": "daqp", "solver_tolerance": 1e-12},
+    {"backend": "quadprog"}, {"backend": "piqp", "solver_tolerance": 1e-12},
+)
+
+
+class Difference(NamedTuple):
+    """How two estimates of the same window differ, and why."""
+
+    kind: str  # candidate, status or estimate
+    rows: str  # "active" or "quiet"
+    reason: str
+    better: str  # the engine with the lower J, "neither"
+    detail: Any
+
+    def __str__(self):
+        return f"{self.kind} ({self.rows}): {self.reason}, {self.better} better"
+
+
+class Nudging(Solver):
+    """Solves QPs whose numbers it has changed in their last digits."""
+
+    def __init__(self):
+        super().__init__(SolverOptions())
+        self.condition = 1.0  # the largest one of their Hessians in units of its diagonal
+        self.r, self.inner = np.random.default_rng(4), create(
+            "auto", SolverOptions(absolute_tolerance=1e-12)
+        )
+
+    def _solve(self, qp, start):
+        other = qp.copy()
+        for part in (other.band, other.gradient):
+            part[...] = nudged(self.r, part)
+        found = self.inner.solve(other)
+        lower = np.tril(qp.dense())
+        roots = np.sqrt(np.diag(lower))
+        values = np.linalg.eigvalsh(lower / np.outer(roots, roots))
+        self.condition = max(self.condition, values[-1] / max(values[0], EPS))
+        solved = found.status is SolveStatus.SOLVED
+        return RawSolution(found.d, solved, found.iterations, found.bound_duals, found.row_duals)
+
+
+def _nudge(r, record):
+    """Change the numbers of a record of the step in C in their last digits."""
+    for name in record.dtype.names:
+        part = record[name]
+        if part.dtype.names is not None:
+            _nudge(r, part)
+        elif part.dtype == np.float64 and name not in _KEPT:
+            part[...] = nudged(r, part)
+
+
+class Beside:
+    """A Python estimator that repeats each step of a compiled one."""
+
+    def __init__(self, case, compiled):
+        self.case, self.compiled = case, compiled
+        self.python, self.exact, self.explained = case.estimator("python"), None, Counter()
+        self.nudging = self.memory = self.far = None
+
+    def begin(self, compiled):
+        """The next step of both begins here."""
+        self.compiled = compiled
+        self.memory = compiled._engine._memory.copy()
+        self._hand_over(self.python)
+
+    def _hand_over(self, python):
+        engine = self.compiled._engine
+        library = engine._library
+        hand_over(
+            engine._memory[0], library.layout, library.directions, engine.usual, python._engine,
+            False,
+        )
+
+    def compare(self, estimate, y, inputs, given):
+        """The Python step's estimate, and a `Difference` or None."""
+        other = self.python.update(y, *inputs, **given)
+        x, J = self._apart(other, estimate)
+        units = self.case.x_units
+        size = units * (1.0 + np.abs(other.candidate / units).max())
+        candidate = np.abs((other.candidate - estimate.candidate) / size).max()
+        same = (other.status & ~STOPPED) == (estimate.status & ~STOPPED)
+        if candidate > 1e-9:
+            kind = "candidate"
+        elif x > CLOSE and J > CLOSE:
+            kind = "estimate"
+        elif not same:
+            kind = "status"
+        else:
+            return other, None
+        quiet = not (estimate.solver_iterations or other.solver_iterations
+                     or estimate.dropped or other.dropped)
+        rows = "quiet" if quiet else "active"
+        better = "neither"
+        if J > 1e-9:
+            better = "compiled" if estimate.cost < other.cost else "python"
+        self.explained[kind, rows] += 1
+        reason = "not examined"
+        if self.explained[kind, rows] <= _MEASURED:
+            reason = self._reason(estimate, other, kind, x, J, (y, inputs, given))
+        detail = (
+            f"x {x:.1e}, J {J:.1e}, candidate {candidate:.1e}, by rounding {self.far}",
+            estimate.cost, other.cost, estimate.candidate_cost, str(estimate.status),
+            str(other.status),
+        )
+        return other, Difference(kind, rows, reason, better, detail)
+
+    def _apart(self, one, other):
+        units = self.case.x_units
+        size = units * (1.0 + np.abs(one.trajectory / units).max())
+        with np.errstate(all="ignore"):
+            x = float(np.abs((one.trajectory - other.trajectory) / size).max())
+        if one.cost == other.cost:  # also infinite ones
+            return x, 0.0
+        return x, abs(one.cost - other.cost) / (abs(one.cost) + 1e-300)
+
+    def _reason(self, estimate, other, kind, x, J, arguments):
+        engine = self.compiled._engine
+        after = engine._memory.copy()
+        try:
+            if self._is_rounding(estimate, other, kind, x, J, arguments):
+                return "rounding"
+            if self._is_tolerance(estimate, x, arguments):
+                return "tolerance of QPs"
+            if self._is_hessian(x, arguments):
+                return "rounding of the Hessian"
+            if self.nudging.settings.backend.condition > FLAT:
+                return "flat J"
+        finally:
+            engine._memory[...] = after
+        if "max_solver_iterations" in self.case.options:
+            return "cap"
+        return "unsolved QP" if STOPPED & (estimate.status | other.status) else "open"
+
+    def _is_rounding(self, estimate, other, kind, x, J, arguments):
+        y, inputs, given = arguments
+        r, engine = np.random.default_rng(3), self.compiled._engine
+        far, statuses, first = np.zeros(2), set(), {}
+        for k in range(_TRIES):
+            engine._memory[...] = self.memory
+            moved = y
+            if k:  # the first one repeats the step
+                _nudge(r, engine._memory)
+                moved = None if y is None else nudged(r, y)
+            self._hand_over(self.python)
+            for one in (self.compiled, self.python):
+                again = one.update(moved, *inputs, **given)
+                statuses.add(again.status & ~STOPPED)
+                far = np.maximum(far, self._apart(first.setdefault(one, again), again))
+        if kind == "status" and {estimate.status & ~STOPPED, other.status & ~STOPPED} <= statuses:
+            return True
+        self.far = far
+        return bool((np.array([x, J]) <= 10.0 * far + (0.0, 1e-9)).all())
+
+    def _is_hessian(self, x, arguments):
+        """Whether the Python step moves as far when its QPs change in their last digits."""
+        y, inputs, given = arguments
+        if self.nudging is None:
+            self.nudging = self.case.estimator(
+                "python", backend=Nudging(), max_solver_iterations=None
+            )
+        found, self.nudging.settings.backend.condition = [], 1.0
+        for _ in range(_TRIES):
+            self.compiled._engine._memory[...] = self.memory
+            self._hand_over(self.nudging)
+            found.append(self.nudging.update(y, *inputs, **given))
+        return x <= 10.0 * max(self._apart(found[0], one)[0] for one in found)
+
+    def _is_tolerance(self, estimate, x, arguments):
+        y, inputs, given = arguments
+        if self.exact is None:
+            self.exact = [
+                self.case.estimator("python", max_solver_iterations=None, **tight)
+                for tight in _TIGHT
+            ]
+        for python in self.exact:
+            self.compiled._engine._memory[...] = self.memory
+            self._hand_over(python)
+            try:
+                again = python.update(y, *inputs, **given)
+            except QpmheError:  # a backend that cannot solve such QPs
+                continue
+            away, J = self._apart(estimate, again)
+            same = (again.status & ~STOPPED) == (estimate.status & ~STOPPED)
+            if away <= max(1e-7, 0.02 * x) or (J <= 1e-9 and same):
+                return True
+        return False

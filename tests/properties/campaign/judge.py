@@ -1,0 +1,416 @@
+"""The judge of the campaign: J, roll-outs and constraints in plain NumPy, from the formulas.
+
+Where J differs from the estimator's by more than a first-order bound of rounding, the judge
+measures by how much J moves when the trajectory and the data change in their last digits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from qpmhe import Status
+
+EPS = np.finfo(float).eps
+LOST = Status.MODEL_FAILED | Status.FAILED_STAGE
+# What is missed by so much counts as satisfied, in standard deviations; documented: 5e-9.
+FEASIBLE = 1e-8
+# How many times the first-order bound, and how many times the measured rounding, J may differ.
+BOUND, MEASURED = 50.0, 10.0
+HUGE = 1e290  # beyond, squares that are added in another order may overflow
+
+
+@dataclass
+class Sample:
+    """What an estimator was given with one sample; y is NaN where there is none."""
+
+    u: np.ndarray
+    y: np.ndarray
+    disturbance: np.ndarray
+    noise: np.ndarray
+    sets: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def seen(self):
+        return np.isfinite(self.y)
+
+
+@dataclass
+class Judged:
+    """J of a trajectory, a bound of its rounding, and what it consists of."""
+
+    J: float
+    slack: float
+    w: np.ndarray
+    v: np.ndarray
+    ahead: np.ndarray  # f along the trajectory
+    d: np.ndarray  # x+ - f
+
+
+def nudged(r, array):
+    """Numbers changed in their last digits."""
+    array = np.asarray(array, float)
+    return array * (1.0 + EPS * r.integers(-1, 2, array.shape))
+
+
+def wrapped(difference, angles):
+    if angles is None:
+        return difference
+    difference, (indices, period) = difference.copy(), angles
+    part = difference[..., indices]
+    inside = (part >= -period / 2.0) & (part < period / 2.0)
+    turned = (part + period / 2.0) % period - period / 2.0
+    difference[..., indices] = np.where(inside, part, turned)
+    return difference
+
+
+def functions(case, x, u):
+    """f and h along rows."""
+    with np.errstate(all="ignore"):
+        ones = np.ones(len(x))
+        parts = [x[:, i] for i in range(case.n)], [u[:, i] for i in range(case.m)]
+        return tuple(
+            np.stack([np.asarray(one) * ones for one in rule(*parts, np)], axis=-1)
+            for rule in (case.f, case.h)
+        )
+
+
+def _loss(loss, s, weight, error):
+    """The loss of a residual, and by how much an error of it moves the loss."""
+    per_component = loss is not None and loss.per_component
+    if per_component:
+        weight = np.diag(weight)
+        q, dq = weight * s * s, weight * (2.0 * np.abs(s) * error + error * error)
+    else:
+        size, magnitude = np.abs(s), np.abs(weight)
+        q = np.maximum(s @ weight @ s, 0.0)
+        dq = (2.0 * size + error) @ magnitude @ error
+        dq += 4.0 * len(s) * EPS * (size @ magnitude @ size)
+    if loss is None:
+        return float(q), float(dq)
+    value = loss(q)
+    moved = np.abs(loss(q + dq) - value) + np.abs(value - loss(np.maximum(q - dq, 0.0)))
+    return float(np.sum(value)), float(np.sum(moved))
+
+
+def _seen_weight(weight, seen):
+    """The weight of the components that are there: the inverse of their covariance."""
+    if seen.all():
+        return weight
+    block, found = np.ix_(seen, seen), np.zeros_like(weight)
+    found[block] = np.linalg.inv(np.linalg.inv(weight)[block])
+    return found
+
+
+def judged(case, x, window, mean, with_prior=True):
+    with np.errstate(all="ignore"):
+        return _judged(case, x, window, mean, with_prior)
+
+
+def _judged(case, x, window, mean, with_prior):
+    count = len(window)
+    ahead, outputs = functions(case, x[:-1], np.array([one.u for one in window]))
+    y, seen = (np.array([getattr(one, name) for one in window]) for name in ("y", "seen"))
+    y = np.where(seen, y, 0.0)
+    d = wrapped(x[1:] - ahead, case.x_angles)
+    v = np.where(seen, wrapped(y - outputs, case.y_angles), 0.0)
+    largest = np.abs(x / case.x_units).max()
+    w, w_error = d, 2e-14 * (np.abs(x[1:]) + np.abs(ahead) + largest * case.x_units)
+    v_error = 2e-14 * (np.abs(y) + np.abs(outputs) + largest * case.y_units) * seen
+    if case.G is not None:
+        D = metric(case)
+        back = np.linalg.pinv(case.G / D[:, None])
+        w, w_error = (d / D) @ back.T, (w_error / D) @ np.abs(back).T
+    J = slack = 0.0
+    for i, sample in enumerate(window):
+        share = case.discount ** (count - 1 - i)
+        weight = _seen_weight(sample.noise, seen[i])
+        for name, s, of, error in (
+            ("w", w[i], sample.disturbance, w_error[i]), ("v", v[i], weight, v_error[i]),
+        ):
+            value, moved = _loss(case.losses[name], s, of, error)
+            J, slack = J + share * value, slack + share * moved
+    if with_prior:
+        error = 4.0 * EPS * (np.abs(x[0]) + np.abs(mean))
+        offset = wrapped(x[0] - mean, case.x_angles)
+        value, moved = _loss(case.losses["p"], offset, case.prior_weight, error)
+        J, slack = J + case.discount**count * value, slack + case.discount**count * moved
+    value, moved = _penalties(case, x, w, v, seen)
+    return Judged(J + value, slack + moved + 1e-10 * abs(J), w, np.where(seen, v, np.nan),
+                  ahead, d)
+
+
+def metric(case):
+    """The standard deviations in which the directions of G are found."""
+    return np.sqrt(np.maximum(np.diag(case.P), np.diag(case.G @ case.Q @ case.G.T)))
+
+
+def _penalties(case, x, w, v, seen):
+    """Of soft sets and of a soft constraint."""
+    total, slack, count = 0.0, 0.0, len(w)
+    shares = [case.discount ** max(count - 1 - i, 0) for i in range(count + 1)]
+    for name, (one, lines, squares) in case.soft.items():
+        for i, point in enumerate({"x": x, "w": w, "v": v}[name]):
+            if len(one.matrix):
+                value, size = one.matrix @ point, np.abs(one.matrix) @ np.abs(point)
+                missed = np.maximum(one.row_lower - value, value - one.row_upper)
+                if name == "v":
+                    missed[(one.matrix != 0.0) @ ~seen[i]] = 0.0
+            else:
+                missed, size = np.maximum(one.lower - point, point - one.upper), np.abs(point)
+                if name == "v":
+                    missed[~seen[i]] = 0.0
+            missed = np.maximum(missed, 0.0)
+            total += shares[i] * float(lines @ missed + squares @ missed**2)
+            slack += shares[i] * 1e-11 * float((lines + 2.0 * squares * missed) @ size)
+    if case.constraint and not case.constraint[2]:
+        for share, point in zip(shares, x, strict=True):
+            missed = max(0.0, float(case.constraint[0](point)))
+            total += share * (3.0 * missed + 2.0 * missed * missed)
+            slack += share * 1e-11 * (3.0 + 4.0 * missed) * (1.0 + missed)
+    return total, slack
+
+
+def rounding(case, x, window, mean, with_prior):
+    """By how much J moves when the trajectory and the data change in their last digits."""
+    r, found = np.random.default_rng(1), []
+    here = judged(case, x, window, mean, with_prior).J
+    for _ in range(8):
+        samples = [
+            Sample(nudged(r, one.u), nudged(r, one.y), one.disturbance, one.noise, one.sets)
+            for one in window
+        ]
+        moved = nudged(r, x) + EPS * r.integers(-1, 2, x.shape) * (
+            np.abs(x / case.x_units).max() * case.x_units
+        )
+        found.append(abs(judged(case, moved, samples, nudged(r, mean), with_prior).J - here))
+    return max(found)
+
+
+def rows(one, points, seen=None):
+    """By how much points miss each inequality, if none of its components is missing."""
+    sides = [one.lower - points, points - one.upper]
+    if seen is not None:
+        sides = [np.where(seen, side, -np.inf) for side in sides]
+    if len(one.matrix):
+        value = points @ one.matrix.T
+        general = [one.row_lower - value, value - one.row_upper]
+        if seen is not None:
+            unknown = (~seen).astype(int) @ (one.matrix.T != 0.0) > 0
+            general = [np.where(unknown, -np.inf, side) for side in general]
+        sides += general
+    return np.concatenate(sides, axis=-1)
+
+
+def _allowed(one, covariance, size):
+    """By how much each inequality may be missed: in deviations, and by rounding."""
+    parts = [(np.sqrt(np.diag(covariance)), size)] * 2
+    if len(one.matrix):
+        deviation = np.sqrt(np.einsum("ij,jk,ik->i", one.matrix, covariance, one.matrix))
+        parts += [(deviation, size @ np.abs(one.matrix).T)] * 2
+    return np.concatenate([FEASIBLE * a + 1e-13 * b for a, b in parts])
+
+
+class Judge:
+    """Faults of one estimate after the other."""
+
+    def __init__(self, case):
+        self.case, self.counts = case, {}
+        self.iQ, self.iR = case.iQ, case.iR  # as `set` leaves them
+
+    def faults(self, estimate, window, mean=None):
+        """(kind, detail) of each fault; the prior's mean is the candidate's first state if None."""
+        with np.errstate(all="ignore"):
+            return self._faults(estimate, window, mean)
+
+    def _faults(self, estimate, window, mean):
+        found: list[tuple[str, Any]] = []
+        case, x, candidate = self.case, estimate.trajectory, estimate.candidate
+        status, improved = estimate.status, Status.IMPROVED in estimate.status
+        if not estimate.cost <= estimate.candidate_cost:
+            found.append(("cost above the candidate's", (estimate.cost, estimate.candidate_cost)))
+        if estimate.cost < 0.0 or estimate.candidate_cost < 0.0:
+            found.append(("negative cost", (estimate.cost, estimate.candidate_cost)))
+        if not (np.isfinite(x).all() and np.isfinite(estimate.state).all()):
+            return [*found, ("an estimate that is not finite", status)]
+        if len(window) != len(x) - 1:
+            return [*found, ("length of the window", (len(window), len(x) - 1))]
+        if improved == (Status.CANDIDATE in status):
+            found.append(("improved and the candidate, or neither", status))
+        if not improved and not np.array_equal(x, candidate):
+            found.append(("not the candidate", status))
+        if case.G is not None and not improved:
+            return found  # its J is that of its roll-out
+        mean = candidate[0] if mean is None else mean
+        own = judged(case, x, window, mean, not case.from_observer)
+        of_candidate = judged(case, candidate, window, mean, not case.from_observer)
+        rolled = candidate
+        if case.G is not None:
+            rolled = self._rolled_out(candidate, window)
+            of_candidate = judged(case, rolled, window, mean, not case.from_observer)
+            found += self._beside(own, x)
+        for name, trajectory, ours, theirs in (
+            ("candidate's cost", rolled, of_candidate, estimate.candidate_cost),
+            ("cost", x, own, estimate.cost),
+        ):
+            found += self._compared(name, trajectory, ours, theirs, window, mean, status)
+        slack = BOUND * (own.slack + of_candidate.slack)
+        if (
+            math.isfinite(estimate.candidate_cost) and not case.from_observer
+            and case.G is None and of_candidate.J + slack < own.J
+        ):
+            found.append(("own J above the candidate's", (own.J, of_candidate.J)))
+        if improved:
+            found += self._of_sets(estimate, window, own, of_candidate)
+            found += self._of_noises(estimate, window, own)
+        if case.kind in ("luenberger", "injection", "zero"):
+            found += self._of_observer(estimate, window)
+        return found
+
+    def _compared(self, name, x, ours, theirs, window, mean, status):
+        case, with_prior = self.case, not self.case.from_observer
+        if not (math.isfinite(ours.J) and ours.J < HUGE):
+            if math.isfinite(theirs) and theirs < HUGE:
+                return [(f"{name} is finite, not for the judge", (ours.J, theirs))]
+            return []
+        if not math.isfinite(theirs):
+            if status & LOST:
+                self.count("J infinite after a failure of the model")
+                return []
+            return [(f"{name} is not finite, but for the judge", (ours.J, theirs, status))]
+        apart = abs(ours.J - theirs) if with_prior else ours.J - theirs
+        loose = 1e3 if case.G is not None else 1.0  # angles of the directions of G
+        bound = BOUND * loose * ours.slack + (1e-7 * abs(ours.J) if loose > 1.0 else 0.0)
+        if not apart > bound:
+            return []
+        if apart <= MEASURED * rounding(case, x, window, mean, with_prior):
+            self.count("J apart by measured rounding")
+            return []
+        return [(f"{name} differs", (ours.J, theirs, ours.slack, status))]
+
+    def _rolled_out(self, candidate, window):
+        """The candidate with the model's own states in directions without disturbances."""
+        D = metric(self.case)
+        scaled = self.case.G / D[:, None]
+        onto = D[:, None] * (scaled @ np.linalg.pinv(scaled)) / D
+        path = [candidate[0]]
+        for i, sample in enumerate(window):
+            ahead = functions(self.case, path[-1][None], sample.u[None])[0][0]
+            path.append(ahead + onto @ (candidate[i + 1] - ahead))
+        return np.array(path)
+
+    def _beside(self, own, x):
+        D = metric(self.case)
+        missed = np.abs(own.d - own.w @ self.case.G.T) / D
+        if np.nanmax(missed) > 1e-9 * (1.0 + np.abs(x / D).max()):
+            return [("a disturbance beside G", float(np.nanmax(missed)))]
+        return []
+
+    def _of_noises(self, estimate, window, own):
+        seen = np.array([one.seen for one in window])
+        if not np.array_equal(np.isnan(estimate.noises), ~seen):
+            return [("noises where nothing was measured", estimate.time)]
+        y = np.where(seen, [one.y for one in window], 0.0)
+        size = np.abs(own.v) + np.abs(y) + (
+            np.abs(estimate.trajectory / self.case.x_units).max() * self.case.y_units
+        )
+        if np.nanmax(np.abs(estimate.noises - own.v) / size, initial=0.0) > 1e-9:
+            return [("noises differ", estimate.time)]
+        return []
+
+    def _of_sets(self, estimate, window, own, of_candidate):
+        """Hard rows that only the estimate misses, or all of them if none is dropped."""
+        case, found, x = self.case, [], estimate.trajectory
+        dropped = Status.ROWS_DROPPED in estimate.status
+        largest = np.abs(x / case.x_units).max()
+        for name, points, before, covariance in (
+            ("x", x, estimate.candidate, case.P), ("w", own.w, of_candidate.w, None),
+            ("v", own.v, of_candidate.v, None),
+        ):
+            if case.sets[name] is None:
+                continue
+            if covariance is None:
+                covariance = np.linalg.inv(self.iQ if name == "w" else self.iR)
+            for i, point in enumerate(points):
+                sample = window[min(i, len(window) - 1)]
+                one, seen = sample.sets[name], sample.seen if name == "v" else None
+                missed = rows(one, point, seen)
+                if name == "x":
+                    size = np.abs(point)
+                elif name == "v":
+                    size = np.abs(np.where(sample.seen, sample.y, 0.0)) + largest * case.y_units
+                else:
+                    size = np.abs(x[i + 1]) + np.abs(own.ahead[i]) + largest * case.x_units
+                    if case.G is not None:
+                        back = np.linalg.pinv(case.G / metric(case)[:, None])
+                        size = 100.0 * np.abs(back) @ (size / metric(case))
+                allowed = _allowed(one, covariance, size)
+                if name == "w" and (missed > allowed).any():
+                    allowed += self._rounding_of_rows(one, x[i : i + 2], sample, missed)
+                self.count("rows", missed.size)
+                over = missed > allowed
+                # Where the model failed, the candidate's residuals are unknown to the estimator.
+                known = not estimate.status & LOST
+                broken = over & (rows(one, before[i], seen) <= 0.0) & known
+                if broken.any() or (over.any() and not dropped):
+                    j = int(np.argmax(broken if broken.any() else over))
+                    found.append((
+                        f"a row of {name} is missed" + " that the candidate keeps" * broken.any(),
+                        (i, j, missed[j], allowed[j], estimate.status),
+                    ))
+        return found + self._of_constraint(estimate, window, own, of_candidate)
+
+    def _rounding_of_rows(self, one, pair, sample, missed):
+        """By how much rows of w move when two states change in their last digits."""
+        case, r, found = self.case, np.random.default_rng(0), 0.0
+        for _ in range(8):
+            x = nudged(r, pair)
+            d = wrapped(x[1] - functions(case, x[:1], sample.u[None])[0][0], case.x_angles)
+            if case.G is not None:
+                d = np.linalg.pinv(case.G / metric(case)[:, None]) @ (d / metric(case))
+            moved = np.where(np.isfinite(missed), rows(one, d) - missed, 0.0)
+            found = np.maximum(found, np.abs(moved))
+        return MEASURED * found
+
+    def _of_constraint(self, estimate, window, own, of_candidate):
+        if not self.case.constraint or not self.case.constraint[2]:
+            return []
+        g, of_v, _ = self.case.constraint
+        for i in range(len(window) + (not of_v)):
+            if of_v and not window[i].seen[0]:
+                continue
+            now, before = (
+                float(g(x[i], own_v[i]) if of_v else g(x[i])) for x, own_v in (
+                    (estimate.trajectory, own.v), (estimate.candidate, of_candidate.v),
+                )
+            )
+            if now > 1e-6 * (1.0 + abs(before)) + FEASIBLE * self.case.row_scale and before <= 0.0:
+                return [("a constraint is missed that the candidate keeps", (i, now, before))]
+        return []
+
+    def _of_observer(self, estimate, window):
+        """The last step of an observer with a constant gain, if nothing projects it."""
+        case, sample, path = self.case, window[-1], estimate.candidate
+        if (
+            case.sets["x"] is not None or "x" in case.soft or "candidate" in case.options
+            or estimate.status & LOST or (case.kind == "injection" and not sample.seen.all())
+        ):
+            return []
+        y = np.where(sample.seen, sample.y, 0.0)
+        with np.errstate(all="ignore"):
+            ahead, outputs = functions(case, path[-2][None], sample.u[None])
+            v = np.where(sample.seen, wrapped(y - outputs[0], case.y_angles), 0.0)
+            following = ahead[0] + case.correction(v)
+            size = np.abs(following) + np.abs(ahead[0]) + np.abs(case.gain) @ np.abs(y) + (
+                np.abs(path / case.x_units).max() * case.x_units
+            )
+            apart = np.abs(wrapped(following - path[-1], case.x_angles)) / size
+        if np.isfinite(following).all() and apart.max() > 1e-11:
+            return [("the observer's step differs", (apart.max(), estimate.status))]
+        return []
+
+    def count(self, name, number=1):
+        self.counts[name] = self.counts.get(name, 0) + number
