@@ -236,7 +236,7 @@ class _Factors:
             block = rows[i]
             later[:, :-1].dot(along[i], out=block[own:])
             block[own:, -1] += later[:, -1]
-            made = triangle(block, np.maximum.reduce(np.abs(block), axis=0)[:-1])
+            made = triangle(block)
             turned[i], later = made[:r], made[r : r + n, r:]
         back = np.linalg.inv(turned[:, :, :r])
         self._added = basis @ back
@@ -285,9 +285,11 @@ class _Triangle:
         self._dgeqrf, self._work = dgeqrf, 32 * columns
         self._upper = np.triu(np.ones((columns - 1, columns)))
 
-    def __call__(self, rows: Array, units: Array) -> Array:
-        """The triangle (columns - 1, columns), for units (columns - 1,)."""
+    def __call__(self, rows: Array, units: Array | None = None) -> Array:
+        """The triangle (columns - 1, columns), for units (columns - 1,) or the largest entries."""
         sizes = np.abs(rows[:, :-1])
+        if units is None:
+            units = np.maximum.reduce(sizes, axis=0)
         sizes /= np.maximum(units, _LEAST)
         # Of equal ones those of the disturbances, whose columns come first.
         order = np.negative(np.maximum.reduce(sizes, axis=1)).argsort(kind="stable")

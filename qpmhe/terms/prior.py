@@ -34,6 +34,10 @@ NO_VARIANCE, KNOWN = 1e-30, 1e-16
 #: eps / (r d) in a variance behind the window, and the least eigenvalue l of an inverse one of l d.
 _LOST = float(np.finfo(np.float64).eps)
 
+#: A root whose r is below this is one of a singular covariance: it has only rounding in a
+#: direction, and J would have nothing else.
+_SINGULAR = 1e-26
+
 
 class InitialWeight(NamedTuple):
     """The prior's weight, and one to judge its distance by.
@@ -122,7 +126,7 @@ class PriorWeights:
         own = (root**2).sum(axis=0)
         pivot = (root.diagonal() ** 2 / own).min()
         if self._takes_rows or later is None:
-            return bool(self._takes_rows and pivot > 0.0)
+            return bool(self._takes_rows and pivot > _SINGULAR)
         behind = later.diagonal()
         shrunk = (own / np.where(behind > 0.0, behind, np.inf)).max()
         return bool(pivot * self._cost.least_correlation * shrunk * shrunk > _LOST)

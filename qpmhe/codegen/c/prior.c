@@ -112,7 +112,9 @@ static int mhe_root_is_better(const mhe_covariances *o, const real *root, const 
         if (!(share >= pivot)) pivot = share;
         if (behind > 0) shrunk = mhe_max(own / behind, shrunk);
     }
-    return MHE_ROLLED ? pivot > 0 : pivot * o->least * shrunk * shrunk > EPSILON;
+    /* A root of a singular covariance has only rounding in a direction. */
+    const real singular = sizeof(real) == 8 ? (real)1e-26 : (real)1e-10;
+    return MHE_ROLLED ? pivot > singular : pivot * o->least * shrunk * shrunk > EPSILON;
 }
 #endif
 
