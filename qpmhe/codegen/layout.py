@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from ..estimation.conditions import USUAL, Conditions
 from ..estimation.constraints import Constraints
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
-from ..estimation.settings import Infeasible, Settings
+from ..estimation.settings import Settings
 from ..memory.fields import MemorySizes
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
@@ -43,7 +43,6 @@ _CLOCK_TEXT = """
 _MOST = int(np.iinfo(np.int32).max)
 # From so many states on, LAPACK's calls take less time than loops that a compiler made.
 _LAPACK_STATES = 40
-_POLICIES = get_args(Infeasible)
 # What corrects an observer, in the order of the numbers in C.
 _OBSERVERS = ("gain", "extended", "unscented", "function")
 # In single precision rounding makes eigenvalues of correlations of this size.
@@ -59,7 +58,6 @@ class Layout:
     nu: int
     horizon: int
     sets: tuple[tuple[bool, int], ...]
-    continuous: int
     real: str = "double"
     #: Whether a term of the cost has a loss that is not quadratic.
     loss: bool = False
@@ -96,7 +94,7 @@ class Layout:
 
     @classmethod
     def of(
-        cls, directions: Directions, horizon: int, continuous: int, real: str = "double",
+        cls, directions: Directions, horizon: int, real: str = "double",
         lapack: bool = False, clock: bool = False,
     ) -> Layout:
         """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
@@ -116,7 +114,7 @@ class Layout:
         weighs, kind = cost.observer_prior is not None, _OBSERVERS.index(own.kind)
         projects = system.states is not None and observer.metric is None
         return cls(
-            system.n, system.p, system.m, horizon, sets, continuous, real, observer=kind,
+            system.n, system.p, system.m, horizon, sets, real, observer=kind,
             widened=any(one.graduation > 1.0 for one in losses[1:]),
             loss=any(one.kind != "quadratic" for one in losses),
             own_losses=sum((one.kind == "own") << k for k, one in enumerate(losses)),
@@ -144,7 +142,7 @@ class Layout:
         bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
-            "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
+            "real": self.real, "loss": int(self.loss),
             "widened": int(self.widened), "own_losses": self.own_losses,
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
@@ -222,7 +220,7 @@ class Layout:
         fields += [(name, r, n) for name in ("inner_lower", "inner_upper", "aside")]
         options = (
             "metric_settled", "project", "max_qps", "uncapped", "patience", "max_iterations",
-            "infeasible", "start_at_best", "reinitialize", "smooth",
+            "start_at_best", "reinitialize", "smooth",
         )
         fields += [(name, np.int32) for name in options]
         if self.clock:
@@ -437,7 +435,6 @@ def _filled(
     record["uncapped"], record["patience"] = settings.max_qps is None, settings.patience
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)
-    record["infeasible"] = _POLICIES.index(settings.infeasible)
     record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["smooth"] = settings.arrival == "smoothed"

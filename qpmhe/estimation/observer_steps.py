@@ -15,6 +15,7 @@ from ..model.functions import contained, raised
 from ..model.sets import ConvexSet
 from ..model.system import Function, System
 from ..observers import Observer, Sample
+from ..observers.base import check_written
 from ..observers.projection import ErrorMetric, NearestPoint
 from ..observers.roots import VAGUE
 from ..terms.base import read_only
@@ -50,7 +51,7 @@ class ObserverSteps(WindowSamples):
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, horizon: int, initial_state: Array,
-        with_terms: bool, project: bool, usual: Conditions,
+        with_terms: bool, project: bool, usual: Conditions, restarts: bool,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         covariance, memory = observer.initial_covariance(), observer.initial_memory()
@@ -58,12 +59,13 @@ class ObserverSteps(WindowSamples):
             n, p, m, horizon, sensors=len(observer.sensors), held=len(system.held),
             covariance=covariance is not None, majorised=not cost.quadratic,
             roots=observer.propagates_roots, memory=0 if memory is None else len(memory),
+            restarts=restarts,
         )
         super().__init__(system, cost, sizes, initial_state, covariance, with_terms)
         self._observer = observer
         self._with_jacobians = with_terms or observer.needs_jacobians
         # What the covariance restarts at where it is lost; C finds such a loss as no number.
-        self._first_covariance = covariance
+        self._first_covariance, self._first_memory = covariance, memory
         self._raises_lost = covariance is not None and observer.c_form is not None
         # For observers and losses: a user's code cannot write into the window.
         self._read_only_covariance = (
@@ -298,7 +300,10 @@ class ObserverSteps(WindowSamples):
         sample.root = sample.next_root = None
         if self.root is not None and self.is_vague[k]:
             sample.root = self.root[k]
+        following = sample.next_memory
         correction, posterior = self._corrected(k, view)
+        if following is not None:
+            check_written(self._observer, sample, following)
         terms.disturbance[...] = correction
         predicted = z_next.copy() if self._nearest is not None else None
         z_next += correction
