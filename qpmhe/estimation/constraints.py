@@ -198,9 +198,12 @@ class NoiseFreeDirections:
         Which of W's rows the cost implies.
     basis : (n, n - k) array
         The directions in which there are disturbances.
+    scale : (n,) array
+        Typical sizes of the states.
     """
 
     def __init__(self, rows: Rows, space: Subspace) -> None:
+        self.scale: Array = space.scale
         scale, matrix, normal = space.scale, rows.matrix, space.normal
         if space.to_disturbances is not None:
             matrix = matrix @ space.to_disturbances

@@ -123,7 +123,7 @@ class ObserverSteps(WindowSamples):
         if self.metric is not None:
             self.z[k] = nearest(self.z[k], self.metric.covariance).point
         elif self.covariance is not None:
-            self.z[k] = nearest(self.z[k], self.covariance[k]).point
+            self.z[k] = nearest(self.z[k], self.covariance[k], self.root_at(k)).point
 
     def _projection(self, time: int) -> NearestPoint | None:
         """The projection onto X at a time: the newest sample's before its own has come."""
@@ -323,7 +323,7 @@ class ObserverSteps(WindowSamples):
         if self.memory is not None and not np.isfinite(self.memory[k + 1]).all():
             return False
         if predicted is not None:
-            self._project(view, predicted, posterior)
+            self._project(view, predicted, posterior, self.root_at(k + 1))
         return True
 
     def _corrected(self, k: int, view: StageView) -> tuple[Array, Array | None]:
@@ -361,7 +361,9 @@ class ObserverSteps(WindowSamples):
                 roots[k + 1] = following
         return correction, posterior
 
-    def _project(self, view: StageView, predicted: Array, covariance: Array | None) -> None:
+    def _project(
+        self, view: StageView, predicted: Array, covariance: Array | None, root: Array | None
+    ) -> None:
         """Settle the metric if need be, and keep z(t+1) in X."""
         nearest, metric, z_next = self._nearest, self.metric, view.z_next
         assert nearest is not None
@@ -374,25 +376,26 @@ class ObserverSteps(WindowSamples):
             metric.settle(view.z, a, c, self._sample)
         if not nearest.contains(z_next):
             correction = view.terms.disturbance
-            self.events |= self._keep_inside(predicted, z_next, correction, covariance)
+            self.events |= self._keep_inside(predicted, z_next, correction, covariance, root)
 
     def _keep_inside(
-        self, predicted: Array, z_next: Array, correction: Array, covariance: Array | None = None
+        self, predicted: Array, z_next: Array, correction: Array, covariance: Array | None = None,
+        root: Array | None = None,
     ) -> int:
         """Project z(t+1) onto X, and set its correction to match; return flags of `Status`."""
         nearest, events = self._nearest, _PROJECTED
         if self.metric is not None:
-            covariance = self.metric.covariance
+            covariance, root = self.metric.covariance, None
         assert nearest is not None
         assert covariance is not None
-        found = nearest(z_next, covariance)
+        found = nearest(z_next, covariance, root)
         if not nearest.contains(predicted):
             events |= _PREDICTION_OUTSIDE
-            if found.reached and nearest.is_beyond(z_next, found.point, covariance):
+            if found.reached and nearest.is_beyond(z_next, found.point, covariance, root):
                 # Every point of X is nearer to the truth than z_next is. The prediction is then
                 # so far off that it would hide the correction: correct its projection instead.
-                inside = nearest(predicted, covariance).point
-                found = nearest(inside + correction, covariance)
+                inside = nearest(predicted, covariance, root).point
+                found = nearest(inside + correction, covariance, root)
         z_next[...] = found.point
         np.subtract(z_next, predicted, correction)
         if self._state_residual is not None:

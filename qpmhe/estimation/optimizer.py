@@ -531,7 +531,7 @@ class Optimizer:
         left = outcome.remaining(began)
         if left is not None and left <= 0.0:
             return None
-        solution = self._solver.solve(qp, None, left)
+        solution = self._subproblem.solve(qp, self._solver, left)
         outcome.count(solution.iterations, perf_counter() - began)
         return solution
 

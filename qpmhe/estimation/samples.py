@@ -109,10 +109,11 @@ class WindowSamples(MemoryRecord):
     @property
     def prior_root(self) -> Array | None:
         """A root of that covariance, where only the root has all digits."""
-        if self.root is None or not self.is_vague[self.start]:
-            return None
-        root: Array = self.root[self.start]
-        return root
+        return self.root_at(self.start)
+
+    def root_at(self, k: int) -> Array | None:
+        """The root of the observer's covariance before stage k, where it has one."""
+        return self.root[k] if self.root is not None and self.is_vague[k] else None
 
     @property
     def last_covariance(self) -> Array | None:

@@ -8,8 +8,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers import QP, Solution
+from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.qp import band_of
+from qpmhe_solvers.solver import ContainedSolver
 
 from ..model.functions import raised_along
 from ..model.residuals import difference
@@ -19,8 +20,9 @@ from ..terms.information import window_information
 from ..terms.linearization import Span, StageTerms
 from ..terms.rows import Rows
 from ..terms.soft import BEYOND, Penalties
-from ..terms.sum import weight_of_first
+from ..terms.sum import rows_of_first, weight_of_first
 from .constraints import Constraints
+from .elimination import SINGULAR, Around, Eliminated, Elimination
 from .problem import Problem
 
 Array = NDArray[np.float64]
@@ -33,8 +35,8 @@ class Subproblem:
     at d = 0 is that of J/2, its Hessian the Gauss-Newton one. Sets become
 
     - bounds on d, and rows on ``x_i + d_i``, from X;
-    - rows on ``w_i + d_{i+1} - A_i d_i`` from W and on ``v_i - C_i d_i`` from V; a component
-      of W of zero width gives an equality row;
+    - rows on ``w_i + d_{i+1} - A_i d_i`` from W and on ``v_i - C_i d_i`` from V; a direction
+      without disturbance gives an equality row, which `solve` eliminates;
     - rows on the linearised nonlinear constraints.
 
     Soft rows are not among them: `softened` adds these, with slack variables, where a solution
@@ -69,6 +71,12 @@ class Subproblem:
         self._w, self._v, self._x, self._g = (slice(a, b) for a, b in pairwise(ends))
         self._penalties = penalties
         self._softened = None if penalties is None else penalties.softened
+        # Of the directions without disturbance, if there are any.
+        self._elimination: Elimination | None = None
+        if w is not None and w.fixed.any():
+            self._elimination = Elimination(constraints, n, p)
+        self._around: Around  # what that reads of the present QP
+        self._eliminated: Eliminated | None = None  # the last QP without them
         self._functions = system.constraints
         #: Whether there are soft rows or nonlinear constraints.
         self.extended: bool = self._functions is not None or penalties is not None
@@ -79,6 +87,7 @@ class Subproblem:
         # trial around which that is.
         self._undamped: Array | None = None
         self._damping: Array
+        self._information: Array  # the diagonal D
         self._damped_trial: Trial | None = None
         #: Why `at` returned None the last time.
         self.failure = ""
@@ -121,6 +130,13 @@ class Subproblem:
             self._undamped = qp.band.copy()
         np.multiply(self._damping, mu, out=qp.band)
         qp.band += self._undamped
+        if self._elimination is not None:
+            rows, side = rows_of_first(problem.terms, trial)
+            added = np.diag(np.sqrt(mu * self._information))
+            self._around.damping = mu
+            self._around.first = (
+                np.concatenate((rows, added)), np.append(side, np.zeros(len(added)))
+            )
 
     def _damping_band(self, problem: Problem, trial: Trial) -> Array:
         """The band that a damping of 1 adds."""
@@ -142,6 +158,7 @@ class Subproblem:
             found = information + window_information(a, seen, spread).diagonal()
             if np.isfinite(found).all():
                 information = found
+        self._information = information
         band[0, :, 0] += information
         return band
 
@@ -155,7 +172,23 @@ class Subproblem:
         self._forces = forces
         if qp is not None:
             qp.gradient[...] = 0.0
+            if self._elimination is not None:
+                around = self._around
+                around.residuals = np.zeros_like(around.residuals)
+                around.first = around.first[0], np.zeros_like(around.first[1])
         return qp
+
+    def solve(self, qp: QP, solver: ContainedSolver, limit: float | None) -> Solution:
+        """Solve a QP by a backend, within a time limit in seconds."""
+        if self._elimination is None or qp is not self._qp:
+            return solver.solve(qp, None, limit)
+        eliminated = self._eliminated = self._elimination.of(self._around, qp, self._w)
+        if eliminated is None:
+            return Solution(None, SolveStatus.FAILED, 0, message=SINGULAR)
+        found = eliminated.solution
+        if found is None:
+            found = eliminated.restored(solver.solve(eliminated.qp, None, limit))
+        return found
 
     def correct_rows(self, qp: QP, problem: Problem, around: Trial, trial: Trial) -> None:
         """Shift the rows of the QP around a trajectory by its linearisation error at a trial.
@@ -202,13 +235,21 @@ class Subproblem:
         soft = self._softened
         if soft is None or solution.d is None or not soft.misses(solution.d).any():
             return None
-        return soft.lifted(qp)
+        if self._eliminated is None:
+            return soft.lifted(qp)
+        return soft.along(self._eliminated.step, self._eliminated.along).lifted(self._eliminated.qp)
 
     def lowered(self, qp: QP, solution: Solution) -> Solution:
         """A solution of the QP with slack variables, as one of the QP without."""
-        assert self._softened is not None
-        self._note(qp, solution, self._softened.forces(qp, solution))
-        return self._softened.lowered(qp, solution)
+        base, soft, eliminated = qp, self._softened, self._eliminated
+        if eliminated is not None and soft is not None:
+            base, soft = eliminated.qp, soft.stacked
+        assert soft is not None
+        forces, found = soft.forces(base, solution), soft.lowered(base, solution)
+        if eliminated is not None:
+            solution, found = eliminated.restored(solution), eliminated.restored(found)
+        self._note(qp, solution, forces)
+        return found
 
     def start(self) -> None:
         """Start a new sequence of QPs, with unknown multipliers."""
@@ -252,19 +293,26 @@ class Subproblem:
         model.span, model.is_candidate, model.slopes = span, is_candidate, slopes
         for term in problem.terms:
             term.add_model(model, trial)
-        forces = self._forces
+        forces, curvature = self._forces, None
         if functions is not None and forces is not None and len(forces) == stages:
-            self._add_curvature(qp, *functions.curvature(*along, forces))
+            curvature = self._add_curvature(qp, *functions.curvature(*along, forces))
+        if self._elimination is not None:
+            first = rows_of_first(problem.terms, trial)
+            self._around = Around(span.minus_jacobian, trial.residuals, trial.weights, first)
+            self._around.curvature = curvature
         if problem.constrained:
             self._set_inequalities(qp, problem, trial, slopes)
         return qp
 
-    def _add_curvature(self, qp: QP, own: Array, below: Array, following: Array) -> None:
+    def _add_curvature(
+        self, qp: QP, own: Array, below: Array, following: Array
+    ) -> tuple[Array, Array]:
         n, band = self._n, qp.band
         own[1:] += following
         for c in range(n):
             band[:, c, : n - c] += own[:, c:, c]
             band[:-1, c, n - c : 2 * n - c] += below[:, :, c]
+        return own, below
 
     def _new_qp(self, stages: int) -> QP:
         """A QP of another length in place of the present one."""

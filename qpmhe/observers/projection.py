@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import Array, positive_definite
-from .._linalg import inverse
+from .._linalg import cholesky, inverse
 from ..memory.snapshot import checked_array
 from ..model.sets import ConvexSet
 from .base import Observer, Sample
 
 _EPS = float(np.finfo(np.float64).eps)
 
-# A variance below this share of the largest possible one counts as zero.
-_SINGULAR = 1e-12
+# A variance below this share of the largest possible one counts as zero: one of a covariance, and
+# one of a root that has more digits.
+_SINGULAR, _SINGULAR_ROOT = 1e-12, 1e-26
 
 # A miss of a row by less than this share of the terms that it sums up is rounding.
 _ROUNDING = 16.0 * _EPS
@@ -43,9 +44,11 @@ class NearestPoint:
     .. math::
         \min_\xi |\xi - \bar z|_{P^{-1}} \quad \text{s.t.} \quad A \xi \le b
 
-    Its solution is :math:`\xi = \bar z - P A^\top \lambda`, in which P may be singular. The
-    dual active-set method of Goldfarb and Idnani finds it: each change of the active set
-    either raises the dual objective or removes a row, and their number is bounded.
+    Its solution is :math:`\xi = \bar z - U^\top U A^\top \lambda` with a root U of
+    :math:`P = U^\top U`, which may be singular. The dual active-set method of Goldfarb and Idnani
+    finds it: each change of the active set either raises the dual objective or removes a row, and
+    their number is bounded. The active rows of :math:`A U^\top` are orthogonalised: nothing is
+    squared, so that a covariance may have a condition of up to 1e20 where its root is known.
 
     Parameters
     ----------
@@ -93,117 +96,137 @@ class NearestPoint:
         rounding = _ROUNDING * (np.abs(points) @ self._sizes.T + self._side_sizes)
         return np.where(missed > rounding, missed, 0.0)
 
-    def __call__(self, point: Array, covariance: Array) -> Projected:
+    def __call__(self, point: Array, covariance: Array, root: Array | None = None) -> Projected:
         """The nearest point in the metric of a covariance (n, n), positive semidefinite.
 
-        Where a singular covariance leads to no point of the set, the metric is diagonal, with the
-        sizes of the components as standard deviations.
+        With a root U of it, U'U, where this has more digits. Where a singular covariance leads to
+        no point of the set, the metric is diagonal, with the sizes of the components as standard
+        deviations.
         """
-        found = self._nearest(point, self._taken(covariance))
+        singular = _SINGULAR if root is None or self._diagonal else _SINGULAR_ROOT
+        found = self._nearest(point, self._root(covariance, root), singular)
         if found is not None:
             return Projected(found, True)
         sizes = np.maximum(np.abs(point), self._largest)
-        found = self._nearest(point, np.diag(sizes * sizes))
+        found = self._nearest(point, np.diag(sizes), _SINGULAR)
         if found is None:
             found = np.clip(point, self._lower, self._upper)
         return Projected(found, False)
 
-    def is_beyond(self, point: Array, nearest: Array, covariance: Array) -> bool:
+    def is_beyond(
+        self, point: Array, nearest: Array, covariance: Array, root: Array | None = None
+    ) -> bool:
         """Whether a point is farther from the set than any two points of the set are apart."""
         if not np.isfinite(self._widths).all():
             return False
         try:
-            metric = inverse(self._taken(covariance))
+            back = np.linalg.inv(self._root(covariance, root))
         except np.linalg.LinAlgError:
             return False
-        offset = point - nearest
+        offset, metric = (point - nearest) @ back, np.abs(back @ back.T)
         # Within the set |e_i| <= w_i, so that e' M e <= w' |M| w: larger than any distance in it.
-        return bool(offset @ metric @ offset > self._widths @ np.abs(metric) @ self._widths)
+        return bool(offset @ offset > self._widths @ metric @ self._widths)
 
-    def _taken(self, covariance: Array) -> Array:
-        """The part of a covariance that makes the metric."""
-        return np.diag(covariance.diagonal()) if self._diagonal else covariance
+    def _root(self, covariance: Array, root: Array | None) -> Array:
+        """A root of what makes the metric."""
+        if self._diagonal:
+            return np.diag(np.sqrt(covariance.diagonal()))
+        return cholesky(covariance).T if root is None else root
 
-    def _nearest(self, point: Array, covariance: Array) -> Array | None:
-        rows = self._rows
-        spread: Array = covariance @ rows.T
-        variances = np.einsum("ij,ji->i", rows, spread)
+    def _nearest(self, point: Array, root: Array, singular: float) -> Array | None:
+        spread: Array = root @ self._rows.T
+        variances = np.einsum("ij,ij->j", spread, spread)
         # |a|' D |a| with D the diagonal is of the size that the variance of a row can have.
-        possible = (self._sizes**2) @ np.abs(covariance.diagonal())
-        usable = variances > _SINGULAR * possible
+        possible = (self._sizes**2) @ np.einsum("ij,ij->j", root, root)
+        usable = variances > singular * possible
         scale = np.sqrt(np.where(usable, variances, 1.0))
         # In units of each row's standard deviation, so that no row's unit matters.
-        gram = (rows @ spread) / np.outer(scale, scale)
-        reach = np.sqrt(possible) / scale  # the largest possible deviation of each
-        active: list[int] = []
-        multipliers = np.zeros(0)
+        search = _Search(root, spread / scale, np.sqrt(possible) / scale, singular)
         current = point
         for _ in range(50 + 10 * scale.size):
             missed = self._misses(current) / scale
-            if active:
-                missed[active] = 0.0
+            if search.active:
+                missed[search.active] = 0.0
             worst = int(missed.argmax())
             if not missed[worst] > 0.0:
                 found: Array = np.clip(current, self._lower, self._upper)
                 # Exactly on its bounds, not beside them by rounding: there, a model may have a huge
                 # derivative where it has none on the bound.
-                bounds = [row for row in active if row < self._bounds.size]
+                bounds = [row for row in search.active if row < self._bounds.size]
                 found[self._components[bounds]] = self._bounds[bounds]
                 return found
-            if not usable[worst]:
+            if not usable[worst] or not search.enter(worst, float(missed[worst])):
                 return None
-            entering = self._enter(gram, reach, worst, float(missed[worst]), active, multipliers)
-            if entering is None:
-                return None
-            multipliers = entering
-            current = self._reached(point, multipliers, gram, spread, scale, active)
+            current = self._reached(point, search, scale)
         return None
 
-    def _reached(
-        self, point: Array, multipliers: Array, gram: Array, spread: Array, scale: Array,
-        active: list[int],
-    ) -> Array:
-        """The point that these multipliers lead to, corrected to lie on the active rows."""
-        rows, sides, within = self._rows[active], self._sides[active], np.ix_(active, active)
-        current = point - spread[:, active] @ (multipliers / scale[active])
+    def _reached(self, point: Array, search: _Search, scale: Array) -> Array:
+        """The point that the multipliers lead to, corrected to lie on the active rows."""
+        active = search.active
+        rows, sides = self._rows[active], self._sides[active]
+        current = point - search.moved
         for _ in range(_REFINEMENTS):
             missed = (rows @ current - sides) / scale[active]
             rounding = _ROUNDING * (self._sizes[active] @ np.abs(current) + np.abs(sides))
             if (np.abs(missed) * scale[active] <= rounding).all():
                 break
-            current = current - spread[:, active] @ (
-                np.linalg.solve(gram[within], missed) / scale[active]
-            )
+            current = current - search.correction(missed)
         return current
 
-    @staticmethod
-    def _enter(
-        gram: Array, reach: Array, row: int, missed: float, active: list[int], multipliers: Array
-    ) -> Array | None:
-        """Make a violated row active, and others inactive if need be; None if that is impossible.
 
-        Changes ``active`` in place, and returns its multipliers.
-        """
-        own = 0.0
+class _Search:
+    """The active rows of a search, as columns U a in units of their deviations."""
+
+    def __init__(self, root: Array, columns: Array, reach: Array, singular: float) -> None:
+        self._root, self._columns = root, columns
+        self._reach, self._singular = reach, singular  # the largest possible deviation of each row
+        self.active: list[int] = []
+        self._multipliers = np.zeros(0)
+        self._orthogonalise()
+
+    def _orthogonalise(self) -> None:
+        self._basis, self._triangle = np.linalg.qr(self._columns[:, self.active])
+
+    @property
+    def moved(self) -> Array:
+        """By how much the multipliers move the point."""
+        return np.asarray(self._root.T @ (self._columns[:, self.active] @ self._multipliers))
+
+    def correction(self, missed: Array) -> Array:
+        """The least move by which the active rows are so much less."""
+        along = np.linalg.solve(self._triangle.T, missed)
+        return np.asarray(self._root.T @ (self._basis @ along))
+
+    def enter(self, row: int, missed: float) -> bool:
+        """Make a violated row active, and others inactive if need be; whether that is possible."""
+        own, column = 0.0, self._columns[:, row]
         while True:
-            exchange = np.linalg.solve(gram[np.ix_(active, active)], gram[active, row])
-            curvature = float(gram[row, row] - gram[row, active] @ exchange)
-            largest = float(reach[row] + np.abs(exchange) @ reach[active])
-            full = (missed / curvature) if curvature > _SINGULAR * largest**2 else np.inf
+            shares, left = self._basis.T @ column, column
+            left = left - self._basis @ shares
+            again = self._basis.T @ left  # what rounding has left of them
+            left, shares = left - self._basis @ again, shares + again
+            exchange = np.linalg.solve(self._triangle, shares)
+            curvature, largest = float(left @ left), float(
+                self._reach[row] + np.abs(exchange) @ self._reach[self.active]
+            )
+            full = (missed / curvature) if curvature > self._singular * largest**2 else np.inf
             with np.errstate(divide="ignore", invalid="ignore"):
-                limits = np.where(exchange > 0.0, multipliers / exchange, np.inf)
+                limits = np.where(exchange > 0.0, self._multipliers / exchange, np.inf)
             blocking = int(limits.argmin()) if limits.size else -1
             length = min(full, float(limits[blocking]) if limits.size else np.inf)
             if not np.isfinite(length):
-                return None
-            multipliers = multipliers - length * exchange
+                return False
+            self._multipliers = self._multipliers - length * exchange
             own += length
-            missed -= length * max(curvature, 0.0)
+            missed -= length * curvature
             if length == full:
-                active.append(row)
-                return np.append(multipliers, own)
-            del active[blocking]
-            multipliers = np.delete(multipliers, blocking)
+                self.active.append(row)
+                self._multipliers = np.append(self._multipliers, own)
+                self._orthogonalise()
+                return True
+            del self.active[blocking]
+            self._multipliers = np.delete(self._multipliers, blocking)
+            self._orthogonalise()
 
 
 class ErrorMetric:

@@ -70,10 +70,11 @@ def triangle(rows: Array) -> Array:
 
 
 def whitened(factor: Array, v: Array) -> Array:
-    """The solution w of U'w = v, for an upper triangle U."""
-    found = np.empty_like(v)
+    """The solution w of U'w = v, for an upper triangle U; 0 where U has a row of zeros."""
+    found = np.zeros_like(v)
     for j, value in enumerate(v):
-        found[j] = (value - factor[:j, j].dot(found[:j])) / factor[j, j]
+        if factor[j, j] != 0.0:
+            found[j] = (value - factor[:j, j].dot(found[:j])) / factor[j, j]
     return found
 
 

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from qpmhe_solvers import QP
 from qpmhe_solvers.qp import band_of
 
+from .._linalg import cholesky
 from ..costs import Cost
 from ..model.sets import ConvexSet
+from ..observers.roots import whitened
 from .linearization import Span
 from .rows import Rows
 
@@ -326,6 +328,11 @@ class FirstStateTerm(Term):
     @abstractmethod
     def force(self, trial: Trial) -> Array | None:
         """Half the derivative (n,) of the term by the state; None where it is zero."""
+
+    def rows_of_first(self, trial: Trial) -> tuple[Array, Array]:
+        """R (k, n) and s (k,): the quadratic form is |R d + s|^2, and a constant."""
+        root, force = cholesky(self.weight_of_first(trial)).T, self.force(trial)
+        return root, np.zeros(len(root)) if force is None else whitened(root, force)
 
     def add_model(self, model: QuadraticModel, trial: Trial) -> None:
         """Add weight and force; see `Term.add_model`."""

@@ -27,11 +27,16 @@ Array = NDArray[np.float64]
 NO_VARIANCE, KNOWN = 1e-30, 1e-16
 
 
-#: The weight comes from a root of the covariance where this loses fewer digits. With r the least
+#: The weight comes from a root of the covariance where this loses fewer digits: always, where QPs
+#: take its rows as they are, as an elimination does. Where they take its square: with r the least
 #: variance of a component given those before it, as a share of its variance, and d the largest
 #: factor by which the window's data reduce a variance, rounding of the weight has a share of
 #: eps / (r d) in a variance behind the window, and the least eigenvalue l of an inverse one of l d.
 _LOST = float(np.finfo(np.float64).eps)
+
+#: A root whose r is below this is one of a singular covariance: it has only rounding in a
+#: direction, and J would have nothing else.
+_SINGULAR = 1e-26
 
 
 class InitialWeight(NamedTuple):
@@ -69,6 +74,9 @@ class PriorWeights:
         self.added: Array = np.zeros((system.n, system.n))
         self.least = self.added
         self._varies = rule is not None and covariance is not None
+        fixed = system.disturbances is not None and system.disturbances.fixed_components.size > 0
+        # Whether there are noise-free directions, which are eliminated.
+        self._takes_rows = fixed or (cost.space is not None and cost.space.noise_free.shape[1] > 0)
         if rule is not None and covariance is not None and covariance.shape == self.added.shape:
             _, first = self._regular(covariance)
             self.added = 2.0 / rule.kappa * first
@@ -85,7 +93,9 @@ class PriorWeights:
         if covariance is None or not self._varies:
             weight = cost.initial_weight(covariance)
             return InitialWeight(weight, weight)
-        if root is not None and later is not None:
+        if root is None and self._takes_rows:
+            root = cholesky(covariance).T
+        if root is not None:
             found = self._from_root(covariance, root, later)
             if found is not None:
                 return found
@@ -95,22 +105,31 @@ class PriorWeights:
             return InitialWeight(weight, weight)
         return InitialWeight(weight, cost.initial_weight(regular) + self.least)
 
-    def _from_root(self, covariance: Array, root: Array, later: Array) -> InitialWeight | None:
+    def _from_root(
+        self, covariance: Array, root: Array, later: Array | None
+    ) -> InitialWeight | None:
         """From the root, unless the covariance's inverse is nearer: see `_LOST`."""
         variances = self._variances(covariance + self.added)
         wider = [
             triangle(np.concatenate((root, cholesky(self.added + one).T)))
             for one in variances or (0.0,)
         ]
-        own, behind = (wider[0] ** 2).sum(axis=0), later.diagonal()
-        pivot = (wider[0].diagonal() ** 2 / own).min()
-        shrunk = (own / np.where(behind > 0.0, behind, np.inf)).max()
-        if not pivot * self._cost.least_correlation * shrunk * shrunk > _LOST:
+        if not self._is_better(wider[0], later):
             return None
         least = cholesky(self.least).T
         near, *others = (triangle(np.concatenate((np.linalg.inv(one).T, least))) for one in wider)
         far = others[0] if others else near
         return InitialWeight(near.T @ near, far.T @ far, near, far)
+
+    def _is_better(self, root: Array, later: Array | None) -> bool:
+        """Whether the weight loses fewer digits by the root: see `_LOST`."""
+        own = (root**2).sum(axis=0)
+        pivot = (root.diagonal() ** 2 / own).min()
+        if self._takes_rows or later is None:
+            return bool(self._takes_rows and pivot > _SINGULAR)
+        behind = later.diagonal()
+        shrunk = (own / np.where(behind > 0.0, behind, np.inf)).max()
+        return bool(pivot * self._cost.least_correlation * shrunk * shrunk > _LOST)
 
     def _regular(self, covariance: Array) -> tuple[Array, Array]:
         """The covariance with a small and with a typical variance of states known exactly."""
@@ -281,6 +300,16 @@ class Prior(FirstStateTerm):
     def root_of_first(self, trial: Trial) -> Array | None:
         """See `Term.root_of_first`."""
         return self._root(self.offset(trial))
+
+    def rows_of_first(self, trial: Trial) -> tuple[Array, Array]:
+        """See `FirstStateTerm.rows_of_first`."""
+        offset = self.offset(trial)
+        root = self._root(offset)
+        if root is None:
+            root = cholesky(self._majorised(offset)).T
+        if trial.trajectory is self._zero:
+            return root, np.zeros(len(root))
+        return root, root.dot(offset)
 
     def force(self, trial: Trial) -> Array | None:
         """See `FirstStateTerm.force`; None for a candidate that starts at the mean."""

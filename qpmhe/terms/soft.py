@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from copy import copy
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -252,9 +253,11 @@ class Softened:
         from scipy.linalg.lapack import dpbtrf, dpbtrs  # late: most estimators have nothing soft
 
         self._dpbtrf, self._dpbtrs = dpbtrf, dpbtrs
-        self._n, self._penalties = n, penalties
+        self._n, self._penalties, self._size = n, penalties, penalties.size
         self._least = _CURVATURE / penalties.scale
         self._qp: QP | None = None
+        #: The same in other unknowns, see `along`.
+        self.stacked: Softened | None = None
         #: Values of the rows at d = 0, (K + 1, R), and their derivatives, as in `Penalties`.
         self.values: Array
         self._own: Array
@@ -282,6 +285,24 @@ class Softened:
         """The penalty of the linearised rows at a step."""
         return self._window.cost(self.misses(step))
 
+    def along(self, step: Array, directions: Array) -> Softened:
+        """The same for QPs in z, with d = step + directions z: all rows belong to one stage.
+
+        ``directions`` is (K + 1, n, N).
+        """
+        stacked, size = self.stacked, directions.shape[-1]
+        if stacked is None or stacked._n != size or stacked._size != self.values.size:
+            self.stacked = stacked = copy(self)
+            stacked._n, stacked._size, stacked._qp = size, self.values.size, None
+            stacked._least = np.tile(self._least, len(step))
+        own = self._own @ directions
+        own[:-1] += self._following[:-1] @ directions[1:]
+        stacked._own = own.reshape(1, -1, size)
+        stacked._following = np.zeros_like(stacked._own)
+        stacked.values = self.at(step).reshape(1, -1)
+        stacked._window = WindowPenalties(*(one.reshape(1, -1) for one in self._window))
+        return stacked
+
     def bend(self, values: Array, step: Array, curvature: Array) -> None:
         """Shift the rows by what their linearisation misses at a step that leads to these values.
 
@@ -302,7 +323,7 @@ class Softened:
 
     def lifted(self, base: QP) -> QP:
         """The QP with slack variables, its objective half of J as the base's is."""
-        n, rows, size, window = self._n, base.rows, self._penalties.size, self._window
+        n, rows, size, window = self._n, base.rows, self._size, self._window
         qp = self._qp
         if qp is None or qp.stages != base.stages or qp.rows != rows + 2 * size:
             qp = self._qp = self._new(base)
@@ -342,7 +363,7 @@ class Softened:
         )
 
     def _new(self, base: QP) -> QP:
-        n, rows, size = self._n, base.rows, self._penalties.size
+        n, rows, size = self._n, base.rows, self._size
         wide = n + size
         qp = QP(base.stages, wide, rows + 2 * size)
         qp.lower[:, n:] = 0.0
@@ -363,8 +384,9 @@ class Softened:
         functions, duals = self._penalties.functions, solution.row_duals
         if functions is None or duals is None:
             return None
-        forces = np.zeros((base.stages, functions.size))
-        upper = duals.reshape(base.stages, -1)[:, base.rows + self._penalties.size :]
+        upper = duals.reshape(base.stages, -1)[:, base.rows + self._size :]
+        upper = upper.reshape(-1, self._penalties.size)
+        forces = np.zeros((len(upper), functions.size))
         for rows, place, _ in self._penalties.parts:
             if rows.name == "constraints":
                 forces[:, rows.components] = np.maximum(upper[:, place], 0.0)
@@ -444,7 +466,7 @@ class Softened:
         With, for each, the largest force of an active row that is not violated, the curvature of
         the penalty beyond, and the force that a solver found.
         """
-        n, hard, window, size = self._n, base.rows, self._window, self._penalties.size
+        n, hard, window, size = self._n, base.rows, self._window, self._size
         count = hard + (n if base.bounded else 0)  # of hard inequalities at each stage
         duals = np.hstack((row_duals[:, :hard], bound_duals[:, : count - hard]))
         eye = np.broadcast_to(np.eye(n)[: count - hard], (base.stages, count - hard, n))

@@ -12,7 +12,7 @@ from .._linalg import cholesky
 from ..costs import Cost
 from ..errors import OptionError
 from ..model.system import System
-from .base import Term, TermForm, Trial, WindowData, WindowView
+from .base import FirstStateTerm, Term, TermForm, Trial, WindowData, WindowView
 from .hold import Hold, WindowHold
 from .prior import Prior, PriorCost
 from .soft import Penalties
@@ -154,3 +154,9 @@ def root_of_first(terms: Sequence[Term], trial: Trial) -> Array | None:
         cholesky(weight).T if root is None else root
         for root, weight in zip(roots, weights, strict=True) if weight is not None
     ])
+
+
+def rows_of_first(terms: Sequence[Term], trial: Trial) -> tuple[Array, Array]:
+    """R (k, n) and s (k,) with which J has |R d + s|^2 near the first state of a trajectory."""
+    found = [term.rows_of_first(trial) for term in terms if isinstance(term, FirstStateTerm)]
+    return np.concatenate([rows for rows, _ in found]), np.concatenate([side for _, side in found])

@@ -1,5 +1,7 @@
 """Kalman observers beside priors of up to 1e10 noise deviations, against 60 digits."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -52,11 +54,52 @@ def predicted(a, c, q, deviation, ys):
         return np.array(means), np.array(covariances)
 
 
-def estimator(model, kind, deviation, engine, units=1.0, **options):
+def nearest(point, covariance, sides):
+    """The point nearest in the metric of a covariance, with x[j] at most or at least a side."""
+    n = point.rows
+    for count in range(n + 1):
+        for held in itertools.combinations(sides, count):
+            if len({j for j, _, _ in held}) < count:
+                continue
+            pick = mp.matrix(count, n)
+            for i, (j, sign, _) in enumerate(held):
+                pick[i, j] = sign
+            x, forces = point, mp.matrix(count, 1)
+            if count:
+                missed = pick * point - mp.matrix([sign * side for _, sign, side in held])
+                forces = mp.lu_solve(pick * covariance * pick.T, missed)
+                x = point - covariance * pick.T * forces
+            tiny = mp.mpf(10) ** -40 * (1 + mp.norm(x))
+            if min([0, *forces]) >= 0 and all(
+                sign * x[j] <= sign * side + tiny for j, sign, side in sides
+            ):
+                return x
+    raise AssertionError("no point of the set")
+
+
+def projected(a, c, q, deviation, ys, sides):
+    """The predictions of the filter, put into the set after each step."""
+    with mp.workdps(60):
+        move, output, spread = (mp.matrix(one.tolist()) for one in (a, c, q))
+        mean, covariance = mp.zeros(len(a), 1), mp.mpf(deviation) ** 2 * mp.eye(len(a))
+        sides, means, active = [(j, s, mp.mpf(float(b))) for j, s, b in sides], [], 0
+        for y in ys:
+            inner = output * covariance * output.T + mp.eye(output.rows)
+            gain = covariance * output.T * inner**-1
+            free = move * (mean + gain * (mp.matrix(y.tolist()) - output * mean))
+            covariance = move * (covariance - gain * inner * gain.T) * move.T + spread
+            mean = nearest(free, covariance, sides)
+            active += mean != free
+            means.append([float(one) for one in mean])
+        assert active > 2
+        return np.array(means)
+
+
+def estimator(model, kind, deviation, engine, units=1.0, states=None, **options):
     a, c, q = model
     n, scale = len(a), np.asarray(units) * np.ones(len(a))
     a, c, q = scale[:, None] * a / scale, c / scale, scale[:, None] * q * scale
-    system = qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=n, p=len(c))
+    system = qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T, n=n, p=len(c), states=states)
     given = {"disturbance": q, "noise": np.eye(len(c))}
     mhe = qpmhe.MovingHorizonEstimator(
         system, kind(prior=deviation**2 * np.diag(scale**2), **given, **options),
@@ -211,3 +254,23 @@ def test_groups_that_pass_change_nothing(kind, engine):
         if groups == [[0, 1, 2]]:
             assert not rejected[-1]
             assert abs(run.observer_states[-1, 0] - jump[-1, 0]) < 10.0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("kind", OBSERVERS)
+@pytest.mark.parametrize("name", ["slant", "jerk", "twice"])
+def test_projections_take_the_root(name, kind, engine):
+    """The nearest point by enumeration in 60 digits; no metric is singular."""
+    model, ys = MODELS[name], 10.0 + np.random.default_rng(2).normal(size=(8, 3))
+    ys = ys[:, : len(model[1])]
+    n = len(model[0])
+    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+    lower[0], upper[0], lower[1], upper[1] = -50.0, 11.0, -0.4, 0.2
+    sides = [(0, 1, 11.0), (0, -1, -50.0), (1, 1, 0.2), (1, -1, -0.4)]
+    for deviation in (1.0, 1e3, 1e6, 1e8, 1e10):
+        states = projected(*model, deviation, ys, sides)
+        run = estimator(
+            model, kind, deviation, engine, states=qpmhe.Box(lower, upper)
+        ).run(ys)
+        assert not run.share(qpmhe.Status.METRIC_SINGULAR)
+        np.testing.assert_allclose(run.observer_states[1:], states, rtol=0.0, atol=1e-6)

@@ -138,7 +138,7 @@ def careless(mhe, estimate):
 
 def clipping():
     nearest = NearestPoint.__call__
-    return NearestPoint, "__call__", lambda self, point, covariance: nearest(
+    return NearestPoint, "__call__", lambda self, point, covariance, root: nearest(
         self, point, np.eye(point.size)
     )
 

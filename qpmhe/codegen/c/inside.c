@@ -17,9 +17,9 @@ static int mhe_stay_inside(mhe_estimator *e, int i, const mhe_x_set *onto, const
     const mhe_x_set *set = onto ? onto : mhe_x_set_behind(e, stage);
     mhe_settle_metric(e, stage);
     if (mhe_is_inside(set, next)) return 0;
-    real other[NX * NX];
-    const real *P = mhe_projected_in(e, mhe_metric(e, i), other);
-    const int events = mhe_keep_inside(set, P, predicted, next, stage->w);
+    mhe_metric m;
+    mhe_metric_behind(e, i, &m);
+    const int events = mhe_keep_inside(set, &m, predicted, next, stage->w);
     mhe_wrap_state(s, next, stage->w);
     return events;
 }
@@ -49,7 +49,9 @@ static int mhe_move_state(mhe_estimator *e, const mhe_sample *sample)
     mhe_x_set set = *after;
     TAKE_SIDES(set, s->states, NX, MHE_X_ROWS);
     if (!newest || !isfinite(newest->cost)) {
-        mhe_put_inside(e, &set, mhe_metric(e, e->length - 1), e->z_end);
+        mhe_metric m;
+        mhe_metric_behind(e, e->length - 1, &m);
+        mhe_put_inside(e, &set, &m, e->z_end);
         return 0;
     }
     const int events = mhe_enter(e, e->length - 1, &set);
@@ -65,7 +67,9 @@ static void mhe_start_inside(mhe_estimator *e)
     memcpy(e->metric, s->metric, sizeof e->metric);
     e->metric_settled = s->metric_settled;
     if (mhe_is_inside(&s->states, e->z_end)) return;
-    mhe_project(&s->states, s->metric, e->z_end, inside);
+    mhe_metric m;
+    mhe_set_metric(&m, s->metric, 0);
+    mhe_project(&s->states, &m, e->z_end, inside);
     memcpy(e->z_end, inside, sizeof inside);
 }
 
@@ -73,7 +77,9 @@ static void mhe_start_inside(mhe_estimator *e)
 static void mhe_put_first_inside(mhe_estimator *e)
 {
     const mhe_settings *s = e->settings;
-    mhe_put_inside(e, e->length ? mhe_x_set_at(s, mhe_stage_at(e, 0)) : &s->states,
-                   mhe_metric(e, -1), mhe_next_z(e, -1));
+    mhe_metric m;
+    mhe_metric_behind(e, -1, &m);
+    mhe_put_inside(e, e->length ? mhe_x_set_at(s, mhe_stage_at(e, 0)) : &s->states, &m,
+                   mhe_next_z(e, -1));
     if (!e->length) memcpy(e->history_end, e->z_end, sizeof e->z_end);
 }

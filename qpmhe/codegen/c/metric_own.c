@@ -101,11 +101,11 @@ static int mhe_settle(const mhe_settings *s, const real *K, const mhe_terms *t, 
     return 1;
 }
 
-/* The metric behind stage i, as a covariance. */
-static const real *mhe_metric(const mhe_estimator *e, int i)
+/* The metric behind stage i. */
+static void mhe_metric_behind(const mhe_estimator *e, int i, mhe_metric *m)
 {
     (void)i;
-    return e->metric;
+    mhe_take_metric(e, e->metric, 0, m);
 }
 
 /* Whether the metric needs the slope of the observer's error. */

@@ -33,7 +33,8 @@ static void mhe_weight_from_root(const mhe_covariances *o, const real *covarianc
     mhe_square(root, out);
 }
 
-/* Whether the weight loses fewer digits by a root of the covariance than by its inverse. With r the least
+/* Whether the weight loses fewer digits by a root of the covariance than by its inverse: always, where
+ * elimination.c takes the root as it is. Where the QP takes its square: with r the least
  * variance of a component given those before it, as a share of its variance, and d the largest factor
  * by which the window's data reduce a variance, rounding of the weight has a share of eps / (r d) in a
  * variance behind the window, and the least eigenvalue l of an inverse one of l d. */
@@ -48,25 +49,32 @@ static int mhe_root_is_better(const mhe_covariances *o, const real *root, const 
         if (!(share >= pivot)) pivot = share;
         if (behind > 0) shrunk = mhe_max(own / behind, shrunk);
     }
-    return pivot * o->least * shrunk * shrunk > EPSILON;
+    /* A root of a singular covariance has only rounding in a direction. */
+    const real singular = sizeof(real) == 8 ? (real)1e-26 : (real)1e-10;
+    return MHE_ROLLED ? pivot > singular : pivot * o->least * shrunk * shrunk > EPSILON;
 }
 
-/* The prior's weight by the root of a vague covariance, where that is better; `count`: states that are
+/* The prior's weight by a root of the covariance, where that is better; `count`: states that are
  * known exactly, with these variances. */
 static int mhe_weigh_prior_by_root(mhe_estimator *e, mhe_prior *prior, const real *known, int count)
 {
     const mhe_covariances *o = &e->settings->covariances;
     const mhe_stage *first = mhe_stage_at(e, 0);
-    real wider[NX * NX];
+    real wider[NX * NX], own_root[NX * NX];
+    const real *root = first->root;
     prior->root = prior->distance_root = 0;
-    if (!first->is_vague) return 0;
-    mhe_widen_root(o, first->root, known, MHE_KNOWN, wider);
+    if (!MHE_ROLLED && !first->is_vague) return 0;
+    if (!first->is_vague) {
+        mhe_root(NX, first->covariance, own_root);
+        root = own_root;
+    }
+    mhe_widen_root(o, root, known, MHE_KNOWN, wider);
     if (!mhe_root_is_better(o, wider, mhe_next_covariance(e, e->length - 1))) return 0;
     prior->root = prior->distance_root = prior->own_root;
     mhe_weight_from_root(o, wider, prior->own_weight, prior->own_root);
     if (!count) return 1;
     prior->distance_root = prior->own_distance_root;
-    mhe_widen_root(o, first->root, known, 1, wider);
+    mhe_widen_root(o, root, known, 1, wider);
     mhe_weight_from_root(o, wider, prior->own_distance, prior->own_distance_root);
     return 1;
 }

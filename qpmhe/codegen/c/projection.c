@@ -3,8 +3,10 @@
 /* One-sided inequalities a's <= b: components from above and from below, then rows likewise. */
 #define SIDES (2 * (NX + MHE_X_ROWS))
 
-/* A variance below this share of the largest possible one counts as zero. */
+/* A variance below this share of the largest possible one counts as zero: one of a covariance, and
+ * one of a root that has more digits. */
 #define SINGULAR (sizeof(real) == 8 ? (real)1e-12 : (real)1e-5)
+#define SINGULAR_ROOT (sizeof(real) == 8 ? (real)1e-26 : (real)1e-10)
 
 /* Most corrections that put a point on its active sides. */
 #define REFINEMENTS 4
@@ -65,91 +67,108 @@ static int mhe_is_inside(const mhe_x_set *set, const real *s)
 /* The search for the nearest point. Sides are in units of their standard deviations. */
 typedef struct {
     const mhe_x_set *set;
-    const real *P;
-    real deviation[SIDES], reach[SIDES]; /* 0 without variance; the largest possible deviation */
+    const real *U; /* a root of the covariance, U'U */
+    real singular, deviation[SIDES], reach[SIDES]; /* 0 without variance; the largest possible one */
     int count, active[NX];
     uint8_t is_active[SIDES];
     real multipliers[NX];
-    real spread[NX * NX];  /* P a of each active side */
-    real gram[NX * NX], factor[NX * NX]; /* a' P a of each two active sides */
+    real columns[NX * NX];                /* U a of each active side, in rows */
+    real basis[NX * NX], triangle[NX * NX]; /* and their factors, likewise: B in rows, T */
 } mhe_nearest;
 
-static void mhe_start_nearest(mhe_nearest *n, const mhe_x_set *set, const real *P)
+/* U a of a side. */
+static void mhe_side_spread(const mhe_nearest *n, int r, real *out)
 {
-    n->set = set, n->P = P, n->count = 0;
+    for (int i = 0; i < NX; i++)
+        out[i] = r < 2 * NX ? n->U[i * NX + r % NX]
+                            : mhe_dot(NX, n->U + i * NX, mhe_row_of(n->set, r));
+    if (mhe_is_lower(r))
+        for (int i = 0; i < NX; i++) out[i] = -out[i];
+}
+
+static void mhe_start_nearest(mhe_nearest *n, const mhe_x_set *set, const real *U, real singular)
+{
+    real variances[NX] = {0}, spread[NX];
+    n->set = set, n->U = U, n->singular = singular, n->count = 0;
     memset(n->is_active, 0, sizeof n->is_active);
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) variances[j] += U[i * NX + j] * U[i * NX + j];
     for (int r = 0; r < SIDES; r++) {
-        real variance = 0, possible = 0;
+        real possible = 0;
+        mhe_side_spread(n, r, spread);
+        const real variance = mhe_dot(NX, spread, spread);
         if (r < 2 * NX) {
-            variance = P[(r % NX) * (NX + 1)];
-            possible = fabs(variance);
+            possible = variances[r % NX];
         } else {
             const real *row = mhe_row_of(set, r);
-            variance = mhe_form(NX, P, row);
-            for (int j = 0; j < NX; j++) possible += row[j] * row[j] * fabs(P[j * (NX + 1)]);
+            for (int j = 0; j < NX; j++) possible += row[j] * row[j] * variances[j];
         }
-        const int usable = variance > SINGULAR * possible;
+        const int usable = variance > singular * possible;
         n->deviation[r] = usable ? sqrt(variance) : 0;
         n->reach[r] = usable ? sqrt(possible) / n->deviation[r] : 0;
     }
 }
 
-/* b := gram^-1 b for the active sides; whether gram is positive definite. */
-static int mhe_solve_active(mhe_nearest *n, real *b)
+/* The shares of the first active sides in a column, which is left without them. */
+static void mhe_take_shares(const mhe_nearest *n, int count, real *column, real *shares)
 {
-    const int count = n->count;
-    for (int i = 0; i < count; i++)
-        for (int j = 0; j < count; j++) n->factor[i * count + j] = n->gram[i * NX + j];
-    if (!mhe_decompose(count, n->factor)) return 0;
-    mhe_solve_for(count, n->factor, 1, b);
+    for (int i = 0; i < count; i++) shares[i] = 0;
+    for (int round = 0; round < 2; round++) /* again: what rounding has left of them */
+        for (int i = 0; i < count; i++) {
+            const real *b = n->basis + i * NX, share = mhe_dot(NX, b, column);
+            shares[i] += share;
+            for (int j = 0; j < NX; j++) column[j] -= share * b[j];
+        }
+}
+
+/* Factors of the active sides from one on; whether these are independent. */
+static int mhe_orthogonalise(mhe_nearest *n, int from)
+{
+    for (int i = from; i < n->count; i++) {
+        real *b = n->basis + i * NX, shares[NX];
+        memcpy(b, n->columns + i * NX, sizeof(real) * NX);
+        mhe_take_shares(n, i, b, shares);
+        const real norm = sqrt(mhe_dot(NX, b, b));
+        if (!(norm > 0)) return 0;
+        for (int j = 0; j < NX; j++) b[j] /= norm;
+        for (int j = 0; j < i; j++) n->triangle[j * NX + i] = shares[j];
+        n->triangle[i * NX + i] = norm;
+    }
     return 1;
 }
 
-/* The multiplier i leaves. */
-static void mhe_leave(mhe_nearest *n, int i)
+/* The multiplier i leaves; whether the others are independent. */
+static int mhe_leave(mhe_nearest *n, int i)
 {
     const int rest = --n->count - i;
     n->is_active[n->active[i]] = 0;
-    for (int j = 0; j < rest; j++) {
-        n->active[i + j] = n->active[i + j + 1];
-        n->multipliers[i + j] = n->multipliers[i + j + 1];
-        memcpy(n->spread + (i + j) * NX, n->spread + (i + j + 1) * NX, sizeof(real) * NX);
-        memcpy(n->gram + (i + j) * NX, n->gram + (i + j + 1) * NX, sizeof(real) * NX);
+    for (int j = i; j < i + rest; j++) {
+        n->active[j] = n->active[j + 1];
+        n->multipliers[j] = n->multipliers[j + 1];
+        memcpy(n->columns + j * NX, n->columns + (j + 1) * NX, sizeof(real) * NX);
     }
-    for (int j = 0; j < n->count; j++) {
-        real *row = n->gram + j * NX;
-        memmove(row + i, row + i + 1, sizeof(real) * (size_t)rest);
-    }
+    return mhe_orthogonalise(n, i);
 }
 
 /* Make a side active that is missed by so many deviations, and others inactive if need be; 0 if
  * that is impossible. */
 static int mhe_join(mhe_nearest *n, int side, real missed)
 {
-    real spread[NX], column[NX], exchange[NX], own = 0, variance;
-    const real unit = 1 / n->deviation[side];
-    if (side < 2 * NX) {
-        const real sign = mhe_is_lower(side) ? -unit : unit;
-        for (int j = 0; j < NX; j++) spread[j] = sign * n->P[j * NX + side % NX];
-    } else {
-        const real sign = mhe_is_lower(side) ? -unit : unit;
-        mhe_times(NX, n->P, mhe_row_of(n->set, side), spread);
-        for (int j = 0; j < NX; j++) spread[j] *= sign;
-    }
-    variance = mhe_reading(n->set, side, spread) * unit;
+    real column[NX], own = 0;
+    mhe_side_spread(n, side, column);
+    for (int j = 0; j < NX; j++) column[j] /= n->deviation[side];
     for (;;) {
-        real curvature = variance, largest = n->reach[side], length = INFINITY;
+        real left[NX], exchange[NX], largest = n->reach[side], length = INFINITY;
         int blocking = -1;
-        for (int i = 0; i < n->count; i++) {
-            const int r = n->active[i];
-            column[i] = exchange[i] = mhe_reading(n->set, r, spread) / n->deviation[r];
-        }
-        if (!mhe_solve_active(n, exchange)) return 0;
-        for (int i = 0; i < n->count; i++) {
-            curvature -= column[i] * exchange[i];
+        memcpy(left, column, sizeof left);
+        mhe_take_shares(n, n->count, left, exchange);
+        for (int i = n->count - 1; i >= 0; i--) {
+            for (int j = i + 1; j < n->count; j++) exchange[i] -= n->triangle[i * NX + j] * exchange[j];
+            exchange[i] /= n->triangle[i * NX + i];
             largest += fabs(exchange[i]) * n->reach[n->active[i]];
         }
-        if (n->count < NX && curvature > SINGULAR * largest * largest) length = missed / curvature;
+        const real curvature = mhe_dot(NX, left, left);
+        if (n->count < NX && curvature > n->singular * largest * largest) length = missed / curvature;
         for (int i = 0; i < n->count; i++)
             if (exchange[i] > 0 && n->multipliers[i] / exchange[i] < length) {
                 length = n->multipliers[i] / exchange[i];
@@ -158,9 +177,9 @@ static int mhe_join(mhe_nearest *n, int side, real missed)
         if (!isfinite(length)) return 0;
         for (int i = 0; i < n->count; i++) n->multipliers[i] -= length * exchange[i];
         own += length;
-        missed -= length * mhe_max(curvature, 0);
+        missed -= length * curvature;
         if (blocking < 0) break;
-        mhe_leave(n, blocking);
+        if (!mhe_leave(n, blocking)) return 0;
     }
     const int last = n->count;
     if (last >= NX) return 0;
@@ -168,22 +187,24 @@ static int mhe_join(mhe_nearest *n, int side, real missed)
     n->active[last] = side;
     n->is_active[side] = 1;
     n->multipliers[last] = own;
-    memcpy(n->spread + last * NX, spread, sizeof spread);
-    for (int i = 0; i < last; i++) {
-        n->gram[last * NX + i] = column[i];
-        n->gram[i * NX + last] = column[i];
-    }
-    n->gram[last * NX + last] = variance;
-    return 1;
+    memcpy(n->columns + last * NX, column, sizeof column);
+    return mhe_orthogonalise(n, last);
+}
+
+/* s := s - U'z. */
+static void mhe_move_along(const mhe_nearest *n, const real *z, real *s)
+{
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) s[j] -= n->U[i * NX + j] * z[i];
 }
 
 /* The point that the multipliers lead to, corrected to lie on the active sides. */
 static void mhe_reach(mhe_nearest *n, const real *point, real *s)
 {
-    real gap[NX];
+    real z[NX] = {0}, gap[NX];
     for (int j = 0; j < NX; j++) s[j] = point[j];
-    for (int i = 0; i < n->count; i++)
-        for (int j = 0; j < NX; j++) s[j] -= n->multipliers[i] * n->spread[i * NX + j];
+    mhe_add_product(n->count, NX, 1, n->columns, n->multipliers, z);
+    mhe_move_along(n, z, s);
     for (int round = 0; round < REFINEMENTS; round++) {
         int open = 0;
         for (int i = 0; i < n->count; i++) {
@@ -192,9 +213,14 @@ static void mhe_reach(mhe_nearest *n, const real *point, real *s)
             open |= !(fabs(missed) <= 16 * EPSILON * mhe_reading_size(n->set, r, s));
             gap[i] = missed / n->deviation[r];
         }
-        if (!open || !mhe_solve_active(n, gap)) break;
-        for (int i = 0; i < n->count; i++)
-            for (int j = 0; j < NX; j++) s[j] -= gap[i] * n->spread[i * NX + j];
+        if (!open) break;
+        for (int j = 0; j < NX; j++) z[j] = 0;
+        for (int i = 0; i < n->count; i++) {
+            for (int j = 0; j < i; j++) gap[i] -= n->triangle[j * NX + i] * gap[j];
+            gap[i] /= n->triangle[i * NX + i];
+            for (int j = 0; j < NX; j++) z[j] += gap[i] * n->basis[i * NX + j];
+        }
+        mhe_move_along(n, z, s);
     }
 }
 
@@ -206,14 +232,15 @@ static void mhe_clip(const mhe_x_set *set, real *s)
     }
 }
 
-/* out = the point of the set nearest to another one, in the metric of a covariance P that may be
+/* out = the point of the set nearest to another one, in the metric of a covariance P = U'U that may be
  * singular: min |s - point|_{P^-1}, s = point - P a' lambda. The dual active-set method of Goldfarb
  * and Idnani (Mathematical Programming 27, 1983). 0 where a singular P leads to no such point. */
-static int mhe_nearest_in(const mhe_x_set *set, const real *P, const real *point, real *out)
+static int mhe_nearest_in(const mhe_x_set *set, const real *U, real singular, const real *point,
+                          real *out)
 {
     mhe_nearest n;
     real s[NX];
-    mhe_start_nearest(&n, set, P);
+    mhe_start_nearest(&n, set, U, singular);
     memcpy(s, point, sizeof s);
     for (int i = 0; i < 50 + 10 * SIDES; i++) {
         int worst = -1;
@@ -240,11 +267,24 @@ static int mhe_nearest_in(const mhe_x_set *set, const real *P, const real *point
     return 0;
 }
 
+/* A metric: a root of its inverse, the covariance P, and the share of a variance that is none. */
+typedef struct {
+    real root[NX * NX], singular;
+} mhe_metric;
+
+/* The metric of a covariance; of its root, where that has more digits. */
+static void mhe_set_metric(mhe_metric *m, const real *covariance, const real *root)
+{
+    m->singular = root ? SINGULAR_ROOT : SINGULAR;
+    if (root) memcpy(m->root, root, sizeof m->root);
+    else mhe_root(NX, covariance, m->root);
+}
+
 /* The same in any case; where P leads to no point of the set, the metric is diagonal, with the
  * sizes of the components as standard deviations, and the result 0. */
-static int mhe_project(const mhe_x_set *set, const real *P, const real *point, real *out)
+static int mhe_project(const mhe_x_set *set, const mhe_metric *P, const real *point, real *out)
 {
-    if (mhe_nearest_in(set, P, point, out)) return 1;
+    if (mhe_nearest_in(set, P->root, P->singular, point, out)) return 1;
     real other[NX * NX] = {0};
     for (int j = 0; j < NX; j++) {
         real size = fabs(point[j]);
@@ -253,9 +293,9 @@ static int mhe_project(const mhe_x_set *set, const real *P, const real *point, r
             const real limit = fabs(mhe_limit(set, r));
             if (slope > 0 && isfinite(limit)) size = mhe_max(limit / slope, size);
         }
-        other[j * (NX + 1)] = size * size;
+        other[j * (NX + 1)] = size;
     }
-    if (!mhe_nearest_in(set, other, point, out)) {
+    if (!mhe_nearest_in(set, other, SINGULAR, point, out)) {
         for (int j = 0; j < NX; j++) out[j] = point[j];
         mhe_clip(set, out);
     }
@@ -263,25 +303,33 @@ static int mhe_project(const mhe_x_set *set, const real *P, const real *point, r
 }
 
 /* Whether a point is farther from the set than any two points of the set are apart. */
-static int mhe_is_beyond(const mhe_x_set *set, const real *P, const real *point,
+static int mhe_is_beyond(const mhe_x_set *set, const mhe_metric *P, const real *point,
                          const real *nearest)
 {
-    real scratch[NX * NX], metric[NX * NX], offset[NX], widths[NX], most = 0;
+    real back[NX * NX] = {0}, widths[NX], most = 0, distance = 0; /* U^-1 */
     for (int j = 0; j < NX; j++) {
-        offset[j] = point[j] - nearest[j];
         widths[j] = set->upper[j] - set->lower[j];
-        if (!isfinite(widths[j])) return 0;
+        if (!isfinite(widths[j]) || !(fabs(P->root[j * (NX + 1)]) > 0)) return 0;
     }
-    memcpy(scratch, P, sizeof scratch);
-    if (!mhe_invert(NX, scratch, metric)) return 0;
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) most += widths[i] * fabs(metric[i * NX + j]) * widths[j];
-    return mhe_form(NX, metric, offset) > most;
+    for (int c = 0; c < NX; c++)
+        for (int i = c; i >= 0; i--) {
+            real sum = i == c;
+            for (int l = i + 1; l <= c; l++) sum -= P->root[i * NX + l] * back[l * NX + c];
+            back[i * NX + c] = sum / P->root[i * (NX + 1)];
+        }
+    for (int i = 0; i < NX; i++) {
+        real along = 0;
+        for (int j = 0; j <= i; j++) along += (point[j] - nearest[j]) * back[j * NX + i];
+        distance += along * along;
+        for (int j = 0; j < NX; j++)
+            most += widths[i] * fabs(mhe_dot(NX, back + i * NX, back + j * NX)) * widths[j];
+    }
+    return distance > most;
 }
 
 /* Keep the observer's next state in X, and set its correction w to match; bits of the status.
  * `predicted`: without the correction. */
-static int mhe_keep_inside(const mhe_x_set *set, const real *P, const real *predicted, real *next,
+static int mhe_keep_inside(const mhe_x_set *set, const mhe_metric *P, const real *predicted, real *next,
                            real *w)
 {
     real point[NX];
@@ -304,22 +352,26 @@ static int mhe_keep_inside(const mhe_x_set *set, const real *P, const real *pred
     return reached ? events : events | MHE_METRIC_SINGULAR;
 }
 
-/* The metric in which the observer is projected, as a covariance. With `project` of 2 that is the
- * diagonal of its own, which is made in `other`. */
-static const real *mhe_projected_in(const mhe_estimator *e, const real *own, real *other)
+/* The metric in which the observer is projected. With `project` of 2 it is the diagonal of the
+ * observer's own covariance. */
+static void mhe_take_metric(const mhe_estimator *e, const real *covariance, const real *root,
+                            mhe_metric *m)
 {
-    if (e->settings->project < 2) return own;
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) other[i * NX + j] = i == j ? own[i * NX + j] : 0;
-    return other;
+    if (e->settings->project < 2) {
+        mhe_set_metric(m, covariance, root);
+        return;
+    }
+    m->singular = SINGULAR;
+    memset(m->root, 0, sizeof m->root);
+    for (int j = 0; j < NX; j++) m->root[j * (NX + 1)] = sqrt(mhe_max(covariance[j * (NX + 1)], 0));
 }
 
 /* Put a state of the observer into a set to which no correction leads. */
-static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, const real *metric,
+static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, const mhe_metric *metric,
                            real *state)
 {
-    real point[NX], other[NX * NX];
+    real point[NX];
     if (!e->settings->project || mhe_is_inside(set, state)) return;
-    mhe_project(set, mhe_projected_in(e, metric, other), state, point);
+    mhe_project(set, metric, state, point);
     memcpy(state, point, sizeof point);
 }

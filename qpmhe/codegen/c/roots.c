@@ -17,5 +17,11 @@ static real mhe_correct_with_pivot(mhe_estimator *e, int i, real *out)
     return found;
 }
 
+/* The root of the covariance behind stage i, where the observer has one. */
+static const real *mhe_known_root(mhe_estimator *e, int i)
+{
+    return *mhe_next_is_vague(e, i) ? mhe_next_root(e, i) : 0;
+}
+
 /* The covariance behind stage i comes from elsewhere, and has no root. */
 static void mhe_forget_root(mhe_estimator *e, int i) { *mhe_next_is_vague(e, i) = 0; }
