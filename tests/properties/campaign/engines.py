@@ -27,7 +27,8 @@ FLAT = 1e8  # condition of a Hessian from which on J is nearly flat in a directi
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
-_MEASURED = 4  # differences of a kind that are explained, of each estimator
+# Differences of a kind that are explained, of each estimator.
+_MEASURED = {"quiet": 20, "active": 4}
 _TRIES = 6
 _TIGHT = (
     {"solver_tolerance": 1e-12}, {"backend": "daqp", "solver_tolerance": 1e-12},
@@ -127,7 +128,7 @@ class Beside:
             better = "compiled" if estimate.cost < other.cost else "python"
         self.explained[kind, rows] += 1
         reason = "not examined"
-        if self.explained[kind, rows] <= _MEASURED:
+        if self.explained[kind, rows] <= _MEASURED[rows]:
             reason = self._reason(estimate, other, kind, x, J, (y, inputs, given))
         detail = (
             f"x {x:.1e}, J {J:.1e}, candidate {candidate:.1e}, by rounding {self.far}",
