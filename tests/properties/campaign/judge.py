@@ -247,13 +247,13 @@ class Judge:
         mean = candidate[0] if mean is None else mean
         own = judged(case, x, window, mean, not case.from_observer)
         of_candidate = judged(case, candidate, window, mean, not case.from_observer)
-        rolled = candidate
-        if case.G is not None:
+        rolled, of_rolled = candidate, of_candidate
+        if case.G is not None:  # J of the candidate is that of its roll-out, its rows are its own
             rolled = self._rolled_out(candidate, window)
-            of_candidate = judged(case, rolled, window, mean, not case.from_observer)
+            of_rolled = judged(case, rolled, window, mean, not case.from_observer)
             found += self._beside(own, x)
         for name, trajectory, ours, theirs in (
-            ("candidate's cost", rolled, of_candidate, estimate.candidate_cost),
+            ("candidate's cost", rolled, of_rolled, estimate.candidate_cost),
             ("cost", x, own, estimate.cost),
         ):
             found += self._compared(name, trajectory, ours, theirs, window, mean, status)
@@ -357,8 +357,9 @@ class Judge:
                 broken = over & (rows(one, before[i], seen) <= 0.0) & known
                 if broken.any() or (over.any() and not dropped):
                     j = int(np.argmax(broken if broken.any() else over))
+                    which = " that the candidate keeps" if broken.any() else ""
                     found.append((
-                        f"a row of {name} is missed" + " that the candidate keeps" * broken.any(),
+                        f"a row of {name} is missed{which}",
                         (i, j, missed[j], allowed[j], estimate.status),
                     ))
         return found + self._of_constraint(estimate, window, own, of_candidate)
