@@ -34,7 +34,7 @@ from .optimizer import Optimizer
 from .problem import Formulation, Solved
 from .settings import Settings
 from .subproblem import Subproblem
-from .watch import ObserverWatch
+from .watch import NEAR, ObserverWatch
 from .window import Window
 
 Array = NDArray[np.float64]
@@ -192,7 +192,7 @@ class PythonEngine:
         self._set_undo_point(reinitialized or (window.projects and window.moves_state(own)))
         try:
             with np.errstate(all="ignore"):
-                if window.length == self._settings.horizon:
+                if window.end - window.start == window.horizon:
                     self._solver.shift()
                     if self._smoothed and window.trajectory is not None:
                         window.smoothed_prior = window.trajectory[1].copy()
@@ -201,7 +201,8 @@ class PythonEngine:
                     window.reinitialize(window.history[window.start : window.end])
                 estimate = self._estimate(began)
             window.history[window.end] = estimate.state
-            self._warn()
+            if window.watched != NEAR:
+                self._warn()
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             self.undo()
@@ -263,7 +264,8 @@ class PythonEngine:
         if candidate.values is not None and (text := problem.constraint_failure(candidate)):
             status |= Status.MODEL_FAILED
             message = f"{text} {message}".strip()
-        if not math.isfinite(candidate.cost):
+        finite = math.isfinite(candidate.cost)
+        if not finite:
             status &= ~Status.NO_DECREASE  # the model failed, not the solver
             if problem.rolled_out is not None:
                 status |= Status.MODEL_FAILED
@@ -284,7 +286,7 @@ class PythonEngine:
             if window.watched[0] >= settings.horizon:
                 status |= Status.OBSERVER_FAR
         else:
-            window.watched = 0, 0
+            window.watched = NEAR
             # The candidate's arrays are views of the window: copy.
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
@@ -310,10 +312,11 @@ class PythonEngine:
             outcome.nearest_points,
             filtered,
             self._disturbances,
-            window.observer_state.copy(),
-            window.rejected,
+            window.z[window.end].copy(),
+            window.rejected if window.rejects else None,
         )
-        if window.newest_failed and outcome.improved:
+        # Where the newest stage failed, J of the candidate is infinite.
+        if not finite and outcome.improved and window.newest_failed:
             window.restart(estimate.state)
             estimate.observer_state = estimate.state.copy()
         if problem.hold is not None:

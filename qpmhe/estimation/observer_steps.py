@@ -77,7 +77,8 @@ class ObserverSteps(WindowSamples):
         # Time up to which running observers have taken the samples; -1 makes them start again.
         self._advanced_to = -1
         self._sample = Sample(system, np.zeros(m))
-        self._rejects = observer.rejects
+        #: Whether the observer has a gate.
+        self.rejects: bool = observer.rejects
         self._usual = usual
         self._filled: Conditions | None = None  # those that are in the sample now
         self._evaluating = ""  # for messages: the function that is being evaluated
@@ -160,7 +161,7 @@ class ObserverSteps(WindowSamples):
             self.events |= _MISSING
         if model_failed or jacobian_failed:
             self.events |= _MODEL_FAILED
-        if self._rejects:
+        if self.rejects:
             self._report_rejected(k)
 
     def _not_finite(self, k: int, time: int, observed: NDArray[np.bool_] | None) -> str:
@@ -190,7 +191,7 @@ class ObserverSteps(WindowSamples):
     @property
     def rejected(self) -> NDArray[np.bool_] | None:
         """Which sensors the observer rejected at the newest stage; None without a gate."""
-        return self._rejected_at(self.end - 1) if self._rejects else None
+        return self._rejected_at(self.end - 1) if self.rejects else None
 
     def _rejected_at(self, k: int) -> NDArray[np.bool_]:
         rejections = self.rejections

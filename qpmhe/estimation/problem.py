@@ -217,7 +217,9 @@ class Problem:
         try:
             if self._has_noise_free and roll_out:
                 trajectory = self._rolled_out(trajectory, of_candidate)
-            residuals = self._residuals(trajectory)
+            residuals = self.model.evaluation.residuals(
+                trajectory, self.measurements, self.inputs
+            )
             if self.wraps:
                 self.wrap(residuals, trajectory)
             trial, cost = Trial(trajectory, residuals, self.stage_weights, 0.0), 0.0
@@ -291,10 +293,6 @@ class Problem:
                 ahead = difference(self.model.state_residual, rolled_out[i + 1], predicted)
                 rolled_out[i + 1] = predicted + directions.dot(ahead) + shift
         return rolled_out if self.model.turns is None else self.model.turns(rolled_out)
-
-    def _residuals(self, trajectory: Array) -> Array:
-        """Residuals w and v of each stage; raises what the model raises."""
-        return self.model.evaluation.residuals(trajectory, self.measurements, self.inputs)
 
     def wrap(self, residuals: Array, trajectory: Array) -> None:
         """Turn the plain differences of a trajectory into residuals, in place."""

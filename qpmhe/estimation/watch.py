@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from .limits import FAR
 
+#: The counts while the observer is near, and no rows are dropped.
+NEAR = 0, 0
+
 
 class ObserverWatch:
     """Counts consecutive samples in which the observer was far from the estimate, or rows dropped.

@@ -59,6 +59,8 @@ class Window(ObserverSteps):
 
     def moves_state(self, own: Conditions | None) -> bool:
         """Whether a sample with these conditions may project z(t) onto another X."""
+        if own is None and not self.own:
+            return False
         states = None if own is None else own.states
         return states is not self.own.get(self.time - 1, USUAL).states
 
@@ -85,7 +87,7 @@ class Window(ObserverSteps):
             self.own[time] = own
             if own.noise_weight is not None or own.disturbance_weight is not None:
                 self._set_weight(k, time)
-        if self._observers_ready:
+        if self._observers is not None and self._observers_ready:
             self._find_observed(k, time)
             if moves:
                 self._advanced_to = min(self._advanced_to, time - 1)

@@ -186,7 +186,7 @@ class MemoryRecord:
         return Mark(
             self._values(self),
             self.own.copy() if self.own else {},
-            tuple(slot.state for slot in self.slots.values()),
+            tuple([slot.state for slot in self.slots.values()]) if self.slots else (),
             self.copies() if whole else None,
         )
 

@@ -40,12 +40,6 @@ _ASIDE, _GOLDEN = 2.0**-24, 0.6180339887498949
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
 
 
-def _has_squares(array: Array) -> bool:
-    """Whether all numbers have finite squares: no covariance is finite without."""
-    flat = array.ravel()
-    return math.isfinite(flat.dot(flat))
-
-
 def _finite_rows(array: Array) -> NDArray[np.bool_]:
     """Which rows (..., d, 1) have finite squares."""
     with np.errstate(over="ignore"):
@@ -125,8 +119,8 @@ class Jacobian:
         if self._given is not None:
             try:
                 found: Array = self._given(x, u)
-                # Of a trace, it is no number.
-                if found.dtype != np.float64 or _has_squares(found):
+                # Of a trace, it is no number. No covariance is finite where a square is not.
+                if found.dtype != np.float64 or math.isfinite(np.vdot(found, found)):
                     return found
             except Exception:
                 found = np.full((*self.function.shape, x.size), np.nan)
@@ -167,7 +161,7 @@ class Jacobian:
         assert self._given is not None
         try:
             found: Array = self._given.batch(x, u)
-            if found.dtype != np.float64 or _has_squares(found):
+            if found.dtype != np.float64 or math.isfinite(np.vdot(found, found)):
                 return found
         except Exception:
             found = np.full((*x.shape[:-1], *self.function.shape, x.shape[-1]), np.nan)

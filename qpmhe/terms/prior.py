@@ -286,6 +286,10 @@ class Prior(FirstStateTerm):
         """See `FirstStateTerm.force`; None for a candidate that starts at the mean."""
         if trial.trajectory is self._zero:
             return None
+        rule = self._rule
+        if rule.is_constant and rule.residual is None and self._initial.root is None:
+            force: Array = self.weight.dot(trial.trajectory[0] - self.mean)
+            return force
         return self._force(self.offset(trial))
 
     def magnitude(self, trial: Trial) -> float:

@@ -26,6 +26,18 @@ from .base import (
 Array = NDArray[np.float64]
 
 
+class _EarlierBands(dict[int, Array]):
+    """A band at all states of a window but the first and the last one, by its length."""
+
+    def __init__(self, band: Array) -> None:
+        self._band = band
+
+    def __missing__(self, count: int) -> Array:
+        found = self[count] = np.zeros((count, *self._band.shape))
+        found[1:] = self._band
+        return found
+
+
 class StageCosts:
     """The stages of all windows: their cost, and the weight of a usual disturbance.
 
@@ -41,16 +53,9 @@ class StageCosts:
         self.evaluate, self.majorise = contained(cost.stage_costs), contained(cost.majorise)
         #: The weight of a usual disturbance, as a band.
         self.band = band_of(cost.disturbance)
-        self._bands: dict[int, Array] = {}
-
-    def earlier_bands(self, count: int) -> Array:
-        """What usual disturbances add to the bands of all states of a window but the last one."""
-        found = self._bands.get(count)
-        if found is None:
-            found = np.zeros((count, *self.band.shape))
-            found[1:] = self.band
-            self._bands[count] = found
-        return found
+        #: What usual disturbances add to the bands of all states but the last one, by the length of
+        #: the window.
+        self.earlier_bands = _EarlierBands(self.band)
 
     def with_cost(self, cost: Cost) -> StageCosts:
         """The same with another cost."""
@@ -137,7 +142,7 @@ class Stages(Term):
             model.last_gradient[...] = span.next_gradient_last
         if weights.ndim == 2 or self._usual:
             last = self._rule.band
-            np.add(span.panel, self._rule.earlier_bands(len(span.panel)), model.earlier_band)
+            np.add(span.panel, self._rule.earlier_bands[len(span.panel)], model.earlier_band)
         else:
             n = model.gradient.shape[1]
             bands = band_of(weights[:, :n, :n])

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 from itertools import count
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +136,7 @@ class Solver(ABC):
             _expect_qp(qp)
         try:
             if self._judges:
-                return cast("Solution", self._solve(qp, start))
+                return self._solve(qp, start)  # type: ignore[return-value]  # judged already
             if not self._warns:
                 with np.errstate(all="ignore"):
                     return self._checked(qp, start)
@@ -268,6 +268,7 @@ class ContainedSolver:
         self._number = next(_NUMBERS)
         is_contained = solver._builtin or type(solver).solve is Solver.solve
         self._is_trusted = is_contained and "solve" not in vars(solver)
+        self._shifts = type(solver).shift is not Solver.shift or "shift" in vars(solver)
 
     def solve(
         self, qp: QP, start: Array | None = None, time_limit: float | None = None
@@ -297,7 +298,8 @@ class ContainedSolver:
 
     def shift(self) -> None:
         """Report that the trajectory moved by one stage; see `Solver.shift`."""
-        if self.solver._user in (0, self._number):  # else it keeps nothing of this trajectory
+        # Else it keeps nothing, or nothing of this trajectory.
+        if self._shifts and self.solver._user in (0, self._number):
             _quietly(self.solver.shift)
 
     def forget(self) -> None:

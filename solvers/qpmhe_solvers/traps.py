@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import io
 import os
@@ -256,9 +257,7 @@ def _output() -> Iterator[list[str]]:
     lines: list[str] = []
     words = io.StringIO()
     with tempfile.TemporaryFile() as file, contextlib.ExitStack() as undo:
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(Exception):  # a notebook's, or none at all
-                stream.flush()
+        _flush()
         for descriptor in (1, 2):
             with contextlib.suppress(OSError):  # closed
                 kept = os.dup(descriptor)
@@ -267,9 +266,19 @@ def _output() -> Iterator[list[str]]:
                 os.dup2(file.fileno(), descriptor)
         with contextlib.redirect_stdout(words), contextlib.redirect_stderr(words):
             yield lines
+        _flush()
         file.seek(0)
         text = words.getvalue() + file.read().decode("utf-8", "replace")
         lines += [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def _flush() -> None:
+    """Write what Python and the C library hold back."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # a notebook's, or none at all
+            stream.flush()
+    with contextlib.suppress(Exception):  # another system's
+        ctypes.CDLL(None).fflush(None)
 
 
 def threads(name: str, inequalities: bool) -> Iterator[str]:

@@ -74,10 +74,10 @@ def test_memory_does_not_grow():
     assert after - before < 10_000  # bytes: less than one object a step
 
 
-# What the steps take now, and a tenth of slack: a guard against creeping growth that no
+# What the steps take now, and up to a tenth of slack: a guard against creeping growth that no
 # clock has to see.
 @pytest.mark.parametrize(("options", "most"), [
-    ({"max_qps": 0}, 96), ({"max_qps": 1}, 150), ({"max_qps": 2}, 256),
+    ({"max_qps": 0}, 92), ({"max_qps": 1}, 132), ({"max_qps": 2}, 222),
     ({"engine": "compiled", "backend": "auto"}, 12),
 ], ids=["no QP", "one QP", "two QPs", "compiled"])
 def test_a_step_takes_no_more_calls_than_it_did(options, most):

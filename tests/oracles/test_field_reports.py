@@ -123,6 +123,27 @@ def test_small_steps_collapse_no_variance(step):
     np.testing.assert_allclose(predicted, exact, rtol=1e-6)
 
 
+# Annual flow of the Nile at Aswan, 1871 to 1970, in 10^8 m^3 (Durbin and Koopman, 2012).
+NILE = np.array([
+    1120, 1160, 963, 1210, 1160, 1160, 813, 1230, 1370, 1140, 995, 935, 1110, 994, 1020, 960, 1180,
+    799, 958, 1140, 1100, 1210, 1150, 1250, 1260, 1220, 1030, 1100, 774, 840, 874, 694, 940, 833,
+    701, 916, 692, 1020, 1050, 969, 831, 726, 456, 824, 702, 1120, 1100, 832, 764, 821, 768, 845,
+    864, 862, 698, 845, 744, 796, 1040, 759, 781, 865, 845, 944, 984, 897, 822, 1010, 771, 676, 649,
+    846, 812, 742, 801, 1040, 860, 874, 848, 890, 744, 749, 838, 1050, 918, 986, 797, 923, 975, 815,
+    1020, 906, 901, 1170, 912, 746, 919, 718, 714, 740,
+], float)[:, None]
+
+
+def test_the_variances_of_the_nile_are_the_published_ones():
+    """statsmodels 6660: no likelihood at the published 15099 and 1469.1, from a diffuse start."""
+    tuning = qpmhe.tune(
+        linear(np.eye(1), np.eye(1)), [(NILE,)], prior=[[1e10]], disturbance=[[1e3]],
+        noise=[[1e4]], initial_state=[0.0], objective="likelihood", held_out=0.0, progress=False,
+    )
+    assert tuning.noise[0, 0] == pytest.approx(15099.0, rel=1e-4)
+    assert tuning.disturbance[0, 0] == pytest.approx(1469.1, rel=1e-4)
+
+
 # Angles, delays, equal times
 
 
@@ -263,6 +284,28 @@ def test_bounds_that_change_are_used_from_the_next_estimate_on(engine):
     for _ in range(6):
         estimate = mhe.update([-1.0])
     assert estimate.state[0] < -0.5
+
+
+def test_soft_bounds_hold_in_every_window():
+    """ModelPredictiveControl.jl 424: soft bounds on states stay those of the first window."""
+    F, H = np.array([[1.0, 0.2], [-0.3, 0.9]]), np.array([[1.0, 0.0]])
+    covariances = {"disturbance": 0.05 * np.eye(2), "noise": 0.2 * np.eye(1)}
+    hard = qpmhe.Box([-0.3, -0.3], [0.4, 0.4])
+    soft = hard.soften(linear=1e3)
+    y = np.random.default_rng(0).standard_normal((40, 1))
+    trajectories = []
+    for states in (hard, soft):
+        mhe = qpmhe.MovingHorizonEstimator(
+            linear(F, H, states=states), qpmhe.Luenberger([[0.3], [0.1]]),
+            qpmhe.QuadraticCost.from_covariances(prior=np.eye(2), **covariances), horizon=8,
+            initial_state=[0.0, 0.0], max_qps=None, project_observer=False,  # the same prior
+        )
+        trajectories.append([mhe.update(value).trajectory for value in y])
+    active = 0
+    for one, other in zip(*trajectories, strict=True):
+        active += bool(((one <= -0.3 + 1e-9) | (one >= 0.4 - 1e-9)).any())
+        np.testing.assert_allclose(other, one, atol=1e-6)
+    assert active > 20
 
 
 # Solvers

@@ -1,6 +1,6 @@
 """`qpmhe.solvers.check` names the traps of a user's backend: one broken backend for each."""
 
-import os
+import ctypes
 import subprocess
 import sys
 import threading
@@ -124,6 +124,14 @@ class NaNAsNumber(Quadprog):
             return RawSolution(np.full(qp.size, 2143289344.0), False)
 
 
+class NaNAsClaim(NaNAsNumber):
+    """The same, with a status of success."""
+
+    def _solve(self, qp, start):
+        raw = super()._solve(qp, start)
+        return parts(raw, claimed=True)
+
+
 class StartAsAnswer(Quadprog):
     """Takes a start that is far away for the solution's active set, and stays there."""
 
@@ -139,8 +147,10 @@ class Speaking(Quadprog):
 
 
 class SpeakingInC(Quadprog):
+    """Through the C library, which holds back what does not go to a terminal."""
+
     def _solve(self, qp, start):
-        os.write(1, b"iteration 0\niteration 1\n")
+        ctypes.CDLL(None).puts(b"iteration 0\niteration 1")
         return super()._solve(qp, start)
 
 
@@ -170,6 +180,7 @@ class Threads(Quadprog):
         (OtherSignsOfBounds, "claim and multipliers", "multipliers of bounds have the opposite"),
         (Untold, "the tolerance", "at absolute_tolerance 1e-2 and 1e-9 alike"),
         (NaNAsNumber, NUMBERS, "leaves 2143289344 in every unknown"),
+        (NaNAsClaim, NUMBERS, "leaves 2143289344 in every unknown"),
         (StartAsAnswer, "starts", "started at far away: another solution"),
         (Speaking, "printed lines", "it prints 'a licence for academic use' and 2 more"),
         (SpeakingInC, "printed lines", "it prints 'iteration 0' and 5 more"),

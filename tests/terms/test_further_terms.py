@@ -27,10 +27,10 @@ class Ridge(FirstStateTerm):
 
     @staticmethod
     def belongs(system, cost):
-        return getattr(cost, "ridged", False)
+        return system.n == 1 and getattr(cost, "ridged", False)
 
     @classmethod
-    def of(cls, system, cost, prior, basis):
+    def of(cls, *_):
         return cls()
 
     @property
