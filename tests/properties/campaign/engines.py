@@ -3,9 +3,10 @@
 A difference is explained, in this order: by rounding, where an engine differs as much from itself
 when its memory and its data change in their last digits; by the tolerance of the Python step's QPs,
 where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
-where it differs as much from itself when the QPs change in their last digits; by a direction in
-which J is nearly flat, where the step in C loses digits to the weights of active rows; by a cap or
-by a QP that a method has not solved. What is left is a fault.
+where it differs as much from itself when the QPs change in their last digits; by a cap or
+by a QP that a method has not solved, mostly since it has no feasible point; by a direction in which
+J is nearly flat, where the step in C loses digits to the weights of active rows. What is left is a
+fault.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class Nudging(Solver):
 
     def __init__(self):
         super().__init__(SolverOptions())
+        self.unsolved = False
         self.condition = 1.0  # the largest one of their Hessians in units of its diagonal
         self.r, self.inner = np.random.default_rng(4), create(
             "auto", SolverOptions(absolute_tolerance=1e-12)
@@ -70,6 +72,7 @@ class Nudging(Solver):
         values = np.linalg.eigvalsh(lower / np.outer(roots, roots))
         self.condition = max(self.condition, values[-1] / max(values[0], EPS))
         solved = found.status is SolveStatus.SOLVED
+        self.unsolved |= not solved  # also one of a correction, which no status tells
         return RawSolution(found.d, solved, found.iterations, found.bound_duals, found.row_duals)
 
 
@@ -185,13 +188,14 @@ class Beside:
                 return "tolerance of QPs"
             if self._is_hessian(x, act):
                 return "rounding of the Hessian"
-            if self.nudging.settings.backend.condition > FLAT:
-                return "flat J"
         finally:
             engine._memory[...] = after
+        solver = self.nudging.settings.backend
         if "max_solver_iterations" in self.case.options:
             return "cap"
-        return "unsolved QP" if STOPPED & (estimate.status | other.status) else "open"
+        if solver.unsolved or STOPPED & (estimate.status | other.status):
+            return "unsolved QP"
+        return "flat J" if solver.condition > FLAT else "open"
 
     def _is_rounding(self, estimate, other, kind, x, J, act):
         r, engine = np.random.default_rng(3), self.compiled._engine
@@ -220,7 +224,8 @@ class Beside:
             self.nudging = self.case.estimator(
                 "python", backend=Nudging(), max_solver_iterations=None
             )
-        found, self.nudging.settings.backend.condition = [], 1.0
+        found, solver = [], self.nudging.settings.backend
+        solver.condition, solver.unsolved = 1.0, False
         for _ in range(_TRIES):
             self.compiled._engine._memory[...] = self.memory
             self._hand_over(self.nudging)
