@@ -340,7 +340,7 @@ class _Rehearsal:
         """
         largest = max(abs(expected.candidate).max(), abs(expected.observer_state).max())
         window = self._python.memory.window
-        if window.projects and window.covariance is not None:
+        if window.projects and window.covariance is not None and self._first is not None:
             first, last = (
                 math.sqrt(abs(P).max()) for P in (self._first, window.covariance[window.end])
             )
