@@ -461,12 +461,14 @@ def report(totals, remarks, allowed):
     return failures
 
 
-def speed(there, names):
+def speed(there, names, engines):
     """Print ratios of medians, this tree over the other, timed in turn."""
     ratios = defaultdict(dict)
     with Server(there) as before, Server(HERE) as now:
         for name in names:
             for (engine, call), passes in PASSES.items():
+                if engine not in engines:
+                    continue
                 seconds = defaultdict(list)
                 for k in range(1 + passes):
                     for tree in (before, now) if k % 2 else (now, before):
@@ -512,7 +514,7 @@ def main(arguments=None):
             names = [name for name in now.ask("names") if fnmatch(name, options.cases)]
         print(f"{len(names)} cases, against {_git('log', '-1', '--oneline', options.against)}")
         if options.time:
-            speed(there, names)
+            speed(there, names, options.engines)
             return 0
         totals, remarks = compared(there, options, names)
     return report(totals, remarks, lambda name: own.get(name, usual))

@@ -23,7 +23,7 @@ from ..model.evaluation import (
     VALUES,
     Buffers,
     Evaluator,
-    VirtualMachine,
+    machine,
     results_of,
 )
 from ..model.expressions import CasadiModel, casadi_model, import_casadi
@@ -42,6 +42,7 @@ def from_casadi(
     *,
     dt: float | None = None,
     method: str = "rk4",
+    steps: int = 1,
     n: int | None = None,
     p: int | None = None,
     m: int | None = None,
@@ -62,8 +63,10 @@ def from_casadi(
     dt : float, optional
         Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit of time,
         discretised with u held over the step.
-    method : {"rk4", "euler"}
-        Runge-Kutta of order 4, or one explicit Euler step.
+    method : {"rk4", "euler", "radau", "midpoint"}
+        How the ODE is discretised, see `qpmhe.System.from_ode`.
+    steps : int
+        Number of substeps in each sample.
     n, p, m : int, optional
         Numbers of states, outputs and inputs; n (and m, if there are inputs) are required if f is
         not a casadi.Function.
@@ -88,7 +91,7 @@ def from_casadi(
     """
     if not (compiled is None or isinstance(compiled, bool)):
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
-    model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method)
+    model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method, steps=steps)
     library: ctypes.PyDLL | None = None
     if compiled or (compiled is None and find_compiler() is not None):
         library = _library(
@@ -100,16 +103,18 @@ def from_casadi(
         return from_casadi(
             change.of_one_state(model.f, join, 1.0 if dt is None else 0.0),
             change.of_one_state(model.h, join),
-            n=change.n, p=model.p, m=change.m, dt=dt, method=method, compiled=compiled, **others,
+            n=change.n, p=model.p, m=change.m, dt=dt, method=method, steps=steps,
+            compiled=compiled, **others,
         )
 
     recipe = {
-        "f": model.f, "h": model.h, "dt": dt, "method": method, "compiled": compiled, **options,
+        "f": model.f, "h": model.h, "dt": dt, "method": method, "steps": steps,
+        "compiled": compiled, **options,
     }
 
     def made(timed: bool) -> System:
         maker = (
-            VirtualMachine(model, timed) if library is None
+            machine(model, timed) if library is None
             else partial(_compiled, model, library, timed)
         )
         evaluator = Evaluator(maker)
@@ -117,7 +122,7 @@ def from_casadi(
         origin = Origin(kernel=evaluator, jacobians="casadi", symbolic=model, is_timed=timed)
         if not timed:
             origin = replace(
-                origin, dt=model.dt, method=model.method, make_augmented=augmented,
+                origin, dt=model.dt, how=model.how, make_augmented=augmented,
                 make_timed=None if model.dt is None else lambda _: made(True),
                 recipe=(from_casadi, recipe),
             )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .._checks import dimension, need, positive
 from ..model.augmentation import Augmentation
+from ..model.discretize import Discretization
 from ..model.functions import Trusted, takes_input
 from ..model.model import Origin
 from ..model.points import FEW, points
@@ -123,7 +124,7 @@ def from_jax(
         return _assembled(_Model(programs, None), m + 1, own, timed_options(options))
 
     origin = Origin(
-        dt=length, method=None if length is None else method,
+        dt=length, how=None if length is None else Discretization(method),
         sources={name: programs.as_numpy(name) for name in ("f", "h")},
         make_timed=None if length is None else timed,
         make_augmented=partial(_augmented, f, h, p, m, dt, method),

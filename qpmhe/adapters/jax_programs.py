@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .._checks import need
 from ..errors import InvalidInputError, ModelError
-from ..model.discretize import discretize
+from ..model.discretize import EXPLICIT, checked_discretization, discretize
 from ..model.functions import check_inputs, takes_input
 from ..model.points import Points
 from ..model.stand_ins import without_symbols
@@ -52,7 +52,7 @@ class Programs:
         rate, output = self._checked("f", f, n, probes), self._checked("h", h, p, probes)
         check_inputs(m, f=takes_input("f", f, m), h=takes_input("h", h, m))
         self._functions = {"f": rate, "h": output}
-        step = discretize(rate, None, method)[0]
+        step = discretize(rate, None, checked_discretization(method, 1, EXPLICIT))[0]
         if method == "rk4":
             step = partial(_runge_kutta, jax, rate)
 

@@ -20,10 +20,12 @@ def expression_of(system: System, name: str) -> Traced:
             return found
         model = CasadiModel(
             found.function, found.function, system.n, system.p, system.m, tracing.dt,
-            tracing.method,
+            tracing.how,
         )
     if model is None:
         return Traced(None, "it was not made of functions that are known")
+    if name == "f" and model.is_implicit:
+        return Traced(None, "it is an implicit step, which solves equations")
     ca = import_casadi()
     x, u = ca.SX.sym("x", system.n), ca.SX.sym("u", system.m)
     try:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.evaluation import Buffers, fixed_call
+from ..model.evaluation import Buffers, fixed_call, machine
 from ..model.expressions import CasadiModel, import_casadi
 from ..model.points import Magnitude, states_at
 from ..model.sets import ConvexSet
@@ -36,7 +36,38 @@ class Interpreter:
     """A model by CasADi's virtual machine; NaN where it breaks off."""
 
     def __init__(self, model: CasadiModel) -> None:
-        ca, self.model = import_casadi(), model
+        self.model = model
+        # Relative changes without a pattern: equal ones would leave differences as they are.
+        self._nudge = 1 + _NUDGE * np.random.default_rng(0).uniform(-1.0, 1.0, model.n)
+        self._calls: dict[str, tuple[Callable[[], object], Array]] = {}
+        self._at = np.zeros(model.n), np.zeros(max(model.m, 1)), np.zeros(1)
+        if model.is_implicit:
+            self._call_equations()
+        else:
+            self._call_expressions()
+
+    def _call_equations(self) -> None:
+        """Have the steps solved by Newton's method."""
+        model, (x, u, dt) = self.model, self._at
+        make = machine(model, True)
+        for name in _ALL:
+            states, inputs, results, evaluate = make(1, (name,))
+
+            def call(
+                states: Array = states, inputs: Array = inputs,
+                evaluate: Callable[[], object] = evaluate,
+            ) -> bool:
+                states[0] = x
+                inputs[0, : model.m], inputs[0, model.m] = u[: model.m], dt[0]
+                with np.errstate(all="ignore"):
+                    evaluate()
+                return True
+
+            self._calls[name] = call, results[name][0]
+
+    def _call_expressions(self) -> None:
+        """Have CasADi's virtual machine evaluate the expressions."""
+        ca, model = import_casadi(), self.model
         n, p, step = model.n, model.p, model.step()
         kind = ca.SX if step.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
         x, u, dt = kind.sym("x", n), kind.sym("u", model.m), kind.sym("dt")
@@ -46,13 +77,9 @@ class Interpreter:
             "f": (f, (n,)), "h": (h, (p,)), "f_jacobian": (ca.jacobian(f, x).T, (n, n)),
             "h_jacobian": (ca.jacobian(h, x).T, (p, n)),
         }
-        self._at = np.zeros(n), np.zeros(max(model.m, 1)), np.zeros(1)
-        self._calls: dict[str, tuple[Callable[[], bool], Array]] = {}
         for name, (value, shape) in values.items():
             function, result = ca.Function(name, [x, u, dt], [ca.densify(value)]), np.zeros(shape)
             self._calls[name] = fixed_call(function, self._at, (result,)), result
-        # Relative changes without a pattern: equal ones would leave differences as they are.
-        self._nudge = 1 + _NUDGE * np.random.default_rng(0).uniform(-1.0, 1.0, n)
 
     def value(self, name: str, x: Array, u: Array, dt: float) -> Array:
         """The map f, h or the Jacobian of either, at one state; good until the next call."""

@@ -59,7 +59,6 @@ class Layout:
     nu: int
     horizon: int
     sets: tuple[tuple[bool, int], ...]
-    continuous: int
     real: str = "double"
     #: Whether a term of the cost has a loss that is not quadratic.
     loss: bool = False
@@ -96,7 +95,7 @@ class Layout:
 
     @classmethod
     def of(
-        cls, directions: Directions, horizon: int, continuous: int, real: str = "double",
+        cls, directions: Directions, horizon: int, real: str = "double",
         lapack: bool = False, clock: bool = False,
     ) -> Layout:
         """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
@@ -116,7 +115,7 @@ class Layout:
         weighs, kind = cost.observer_prior is not None, _OBSERVERS.index(own.kind)
         projects = system.states is not None and observer.metric is None
         return cls(
-            system.n, system.p, system.m, horizon, sets, continuous, real, observer=kind,
+            system.n, system.p, system.m, horizon, sets, real, observer=kind,
             widened=any(one.graduation > 1.0 for one in losses[1:]),
             loss=any(one.kind != "quadratic" for one in losses),
             own_losses=sum((one.kind == "own") << k for k, one in enumerate(losses)),
@@ -144,7 +143,7 @@ class Layout:
         bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
-            "continuous": self.continuous, "real": self.real, "loss": int(self.loss),
+            "real": self.real, "loss": int(self.loss),
             "widened": int(self.widened), "own_losses": self.own_losses,
             "lapack": int(self.lapack),
             "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",

@@ -25,7 +25,7 @@ from .directions import Directions
 from .fingerprint import source_key
 from .layout import TERMS, Layout, settings_record
 from .losses import loss_function
-from .source import CONTINUOUS, MAIN, estimator_files, template
+from .source import MAIN, estimator_files, template
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
@@ -129,7 +129,7 @@ def _window_size(system: System, observer: Observer, cost: Cost, horizon: int) -
     """Bytes of an estimator's memory, in double precision."""
     directions = Directions(system, observer, cost)
     one, two = (
-        Layout.of(directions, count, 0).estimator_type().itemsize for count in (1, 2)
+        Layout.of(directions, count).estimator_type().itemsize for count in (1, 2)
     )
     return one + (horizon - 1) * (two - one)
 
@@ -182,10 +182,9 @@ def planned(
     if reason:
         raise OptionError(f"no C code for this estimator: {reason}")
     assert system.symbolic is not None
-    model = symbolic_model(system, observer, cost)
     directions = Directions(system, observer, cost)
     layout = Layout.of(
-        directions, settings.horizon, CONTINUOUS[model.method], real, lapack,
+        directions, settings.horizon, real, lapack,
         settings.time_budget is not None,
     )
     return layout, settings_record(

@@ -15,6 +15,13 @@ from numpy.typing import NDArray
 from .._version import __version__
 from ..errors import CompilationError
 from ..model.expressions import CasadiModel, import_casadi
+from ..model.implicit_steps import (
+    COLLOCATIONS,
+    MOST_HALVINGS,
+    MOST_ITERATIONS,
+    ROUNDING,
+    SMALL,
+)
 from .layout import TERMS, Layout
 from .single import in_single_precision
 
@@ -24,7 +31,6 @@ _FURTHER = ""
 MAIN = "mhe.c"
 # Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
-CONTINUOUS = {None: 0, "euler": 1, "rk4": 4}
 
 
 @lru_cache(maxsize=16)
@@ -123,8 +129,33 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         + '#pragma GCC diagnostic ignored "-Wconversion"\n' * single + "#endif",
         "#define casadi_real mhe_real", code,
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif\n",
-        *calls, template("model.c"),
+        *calls, template("model.c"), *_step_parts(model),
     ))
+
+
+def _step_parts(model: CasadiModel) -> list[str]:
+    """The parts of C that make a map of f: f itself, or substeps of a method."""
+    how = model.how
+    if how is None:
+        return [Template(template("step_map.c")).substitute(value="mhe_f", slope="mhe_f_jacobian")]
+    single = how.steps == 1
+    names = {
+        "value": "mhe_f" if single else "mhe_substep",
+        "slope": "mhe_f_jacobian" if single else "mhe_substep_jacobian",
+    }
+    if how.is_implicit:
+        method = COLLOCATIONS[how.method]
+        text = Template(template("step_implicit.c")).substitute(
+            names, stages=len(method.A), iterations=MOST_ITERATIONS, halvings=MOST_HALVINGS,
+            rounding=repr(ROUNDING), small=repr(SMALL),
+            weights=", ".join(f"{{{', '.join(map(repr, row))}}}" for row in method.A.tolist()),
+            ends=", ".join(map(repr, method.d.tolist())),
+        )
+    else:
+        text = Template(template(f"step_{how.method}.c")).substitute(names)
+    if single:
+        return [text]
+    return [text, Template(template("substeps.c")).substitute(steps=how.steps)]
 
 
 # A function that other programs would call, on one line or on several.
@@ -184,7 +215,6 @@ def model_files(model: CasadiModel) -> dict[str, str]:
     head = (
         "#include <stdint.h>\ntypedef double mhe_real;\n"
         f"#define MHE_NX {model.n}\n#define MHE_NY {model.p}\n#define MHE_NU {model.m}\n"
-        f"#define MHE_CONTINUOUS {CONTINUOUS[model.method]}\n"
     )
     return {"model.c": head + prologue() + model_source(model) + template("model_api.c")}
 

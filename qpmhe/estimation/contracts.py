@@ -15,6 +15,7 @@ from ..errors import InvalidInputError, ModelError, PriorWarning, QpmheError
 from ..model.functions import EvaluationError
 from ..model.system import System
 from ..observers import Observer, Sample
+from ..observers.base import check_written
 from ..terms.base import read_only
 
 Array = NDArray[np.float64]
@@ -80,6 +81,7 @@ def check_correction(
                 sample = _sample(system, observer, state, u)
             except Exception:  # the model's bad luck
                 return
+        following = sample.next_memory
         try:
             with np.errstate(all="ignore"):
                 answer = tried.correct(state.copy(), v.copy(), sample)
@@ -92,6 +94,8 @@ def check_correction(
                 f"{error} at the initial state {state.tolist()}."
             ) from error
         correction = _checked_pair(observer, answer, filtered, system.n)
+        if following is not None:
+            check_written(observer, sample, following)
         # Beside zero: rounding, in the prior's units. What is not finite is bad luck, for the run.
         size = _ROUNDING * (deviations + np.abs(state))
         if not v.any() and (np.abs(correction) > size).any() and np.isfinite(correction).all():

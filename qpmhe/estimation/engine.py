@@ -201,8 +201,7 @@ class PythonEngine:
                     window.reinitialize(window.history[window.start : window.end])
                 estimate = self._estimate(began)
             window.history[window.end] = estimate.state
-            if window.watched != NEAR:
-                self._warn()
+            self._warn()
             return estimate
         except BaseException:  # an interrupt, or a warning as an error: the sample is not taken
             self.undo()
@@ -238,7 +237,10 @@ class PythonEngine:
         self._times.end()
 
     def _warn(self) -> None:
-        text = self._watch.warning(self._window.watched)
+        watched = self._window.watched
+        if watched == NEAR:
+            return
+        text = self._watch.warning(watched)
         if text is not None:
             warnings.warn(text, ObserverWarning, stacklevel=4)
 

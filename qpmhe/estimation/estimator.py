@@ -31,7 +31,7 @@ from .reach import compared
 from .run import Run, RunSource
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require
-from .step_length import step_error, warn_of_step
+from .step_length import check_step
 from .time_index import paired_record
 
 Array = NDArray[np.float64]
@@ -206,11 +206,10 @@ class MovingHorizonEstimator(EstimatorMemory):
             check_correction(
                 self._own_system, observer, cost, self._initial_state, self._usual_input
             )
-            error = step_error(
+            check_step(
                 self._own_system, cost, observer.initial_covariance(), self._initial_state,
-                self._usual_input,
+                self._usual_input, 3,
             )
-            warn_of_step(error, system, 3)
             self._own_system = compared(
                 self._own_system, cost, observer.initial_covariance(), self._initial_state,
                 self._usual_input, horizon,

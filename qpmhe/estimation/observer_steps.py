@@ -15,6 +15,7 @@ from ..model.functions import contained, raised
 from ..model.sets import ConvexSet
 from ..model.system import Function, System
 from ..observers import Observer, Sample
+from ..observers.base import check_written
 from ..observers.projection import ErrorMetric, NearestPoint
 from ..observers.roots import VAGUE
 from ..terms.base import read_only
@@ -298,7 +299,10 @@ class ObserverSteps(WindowSamples):
         sample.root = sample.next_root = None
         if self.root is not None and self.is_vague[k]:
             sample.root = self.root[k]
+        following = sample.next_memory
         correction, posterior = self._corrected(k, view)
+        if following is not None:
+            check_written(self._observer, sample, following)
         terms.disturbance[...] = correction
         predicted = z_next.copy() if self._nearest is not None else None
         z_next += correction

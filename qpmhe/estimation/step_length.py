@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
 from ..errors import ModelWarning
+from ..model.discretize import Discretization
+from ..model.evaluation import Evaluator, machine
 from ..model.residuals import difference
 from ..model.system import System
 from .reach import disturbance_deviations, prior_deviations, prior_points
@@ -20,6 +24,8 @@ Array = NDArray[np.float64]
 # a coarse map by choice, which often is what the data were simulated with.
 _TOO_LONG = {"euler": 10.0}
 _USUALLY_TOO_LONG = 0.1
+# Numbers of substeps that a warning tries, by method.
+_EXPLICIT, _IMPLICIT = (2, 4, 8, 16, 32, 64), (1, 2, 4, 8, 16)
 
 
 @dataclass(frozen=True)
@@ -41,15 +47,13 @@ class StepError:
     point: Array
 
 
-def step_error(
-    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
-) -> StepError | None:
-    """Compare one step of a discretised ODE with two of half the length.
+class StepComparison:
+    """Steps of an ODE compared with others, at the initial state and at points of the prior.
 
     Parameters
     ----------
     system : System
-        The system; one without a model in continuous time has no error.
+        The system.
     cost : Cost
         Its covariances are the units.
     covariance : (n, n) array or None
@@ -58,47 +62,120 @@ def step_error(
         The initial state.
     u : (m,) array
         The usual input.
-
-    Returns
-    -------
-    StepError or None
-        None without a model in continuous time, and where no step is finite.
     """
-    if system.dt is None or not system.has_timed:
-        return None
-    try:
-        prior = prior_deviations(cost, covariance)
-        points = prior_points(system, state, prior)
-        step, half = (np.tile(np.append(u, one), (len(points), 1))
-                      for one in (system.dt, 0.5 * system.dt))
-        with np.errstate(all="ignore"):
-            f = system.timed.f.batch
-            missed = np.abs(
-                difference(system.state_residual, f(points, step), f(f(points, half), half))
-            )
-    except Exception:  # a model outside of its domain; the steps will report that
-        return None
-    units = disturbance_deviations(system, cost)
-    shares = missed / np.where(units > 0.0, units, prior)
-    shares[~np.isfinite(shares).all(axis=1)] = -1.0
-    k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
-    return StepError(float(shares[k, j]), int(j), points[k]) if shares[k, j] >= 0.0 else None
+
+    def __init__(
+        self, system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
+    ) -> None:
+        self._system, prior = system, prior_deviations(cost, covariance)
+        self._points = prior_points(system, state, prior)
+        units = disturbance_deviations(system, cost)
+        self._units = np.where(units > 0.0, units, prior)
+        self._inputs = np.tile(u, (len(self._points), 1))
+        #: What is too large an error, in standard deviations.
+        self.most = _most(system.method)
+
+    def error(self) -> StepError | None:
+        """One step against two of half the length; None where no step is finite."""
+        system = self._system
+        assert system.dt is not None
+        step, half = (
+            np.column_stack((self._inputs, np.full(len(self._inputs), one)))
+            for one in (system.dt, 0.5 * system.dt)
+        )
+        f = system.timed.f.batch
+        return self._largest(f(self._points, step), f(f(self._points, half), half))
+
+    def remedies(self) -> list[str]:
+        """Discretisations whose error is small enough, as arguments; none without an expression."""
+        system, found = self._system, []
+        model = system.symbolic
+        if model is None or model.how is None:
+            return []
+        own: list[tuple[str, tuple[int, ...]]] = [("radau", _IMPLICIT)]
+        if not model.how.is_implicit:
+            own.insert(0, (model.how.method, _EXPLICIT))
+
+        def stepped(how: Discretization) -> Callable[[], Array]:
+            evaluator = Evaluator(machine(replace(model, how=how), False))
+            return lambda: evaluator.one("f", self._points, self._inputs)
+
+        for method, counts in own:
+            for steps in counts:
+                one, other = (stepped(Discretization(method, k)) for k in (steps, 2 * steps))
+                error = self._largest(one(), other())
+                if error is not None and error.deviations <= _most(method):
+                    texts = [f"method={method!r}"] if method != model.how.method else []
+                    texts += [f"steps={steps}"] if steps > 1 else []
+                    found.append(" with ".join(texts))
+                    break
+        return [one for one in found if one]
+
+    def _largest(self, one: Array, other: Array) -> StepError | None:
+        shares = np.abs(difference(self._system.state_residual, one, other)) / self._units
+        shares[~np.isfinite(shares).all(axis=1)] = -1.0
+        k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
+        if shares[k, j] < 0.0:
+            return None
+        return StepError(float(shares[k, j]), int(j), self._points[k])
 
 
-def warn_of_step(error: StepError | None, system: System, level: int) -> None:
-    """Warn of a step that is too long, at a level of the stack."""
-    most = _TOO_LONG.get(system.method or "", _USUALLY_TOO_LONG)
-    if error is None or error.deviations <= most:
+def step_error(
+    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
+) -> StepError | None:
+    """Compare one step of a discretised ODE with two of half the length.
+
+    Arguments are those of `StepComparison`. None without a model in continuous time, and where no
+    step is finite.
+    """
+    comparison = _comparison(system, cost, covariance, state, u)
+    return None if comparison is None else comparison[1]
+
+
+def check_step(
+    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, level: int
+) -> None:
+    """Warn, at a level of the stack, where the step of a discretised ODE is too long.
+
+    Other arguments are those of `StepComparison`.
+    """
+    found = _comparison(system, cost, covariance, state, u)
+    if found is None or found[1].deviations <= found[0].most:
         return
+    comparison, error = found
+    remedies: list[str] = []
+    with suppress(Exception), np.errstate(all="ignore"):
+        remedies = comparison.remedies()
     point = np.array2string(error.point, precision=4, separator=", ")
+    remedy = (
+        f"{' or '.join(remedies)} is fine enough" if remedies
+        else "Take more substeps (steps=), or for stiff rates method='radau'"
+    )
+    steps = f"{system.steps} substeps" if system.steps > 1 else "one step"
     warnings.warn(
-        f"one integration step of dt = {system.dt:g} is too long: from x = {point} it differs from "
-        f"two steps of half this length by {error.deviations:.2g} standard deviations of the "
-        f"disturbance in state {error.component} (expected at most {most:g}), so estimates may "
-        "be wrong though each step improves its cost. Discretise with a shorter step: call the "
-        "Runge-Kutta step several times within f, or a stiff integrator, and pass f to "
-        "qpmhe.System or qpmhe.from_casadi; or make the covariance of the disturbance as large "
-        "as the error.",
+        f"{steps} of {system.method} in dt = {system.dt:g} is too long: from x = {point} the "
+        f"result differs from that of half the length by {error.deviations:.2g} standard "
+        f"deviations of the disturbance in state {error.component} (expected at most "
+        f"{comparison.most:g}), so estimates may be wrong though each step improves its cost. "
+        f"{remedy}. Or make the covariance of the disturbance as large as the error.",
         ModelWarning,
         stacklevel=level + 1,
     )
+
+
+def _most(method: str | None) -> float:
+    return _TOO_LONG.get(method or "", _USUALLY_TOO_LONG)
+
+
+def _comparison(
+    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
+) -> tuple[StepComparison, StepError] | None:
+    """The comparison and the error; None where there is none."""
+    if system.dt is None or not system.has_timed:
+        return None
+    # A model outside of its domain; the steps will report that.
+    with suppress(Exception), np.errstate(all="ignore"):
+        comparison = StepComparison(system, cost, covariance, state, u)
+        error = comparison.error()
+        return None if error is None else (comparison, error)
+    return None

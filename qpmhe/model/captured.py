@@ -265,7 +265,8 @@ class ComparisonTimes:
 
     def compared(self, time: int) -> None:
         """Note that the functions agreed with their traces before the sample of this time."""
-        self._captured.renew()
+        if self._captured.changed():  # before, or by the call itself
+            self._captured.renew()
         self._called = time // _CALLS
         self.next = time + self._looks
 

@@ -36,8 +36,17 @@ _INWARD, _MOST_INWARD = 2.0**-10, 0.25
 # How far beside a point where it is still not finite: shares of the magnitudes, of changing sign
 # and size, since functions without a derivative at 0 have none along axes and diagonals, either.
 _ASIDE, _GOLDEN = 2.0**-24, 0.6180339887498949
+# Values of one state and of many at once may differ by the rounding of so many operations.
+_ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 # How often, and by how much, a step is shortened at most where differences curve within it.
 _SHORTER = [2.0 ** (-4 * k) for k in range(11)]
+
+
+def _agree(one: Array, other: Array) -> bool:
+    """Whether two arrays of values are equal up to the rounding of a few operations."""
+    same = np.abs(one - other) <= _ROUNDING * np.abs(other)
+    same |= (one == other) | (np.isnan(one) & np.isnan(other))
+    return bool(same.all())
 
 
 def _finite_rows(array: Array) -> NDArray[np.bool_]:
@@ -104,6 +113,8 @@ class Jacobian:
         self.nearby = Nearby()
         self._set_scales(np.ones(n))
         self.method = "finite differences"
+        # Whether differences call the function once for many states: see `_finds_at_once`.
+        self._at_once = False
         self.batch: Callable[[Array, Array], Array] = self._differences
         self._given: BatchedFunction | None = None
         if given is not None:
@@ -195,19 +206,62 @@ class Jacobian:
         u_all = np.broadcast_to(u[..., None, :], (*moves.shape[:-1], u.shape[-1]))
         # Copies: a function may return one and the same array every time.
         if side is None:
-            ahead = np.array(self.function.batch(at + moves, u_all))
-            behind = self._aligned(self.function.batch(at - moves, u_all), ahead)
+            both = np.stack((at + moves, at - moves))
+            ahead, behind = self._values(both, np.broadcast_to(u_all, (2, *u_all.shape)))
+            behind = self._aligned(behind, ahead)
             return np.swapaxes((ahead - behind) / (2 * length), -1, -2)
         side = side[..., columns, None]
         central = side == 0.0
         value = np.array(self.function.batch(x, u))[..., None, :]
-        near = np.array(self.function.batch(at + np.where(central, 1.0, side) * moves, u_all))
-        far = self._aligned(
-            self.function.batch(at + np.where(central, -1.0, 2.0 * side) * moves, u_all), value
+        near, far = self._values(
+            np.stack((
+                at + np.where(central, 1.0, side) * moves,
+                at + np.where(central, -1.0, 2.0 * side) * moves,
+            )), np.broadcast_to(u_all, (2, *u_all.shape)),
         )
-        near = self._aligned(near, value)
+        near, far = self._aligned(near, value), self._aligned(far, value)
         rise = np.where(central, near - far, side * (4.0 * near - far - 3.0 * value))
         return np.swapaxes(rise / (2 * length), -1, -2)
+
+    def _values(self, x: Array, u: Array) -> Array:
+        """The function at the states (..., n) of a difference, by one call where that may be.
+
+        The first value is compared with that of a call of its own. Only derivatives come from
+        here: J and all of its parts are evaluated state by state.
+        """
+        function = self.function
+        if self._at_once:
+            states, inputs = x.reshape(-1, x.shape[-1]), u.reshape(math.prod(x.shape[:-1]), -1)
+            with suppress(Exception):  # a function of one state may do anything on many
+                found = function.at_once(states, inputs)
+                if _agree(found[:1], function.batch(states[:1], inputs[:1])):
+                    return found.reshape(*x.shape[:-1], *function.shape)
+            self._at_once = False
+        return np.array(function.batch(x, u))
+
+    def _finds_at_once(self, x: Array, u: Array) -> bool:
+        """Whether the function takes many states at once, as functions of ``x[..., i]`` do.
+
+        It must give the same, up to rounding, as one by one: at the states of a difference and at
+        others as far away as the states are large, in two batches of different lengths.
+        """
+        if self.function.mode != "looped":
+            return False
+        far = x + self._sizes * np.array((-1.0, 1.0, -0.5))[:, None]
+        step = _DIFFERENCE_STEP * np.maximum(self._sizes, np.abs(x))
+        states = np.concatenate((x[None], far, x + step * self._eye))
+        if self._bounds is not None:
+            states = np.clip(states, *self._bounds)
+        inputs = np.broadcast_to(u, (len(states), u.size))
+        try:
+            with np.errstate(all="ignore"):
+                whole = self.function.at_once(states, inputs)
+                some = self.function.at_once(states[1::2], inputs[1::2])
+                # Last: most functions of one state have raised, or returned another shape.
+                alone = self.function.batch(states, inputs)
+                return _agree(whole, alone) and _agree(some, alone[1::2])
+        except Exception:  # at one of these states, or of a function of one state
+            return False
 
     def _aligned(self, values: Array, references: Array) -> Array:
         """Values on the turn of others nearby, where an angle may jump between them."""
@@ -292,6 +346,7 @@ class Jacobian:
             if self._scales is not None and self.method != "traced":
                 self._compare([(x, u)])
             return
+        self._at_once = self._finds_at_once(x, u)
         if self._scales is not None:
             self._set_scales(self._scales)
             measured = self._measured(x, u)

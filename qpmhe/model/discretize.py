@@ -1,30 +1,106 @@
-"""Discretisation of an ordinary differential equation by one step of given length."""
+"""Discretisation of an ordinary differential equation by steps of given length."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import choice
+from .._checks import choice, dimension
+from .implicit_steps import COLLOCATIONS, ImplicitStep
 
 Array = NDArray[Any]
 Function = Callable[..., Any]
-Method = Literal["euler", "rk4"]
-METHODS: tuple[str, ...] = get_args(Method)
+#: Explicit methods, which need no Jacobian of the rate, and implicit ones.
+EXPLICIT = ("euler", "rk4")
+METHODS = (*EXPLICIT, *COLLOCATIONS)
+
+
+class Discretization(NamedTuple):
+    """By how many substeps of which method an ODE becomes a map."""
+
+    method: str
+    steps: int = 1
+
+    @property
+    def is_implicit(self) -> bool:
+        """Whether a step solves equations."""
+        return self.method in COLLOCATIONS
+
+
+def checked_discretization(
+    method: str, steps: int, methods: tuple[str, ...] = METHODS
+) -> Discretization:
+    """The arguments ``method`` and ``steps``, checked."""
+    choice("method", method, methods)
+    return Discretization(method, dimension("steps", steps, 1))
 
 
 def discretize(
-    rate: Function, jacobian: Function | None, method: str
+    rate: Function, jacobian: Function | None, how: Discretization
 ) -> tuple[Function, Function | None]:
-    r"""Turn :math:`\dot x = f_c(x, u)` into :math:`x^+ = f(x, u)` with u held over the step."""
-    choice("method", method, METHODS)
-    if method == "euler":
-        return _euler(rate), jacobian and _euler_jacobian(jacobian)
-    return _rk4(rate), jacobian and _rk4_jacobian(rate, jacobian)
+    r"""Turn :math:`\dot x = f_c(x, u)` into :math:`x^+ = f(x, u)` with u held over the step.
+
+    Implicit methods need the Jacobian of the rate.
+    """
+    if how.is_implicit:
+        assert jacobian is not None
+        return _implicit(rate, jacobian, how)
+    if how.method == "euler":
+        step, slope = _euler(rate), jacobian and _euler_jacobian(jacobian)
+    else:
+        step, slope = _rk4(rate), jacobian and _rk4_jacobian(rate, jacobian)
+    if how.steps == 1:
+        return step, slope
+    return _repeated(step, how.steps), slope and _repeated_jacobian(step, slope, how.steps)
+
+
+def _repeated(step: Function, steps: int) -> Function:
+    def repeated(dt: Any, x: Array, *u: Array) -> Array:
+        for _ in range(steps):
+            x = step(dt / steps, x, *u)
+        return x
+
+    return repeated
+
+
+def _repeated_jacobian(step: Function, slope: Function, steps: int) -> Function:
+    def repeated(dt: Any, x: Array, *u: Array) -> Array:
+        value: Array = slope(dt / steps, x, *u)
+        for _ in range(steps - 1):
+            x = step(dt / steps, x, *u)
+            value = slope(dt / steps, x, *u) @ value
+        return value
+
+    return repeated
+
+
+def _implicit(
+    rate: Function, jacobian: Function, how: Discretization
+) -> tuple[Function, Function]:
+    """The step and its Jacobian, over (..., n), by Newton's method."""
+
+    def of_many(function: Function) -> Function:
+        return lambda x, u: function(x, *((u,) if u.shape[-1] else ()))
+
+    solved = ImplicitStep(of_many(rate), of_many(jacobian), how.method, how.steps)
+
+    def rows(dt: Any, x: Array, u: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+        states = x.reshape(-1, x.shape[-1])
+        inputs = u[0].reshape(len(states), -1) if u else np.empty((len(states), 0))
+        return states, inputs, np.broadcast_to(np.ravel(dt), len(states))
+
+    def step(dt: Any, x: Array, *u: Array) -> Array:
+        return solved.value(*rows(dt, x, u)).reshape(x.shape)
+
+    def slope(dt: Any, x: Array, *u: Array) -> Array:
+        found: Array = solved.linear(*rows(dt, x, u))[1].reshape(*x.shape, x.shape[-1])
+        return found
+
+    return step, slope
 
 
 @lru_cache(maxsize=64)

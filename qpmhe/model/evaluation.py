@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .expressions import CasadiModel, import_casadi
+from .implicit_steps import ImplicitStep
 
 Array = NDArray[np.float64]
 # Fixed arrays for states, inputs and results, and what computes these from those.
@@ -154,6 +157,55 @@ def results_of(model: CasadiModel, count: int, names: tuple[str, ...]) -> dict[s
         results["f_jacobian"], results["h_jacobian"] = joint[None, :n], joint[None, n:]
         results["f"], results["h"] = results["f"][0], results["h"][0]
     return results
+
+
+class ImplicitMachine:
+    """Evaluation of a model whose steps solve equations, by Newton's method.
+
+    Called like `VirtualMachine`, which evaluates its rate and output.
+    """
+
+    def __init__(self, model: CasadiModel, timed: bool) -> None:
+        assert model.how is not None
+        parts = replace(model, dt=None, how=None)
+        self._model, self._timed = model, timed
+        self._evaluator = evaluator = Evaluator(VirtualMachine(parts, False))
+        self._step = ImplicitStep(
+            partial(evaluator.one, "f"), partial(evaluator.one, "f_jacobian"), *model.how
+        )
+
+    def __call__(self, count: int, names: tuple[str, ...]) -> Buffers:
+        """Make buffers for so many states and these results."""
+        model, along = self._model, names == RESIDUALS
+        n, m = model.n, model.m
+        states, inputs = np.zeros((count + along, n)), np.zeros((count, m + self._timed))
+        results, usual = results_of(model, count, names), np.full(count, model.dt or 0.0)
+        one, x = self._evaluator.one, states[:count]
+
+        def evaluate() -> None:
+            u = inputs[:, :m]
+            dt = inputs[:, m] if self._timed else usual
+            if along:
+                residuals = results["residuals"]
+                np.subtract(states[1:], self._step.value(x, u, dt), out=residuals[:, :n])
+                np.subtract(results["y"], one("h", x, u), out=residuals[:, n:])
+                return
+            if "f_jacobian" in names:
+                following, results["f_jacobian"][...] = self._step.linear(x, u, dt)
+            else:
+                following = self._step.value(x, u, dt) if "f" in names else x
+            if "f" in names:
+                results["f"][...] = following.reshape(results["f"].shape)
+            for name in ("h", "h_jacobian"):
+                if name in names:
+                    results[name][...] = one(name, x, u).reshape(results[name].shape)
+
+        return states, inputs, results, evaluate
+
+
+def machine(model: CasadiModel, timed: bool) -> Maker:
+    """What evaluates a model without a compiler."""
+    return (ImplicitMachine if model.is_implicit else VirtualMachine)(model, timed)
 
 
 class VirtualMachine:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from .._checks import choice, dimension, positive
+from .._checks import dimension, positive
 from ..errors import InvalidInputError, ModelError
-from .discretize import METHODS
+from .discretize import Discretization, checked_discretization
 from .functions import check_inputs, takes_input
 
 
@@ -26,7 +26,7 @@ def import_casadi() -> Any:
 class CasadiModel:
     """f and h as functions of (x, u) to a dense column, with n, p, m states, outputs and inputs.
 
-    f is the rate of an ODE with sampling time ``dt`` and discretisation ``method``, or the
+    f is the rate of an ODE with sampling time ``dt`` and discretisation ``how``, or the
     discrete-time map itself, where these are None. u has no rows where there are no inputs.
     ``output_residual`` and ``state_residual`` are the user's functions of (a, b) for differences,
     where there are any; ``losses`` those of one number q to rho(q) and rho'(q), for prior, w and v;
@@ -39,7 +39,7 @@ class CasadiModel:
     p: int
     m: int
     dt: float | None = None
-    method: str | None = None
+    how: Discretization | None = None
     output_residual: Any = None
     state_residual: Any = None
     losses: tuple[Any, Any, Any] = (None, None, None)
@@ -47,8 +47,13 @@ class CasadiModel:
 
     def __post_init__(self) -> None:
         # A map that is taken for a rate, with a step of 0, would be the identity.
-        if (self.dt is None) != (self.method is None):
-            raise ValueError(f"dt is {self.dt} and method {self.method}; expected both or none.")
+        if (self.dt is None) != (self.how is None):
+            raise ValueError(f"dt is {self.dt} and {self.how}; expected both or none.")
+
+    @property
+    def is_implicit(self) -> bool:
+        """Whether a step solves equations, so that it is no expression."""
+        return self.how is not None and self.how.is_implicit
 
     def with_jacobian(self, which: str) -> tuple[Any, list[int]]:
         """A function of (x, u) to f or h and the nonzeros of its Jacobian by x.
@@ -65,21 +70,29 @@ class CasadiModel:
         return made, [row * self.n + column for row, column in zip(rows, columns, strict=True)]
 
     def step(self) -> Any:
-        """The discrete-time map as a casadi.Function of (x, u, dt)."""
+        """The discrete-time map as a casadi.Function of (x, u, dt), unless it is implicit."""
+        assert not self.is_implicit
         ca = import_casadi()
         x, u = _symbols(ca, self.f, self.n, self.m)
         dt = type(x).sym("dt")
-        if self.method is None:
+        following = x
+        if self.how is None:
             following = self.f(x, u)
-        elif self.method == "euler":
-            following = x + dt * self.f(x, u)
         else:
-            k1 = self.f(x, u)
-            k2 = self.f(x + dt / 2 * k1, u)
-            k3 = self.f(x + dt / 2 * k2, u)
-            k4 = self.f(x + dt * k3, u)
-            following = x + dt / 6 * (k1 + 2 * (k2 + k3) + k4)
+            h = dt / self.how.steps if self.how.steps > 1 else dt
+            for _ in range(self.how.steps):
+                following = self._substep(following, u, h)
         return ca.Function("step", [x, u, dt], [following])
+
+    def _substep(self, x: Any, u: Any, h: Any) -> Any:
+        assert self.how is not None
+        if self.how.method == "euler":
+            return x + h * self.f(x, u)
+        k1 = self.f(x, u)
+        k2 = self.f(x + h / 2 * k1, u)
+        k3 = self.f(x + h / 2 * k2, u)
+        k4 = self.f(x + h * k3, u)
+        return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
 
 
 def casadi_model(
@@ -91,10 +104,11 @@ def casadi_model(
     m: int | None = None,
     dt: float | None = None,
     method: str = "rk4",
+    steps: int = 1,
 ) -> CasadiModel:
     """Check the arguments of `qpmhe.from_casadi`, and bring the model to the common form."""
     ca = import_casadi()
-    choice("method", method, METHODS)
+    how = checked_discretization(method, steps)
     for name, size, least in (("n", n, 1), ("p", p, 1), ("m", m, 0)):
         if size is not None:
             dimension(name, size, least)
@@ -118,7 +132,7 @@ def casadi_model(
     p = _agreed("p", p, made_h.numel_out(0))
     if dt is None:
         return CasadiModel(made_f, made_h, n, p, m)
-    return CasadiModel(made_f, made_h, n, p, m, positive("dt", dt), method)
+    return CasadiModel(made_f, made_h, n, p, m, positive("dt", dt), how)
 
 
 def _check_arguments(name: str, function: Any) -> None:

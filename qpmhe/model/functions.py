@@ -168,10 +168,27 @@ class BatchedFunction:
         else:
             # Copied row by row: a function may return one and the same array every time.
             value = np.empty((x.shape[0], *self.shape), dtype=np.result_type(x, np.float64))
-            for i in range(x.shape[0]):
-                value[i] = self(x[i], u[i])
+            function, usual, as_value = self.function, value.shape[1:], self._as_value
+            rows = zip(x.copy(), u.copy(), strict=True) if self.takes_input else zip(x.copy())
+            for i, arguments in enumerate(rows):
+                raw = function(*arguments)
+                is_usual = type(raw) is np.ndarray and raw.shape == usual
+                value[i] = raw if is_usual and raw.dtype == np.float64 else as_value(raw)
         shaped: Array = value.reshape(lead + self.shape)
         return shaped
+
+    def at_once(self, x: Array, u: Array) -> Array:
+        """The values at states (K, n) and inputs (K, m) by one call; raises if it returns others.
+
+        They may be wrong: a function of one state may do anything on many.
+        """
+        raw = self.function(x.copy(), u.copy()) if self.takes_input else self.function(x.copy())
+        shape = (len(x), *self.shape)
+        if type(raw) is not np.ndarray or raw.dtype != np.float64 or (
+            raw.shape != shape and not (self._short and raw.shape == shape[:1])
+        ):
+            raise EvaluationError(f"{self.name} is a function of one state")
+        return raw.reshape(shape).copy()
 
     def try_batched(self, x: Array, u: Array) -> None:
         """Call it once for many states from now on, if that gives the same at these (K, n).

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import ModelError
 from .derivatives import Jacobian
+from .discretize import Discretization
 from .evaluation import Evaluator
 from .expressions import CasadiModel
 from .functions import BatchedFunction, Trusted
@@ -164,7 +165,7 @@ class Origin:
 
     Parameters
     ----------
-    dt, method : optional
+    dt, how : optional
         Sampling time and discretisation of an ODE; None for a discrete-time model.
     rate : BatchedFunction, optional
         The rate, which is traced in the place of f.
@@ -195,7 +196,7 @@ class Origin:
     """
 
     dt: float | None = None
-    method: str | None = None
+    how: Discretization | None = None
     rate: BatchedFunction | None = None
     rate_jacobian: Jacobian | None = None
     sources: dict[str, Callable[[Array, Array], Any]] | None = None

@@ -116,7 +116,7 @@ def _without_memory(held: System, errors: slice, options: SystemOptions) -> Syst
     return System.made(
         Trusted(zeroed(held.f)), Trusted(output(held.h)),
         Origin(
-            dt=held.dt, method=held.method, held=held.held, make_augmented=again,
+            dt=held.dt, how=held.origin.how, held=held.held, make_augmented=again,
             make_timed=timed if held.has_timed else None, is_timed=held.origin.is_timed,
         ),
         n=held.n, p=held.p, m=held.m,

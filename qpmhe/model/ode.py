@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .._checks import dimension, positive
 from .derivatives import Jacobian
-from .discretize import discretize
+from .discretize import Discretization, discretize
 from .functions import BatchedFunction, Trusted
 from .model import Origin
 from .points import FEW, points
@@ -27,7 +27,7 @@ Function = Callable[..., Any]
 
 def made_from_ode(
     cls: type[System], rate: Function | Trusted, h: Function | Trusted, *, dt: float, n: int,
-    p: int, m: int, method: str, rate_jacobian: Function | Trusted | None,
+    p: int, m: int, how: Discretization, rate_jacobian: Function | Trusted | None,
     h_jacobian: Function | Trusted | None, options: SystemOptions,
 ) -> System:
     """The system that `System.from_ode` describes."""
@@ -39,9 +39,11 @@ def made_from_ode(
     if rate_jacobian is not None:
         compared = Jacobian(batched, rate_jacobian, m, probes, states)
         given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
-    step, step_jacobian = discretize(
-        _over_leading(batched), given and _over_leading(given), method
-    )
+    slope = given and _over_leading(given)
+    if how.is_implicit and slope is None:
+        differences = Jacobian(batched, None, m, probes, states)
+        slope = partial(_of_inputs, differences.batch, m)
+    step, step_jacobian = discretize(_over_leading(batched), slope, how)
     length = positive("dt", dt)
 
     def timed(system: System) -> System:
@@ -58,17 +60,18 @@ def made_from_ode(
     def augmented(change: Augmentation, others: SystemOptions) -> System:
         return cls.from_ode(
             change.over_leading(batched, 0.0), change.over_leading(system.h),
-            dt=dt, method=method, n=change.n, p=p, m=change.m, **others,
+            dt=dt, method=how.method, steps=how.steps, n=change.n, p=p, m=change.m, **others,
         )
 
     system = cls.made(
         Trusted(partial(step, length)), h,
         Origin(
-            dt=length, method=method, rate=batched, rate_jacobian=compared,
+            dt=length, how=how, rate=batched, rate_jacobian=compared,
             make_timed=timed, make_augmented=augmented,
             recipe=(cls.from_ode, {
-                "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": method,
-                "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian, **options,
+                "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": how.method,
+                "steps": how.steps, "rate_jacobian": rate_jacobian, "h_jacobian": h_jacobian,
+                **options,
             }),
         ),
         n=n, p=p, m=m, f_jacobian=step_jacobian and Trusted(partial(step_jacobian, length)),
@@ -89,6 +92,11 @@ def _over_leading(function: BatchedFunction) -> Function:
         return function.batch(x, u) if x.ndim > 1 else np.asarray(function(x, u))
 
     return evaluate
+
+
+def _of_inputs(function: Function, m: int, x: Array, *u: Array) -> Any:
+    """A function over (K, n) and (K, m), where there may be no argument for inputs."""
+    return function(x, u[0] if m else np.empty((len(x), 0)))
 
 
 def _timed_by_input(step: Function, m: int) -> Function:

@@ -38,6 +38,7 @@ def augment_parameters(
     drifting: bool = False,
     dt: float | None = None,
     method: str | None = None,
+    steps: int | None = None,
     states: ConvexSet | None = None,
     disturbances: ConvexSet | None = None,
     noises: ConvexSet | None = None,
@@ -66,7 +67,8 @@ def augment_parameters(
         f(x, u, theta), or f(x, theta): maps x (n,), u (m,) and all parameters theta (k,)
         to (n,). With dt, f is the rate, in units of x per unit of time. Or a system of m + k
         inputs, the last k of which are the parameters; it has its own sizes, sets and sampling
-        time, so leave out h, n, p, m, dt, method and the sets.
+        time, so leave out h, n, p, m, dt, method, steps and
+        the sets.
     h : callable
         h(x, u, theta), or h(x, theta), to (p,), or a scalar if p is 1.
     nominal : (k,) array_like
@@ -83,8 +85,9 @@ def augment_parameters(
     dt : float, optional
         Sampling time. If given, f is a rate, discretised with u held over the step, and the system
         takes steps of other lengths.
-    method : {"rk4", "euler"}, optional
-        With dt: Runge-Kutta of order 4, the default, or one explicit Euler step.
+    method, steps : optional
+        With dt: how the rate is discretised, as for `System.from_ode`; one step of ``"rk4"`` if
+        left out.
     states, disturbances : Box or Polytope, optional
         The sets X and W of x alone, of dimension n; the whole space if left out.
     noises : Box or Polytope, optional
@@ -156,7 +159,7 @@ def augment_parameters(
     held = _held(hold, moved)
     arguments = {
         "f": f, "h": h, "nominal": values, "n": n, "p": p, "m": m, "estimated": moved,
-        "drifting": drifting, "dt": dt, "method": method, "states": states,
+        "drifting": drifting, "dt": dt, "method": method, "steps": steps, "states": states,
         "disturbances": disturbances, "noises": noises, "parameter_bounds": parameter_bounds,
         "hold": hold,
     }
@@ -232,17 +235,24 @@ def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
         "n": change.n, "p": p, "m": change.m, "noises": given["noises"],
         **sets,
     }
-    if dt is None and method is not None:
-        raise OptionError(f"method is {shown(method)}, but dt is missing; give both or neither.")
+    for name in ("method", "steps"):
+        if dt is None and given[name] is not None:
+            raise OptionError(
+                f"{name} is {shown(given[name])}, but dt is missing; give both or neither."
+            )
     if dt is None:
         return System(change.over_leading(f, 1.0), output, **options)
     rate = change.over_leading(f, 0.0)
-    return System.from_ode(rate, output, dt=dt, method=method or "rk4", **options)
+    steps = 1 if given["steps"] is None else given["steps"]
+    return System.from_ode(
+        rate, output, dt=dt, method=method or "rk4", steps=steps, **options
+    )
 
 
 def _other_inputs(arguments: dict[str, Any], parameters: int) -> int:
     """The number of inputs of a system that are no parameters; raises if more than it is given."""
-    for name in ("h", "n", "p", "m", "dt", "method", "states", "disturbances", "noises"):
+    own = "h", "n", "p", "m", "dt", "method", "steps", "states", "disturbances", "noises"
+    for name in own:
         if arguments[name] is not None:
             raise OptionError(
                 f"{name} is {shown(arguments[name])}, but f is a System, which has its own; leave "

@@ -61,7 +61,7 @@ class SecondDerivatives:
         self._calls: dict[int, tuple[tuple[Array, ...], Curvature, Any]] = {}
         self._function: Any = None
         symbolic = model.symbolic
-        if symbolic is not None:
+        if symbolic is not None and not symbolic.is_implicit:
             with suppress(Exception):  # an operation whose derivative CasADi does not know
                 self._function = _function(symbolic)
 

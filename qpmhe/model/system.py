@@ -17,6 +17,7 @@ from .._checks import dimension
 from ..errors import InvalidInputError, ModelError
 from .constraints import Constraint, ConstraintFunctions, checked_constraints
 from .derivatives import Jacobian
+from .discretize import checked_discretization
 from .functions import BatchedFunction, Trusted
 from .model import Model, ModelCache, Origin, check_at
 from .ode import made_from_ode
@@ -52,8 +53,9 @@ class System:
     f : callable
         f(x) or f(x, u): maps x (n,) to (n,). Estimators evaluate the expression that a trace on
         symbols finds, for a whole window at once; a function that cannot be traced is called state
-        by state, with a copy of its arguments. With inputs, the second positional parameter is u,
-        whatever its name and default.
+        by state, with a copy of its arguments. Only for its differences is it called once for many
+        states, as (K, n), if that gives the same at the initial state and others. With inputs, the
+        second positional parameter is u, whatever its name and default.
     h : callable
         h(x) or h(x, u): maps x (n,) to (p,), or to a scalar if p is 1. With inputs, f or h must
         take them.
@@ -204,7 +206,7 @@ class System:
             known = origin.rate is not None or origin.sources is not None
             own["tracing"] = ModelTrace(
                 origin.rate or functions.f, functions.h, n, p, m, self.states,
-                origin.dt if known else None, origin.method if known else None, origin.sources,
+                origin.dt if known else None, origin.how if known else None, origin.sources,
             )
         own["evaluation"] = Model(self, functions, functions, scales)
         own["_models"] = ModelCache()
@@ -406,7 +408,12 @@ class System:
     @property
     def method(self) -> str | None:
         """How it is discretised; None for a discrete-time model."""
-        return self.origin.method
+        return None if self.origin.how is None else self.origin.how.method
+
+    @property
+    def steps(self) -> int:
+        """Number of substeps of an ODE in a sample; 1 for a discrete-time system."""
+        return 1 if self.origin.how is None else self.origin.how.steps
 
     @property
     def held(self) -> Mapping[int, float]:
@@ -441,6 +448,7 @@ class System:
         p: int,
         m: int = 0,
         method: str = "rk4",
+        steps: int = 1,
         rate_jacobian: Function | Trusted | None = None,
         h_jacobian: Function | Trusted | None = None,
         **options: Unpack[SystemOptions],
@@ -459,9 +467,14 @@ class System:
             Sampling time, in the time unit of the rate.
         n, p, m : int
             Numbers of states, outputs and inputs; m is 0 for a system without inputs.
-        method : {"rk4", "euler"}
-            Runge-Kutta of order 4, or one explicit Euler step. Where a step is too long for the
-            disturbance's size, the estimator warns; see `qpmhe.MovingHorizonEstimator`.
+        method : {"rk4", "euler", "radau", "midpoint"}
+            Explicit: Runge-Kutta of order 4, or Euler. Implicit, for stiff rates: Radau IIA of
+            order 5, which damps what decays within a step, or the implicit midpoint rule of order
+            2, which keeps quadratic invariants. Implicit steps are solved by Newton's method to
+            rounding; where that fails, the model fails at this state. Where a step is too long for
+            the disturbance's size, the estimator warns; see `qpmhe.MovingHorizonEstimator`.
+        steps : int
+            Number of substeps of equal length in each sample.
         rate_jacobian : callable, optional
             Derivative of the rate with respect to x, (n, n).
         h_jacobian, **options
@@ -470,12 +483,13 @@ class System:
         Raises
         ------
         OptionError
-            If dt is not positive or the method unknown.
+            If dt is not positive, the method unknown, or steps no integer from 1 on.
         ModelError, SetError
             As for `System`.
         """
         return made_from_ode(
-            cls, rate, h, dt=dt, n=n, p=p, m=m, method=method, rate_jacobian=rate_jacobian,
+            cls, rate, h, dt=dt, n=n, p=p, m=m, how=checked_discretization(method, steps),
+            rate_jacobian=rate_jacobian,
             h_jacobian=h_jacobian, options=options,
         )
 

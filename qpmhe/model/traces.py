@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ..errors import EngineWarning
 from .derivatives import Jacobian
-from .evaluation import Evaluator, VirtualMachine
+from .discretize import Discretization
+from .evaluation import Evaluator, machine
 from .expressions import CasadiModel, import_casadi
 from .functions import BatchedFunction, Trusted
 from .points import ALL, USUAL, Points, points
@@ -41,7 +42,7 @@ class Pinned:
 
     def __init__(
         self, found: dict[str, Traced], n: int, p: int, m: int, dt: float | None,
-        method: str | None,
+        how: Discretization | None,
     ) -> None:
         self.found, self.m = found, m
         self._evaluators: dict[bool, Evaluator] = {}
@@ -54,14 +55,14 @@ class Pinned:
                 found[name].function or ca.Function(name, [x, u], [ca.DM.zeros(size)])
                 for name, size in (("f", n), ("h", p))
             )
-            self._partial = CasadiModel(f, h, n, p, m, dt, method)
+            self._partial = CasadiModel(f, h, n, p, m, dt, how)
         self.model = self._partial if all(one.function for one in found.values()) else None
 
     def evaluator(self, timed: bool = False) -> Evaluator:
         """What evaluates the traced functions, with the step's length as last input if timed."""
         if timed not in self._evaluators:
             assert self._partial is not None
-            self._evaluators[timed] = Evaluator(VirtualMachine(self._partial, timed))
+            self._evaluators[timed] = Evaluator(machine(self._partial, timed))
         return self._evaluators[timed]
 
 
@@ -80,7 +81,7 @@ class ModelTrace:
         Numbers of states, outputs and inputs.
     states : ConvexSet or None
         X, in which trace and function are compared.
-    dt, method : optional
+    dt, how : optional
         Where f is a rate: the step length, and the discretisation.
     sources : dict, optional
         Functions of x and u, named ``f`` and ``h``, to be traced in place of those above, which
@@ -90,14 +91,14 @@ class ModelTrace:
 
     def __init__(
         self, f: BatchedFunction, h: BatchedFunction, n: int, p: int, m: int,
-        states: ConvexSet | None, dt: float | None = None, method: str | None = None,
+        states: ConvexSet | None, dt: float | None = None, how: Discretization | None = None,
         sources: dict[str, Callable[[Array, Array], Any]] | None = None,
     ) -> None:
         self._sources = sources
         self._batched = {"f": f, "h": h}
         self._functions = {name: of_both(one) for name, one in self._batched.items()}
         self._n, self._p, self._m, self._states = n, p, m, states
-        self.dt, self.method = dt, method
+        self.dt, self.how = dt, how
         self._lock = threading.RLock()
         self._now: Pinned | None = None
 
@@ -128,7 +129,7 @@ class ModelTrace:
         return expressed(self._functions[name], (self._n, self._m), name, watched=True)
 
     def _pin(self, found: dict[str, Traced]) -> None:
-        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.method)
+        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.how)
 
     def _traced(self, name: str, where: Points) -> Traced:
         function = self._functions[name]
@@ -155,7 +156,7 @@ class ModelTrace:
             # As the step in C takes it: a rate by the method, a map as it is.
             ca, n = import_casadi(), self._n
             x, u = ca.SX.sym("x", n), ca.SX.sym("u", self._m)
-            model = CasadiModel(found.function, None, n, 0, self._m, self.dt, self.method)
+            model = CasadiModel(found.function, None, n, 0, self._m, self.dt, self.how)
             stepped = ca.Function("f", [x, u], [ca.densify(model.step()(x, u, self.dt or 0.0))])
             found = Traced(stepped, "", (n,))
         return difference(found, self._functions[name], where)

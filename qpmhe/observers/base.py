@@ -14,7 +14,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import Array, positive_definite, positive_semidefinite, representation
 from .._linalg import inverse
-from ..errors import OptionError, ShapeError
+from ..errors import ModelError, OptionError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.tracing import Traced
@@ -55,7 +55,7 @@ class Sample:
     memory, next_memory : (k,) array or None
         What the observer remembers at this sample, read-only, and an array, first equal to it, into
         which `Observer.correct` writes what it remembers at the next; None if it has no
-        `Observer.initial_memory`.
+        `Observer.initial_memory`. To assign another array to ``next_memory`` is an error.
     """
 
     system: System
@@ -73,6 +73,22 @@ class Sample:
     next_root: Array | None = None
     memory: Array | None = None
     next_memory: Array | None = None
+
+
+def check_written(observer: Observer, sample: Sample, given: Array) -> None:
+    """Check that ``correct`` has written into the array for what the observer remembers next.
+
+    Raises
+    ------
+    ModelError
+        If it has assigned another array to ``sample.next_memory``, which nobody would read.
+    """
+    if sample.next_memory is not given:
+        raise ModelError(
+            f"{type(observer).__name__}.correct assigned sample.next_memory; expected that it "
+            "writes into this array, sample.next_memory[...] = value: an array that is assigned "
+            "is not remembered."
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from .._checks import Array, count, make_folder
 from ..estimation.estimate import Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
-from ..model.discretize import discretize
+from ..model.discretize import Discretization, discretize
 from ..models import Example
 from ..models.batch_reactor import batch_reactor, casadi_output, casadi_rate
 from ..models.scenario import Record
@@ -72,7 +72,7 @@ class PaperStudy:
     def ipopt(self, iterations: int | None) -> IpoptEstimator:
         """The paper's tool: CasADi with Ipopt, terminated after this many iterations."""
         system, observer, cost, scenario = self.model
-        step, _ = discretize(casadi_rate, None, self.method)
+        step, _ = discretize(casadi_rate, None, Discretization(self.method))
         return IpoptEstimator(
             system, observer, cost, f=partial(step, scenario.dt), h=casadi_output,
             horizon=scenario.horizon, initial_state=scenario.initial_estimate,

@@ -130,6 +130,8 @@ class _Filter:
         self._sweeps: dict[int, tuple[Any, Any]] = {}
         self._step: Any = None
         model = self._system.symbolic
+        if model is not None and model.is_implicit:  # a step is no expression
+            model = None
         residual = system.output_residual
         self.traced = (
             model is not None and model.f.is_a("SXFunction") and model.h.is_a("SXFunction")

@@ -260,13 +260,38 @@ def boxed(one):
     return replace(one, system=system).with_options(max_qps=None, solver_tolerance=1e-9)
 
 
-def _plain(f, h, n, p, horizon=4, steps=14, **options):
+def _plain(f, h, n, p, horizon=4, steps=14, substeps=1, **options):
     """A system by itself: its size, its language or its method is what matters."""
-    system = qpmhe.from_casadi(f, h, n=n, compiled=False, **options)
+    system = qpmhe.from_casadi(f, h, n=n, compiled=False, steps=substeps, **options)
     cost = QuadraticCost(prior=2.0 * np.eye(n), disturbance=20.0 * spd(1, n), noise=10 * spd(2, p))
     start, observer = np.full(n, 0.2), Luenberger(0.1 * np.cos(np.arange(n * p)).reshape(n, p))
     samples = recorded(system, start, steps=steps)
     return Case(system, observer, cost, start, samples, {"horizon": horizon, "max_qps": 2})
+
+
+def _kinetics(method, steps=1):
+    """Stiff kinetics, fed and measured, in NumPy; the time constants are 1/2000 to 25 samples."""
+
+    def rate(x, u):
+        one, two = 0.04 * x[..., 0], 100.0 * x[..., 1] * x[..., 2]
+        three = 2000.0 * x[..., 1] ** 2
+        return np.stack([two - one + u[..., 0], one - two - three, three - 0.02 * x[..., 2]], -1)
+
+    system = qpmhe.System.from_ode(
+        rate, lambda x, u: np.stack([x[..., 0] + u[..., 0], x[..., 2]], -1), dt=1.0, n=3, p=2, m=1,
+        method=method, steps=steps,
+    )
+    cost = QuadraticCost.from_covariances(
+        prior=np.diag([0.1, 0.001, 0.1]) ** 2, disturbance=0.05**2 * np.eye(3),
+        noise=0.02**2 * np.eye(2),
+    )
+    generator, x, samples = np.random.default_rng(3), np.array([1.0, 0.004, 0.2]), []
+    for u in generator.uniform(0.0, 0.05, (14, 1)):
+        samples.append({"y": system.h(x, u) + 0.02 * generator.standard_normal(2), "u": u})
+        x = system.f(x, u)
+    observer = Luenberger([[0.3, 0.0], [0.0, 0.0], [0.0, 0.4]])
+    options = {"horizon": 4, "max_qps": 2}
+    return Case(system, observer, cost, np.array([0.9, 0.004, 0.25]), tuple(samples), options)
 
 
 def _rate(x):
@@ -663,6 +688,17 @@ FEATURES = {
         "injection in sets": ("inputs and states", by(
             lambda one: qpmhe.OutputInjection(lambda z, v: 2.0 * _saturated(z, v))
         )),
+    },
+    "steps": {
+        "radau": (lambda: _kinetics("radau"), with_conditions),
+        "radau substeps": (lambda: _kinetics("radau", 2), filtered(), gaps, AGAIN, WARM),
+        "midpoint": (lambda: _kinetics("midpoint", 3), filtered(UKF), gaps),
+        "rk4 substeps": (lambda: _plain(
+            _rate, lambda x: [x[0]], 3, 1, dt=0.3, method="rk4", substeps=3
+        ), with_conditions),
+        "euler substeps": (lambda: _plain(
+            _rate, lambda x: [x[0]], 3, 1, dt=0.3, method="euler", substeps=2
+        ),),
     },
     "failing": {
         "power failing": (lambda: _failing(1.8), losses(**dict.fromkeys(TERMS, power(1.5)))),

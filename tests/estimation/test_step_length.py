@@ -1,6 +1,7 @@
 """The estimator's check of the step by which an ODE is discretised."""
 
 import copy
+import re
 import warnings
 
 import numpy as np
@@ -40,9 +41,15 @@ def build(system, observer, cost, options):
     return qpmhe.MovingHorizonEstimator(system, observer, cost, **options)
 
 
+_TOO_LONG = (
+    r"one step of rk4 in dt = 0.1 is too long.* state 0 .*\. "
+    r"steps=8 or method='radau' with steps=2 is fine enough\."
+)
+
+
 def test_a_stiff_model_warns_once_with_number_and_remedy():
     parts = made()
-    with pytest.warns(qpmhe.ModelWarning, match=r"dt = 0.1 is too long.* state 0 .*stiff") as seen:
+    with pytest.warns(qpmhe.ModelWarning, match=_TOO_LONG) as seen:
         mhe = build(*parts)
     assert len(seen) == 1
     assert seen[0].filename == __file__
@@ -134,3 +141,20 @@ def test_the_step_loop_does_not_pay():
         counts.append(len(calls))
     assert len(set(counts)) == 1
     assert counts[0] <= 8
+
+
+@pytest.mark.parametrize("method", ["euler", "rk4", "midpoint"])
+def test_the_remedies_are_remedies(method):
+    """An estimator with each of them, as the warning writes it, does not warn."""
+    parts = made(dt=0.2, method=method)
+    with pytest.warns(qpmhe.ModelWarning, match="too long") as seen:
+        build(*parts)
+    text = str(seen[0].message)
+    remedies = re.findall(r"(?:method='(\w+)')?(?: with )?(?:steps=(\d+))?", text.split(". ")[-2])
+    found = [one for one in remedies if any(one)]
+    assert len(found) == (1 if method == "midpoint" else 2), text
+    for name, steps in found:
+        system = qpmhe.System.from_ode(
+            STIFF, h, dt=0.2, n=2, p=1, method=name or method, steps=int(steps or 1)
+        )
+        build(system, *parts[1:])

@@ -134,6 +134,30 @@ def test_a_memory_that_runs_away_fails_the_stage():
     assert np.isfinite(mhe.state).all()
 
 
+class Assigning(Wary):
+    """Assigns what it remembers, which nobody would read, from one of its samples on."""
+
+    def __init__(self, first):
+        super().__init__()
+        self.first = first
+
+    def correct(self, z, v, sample):
+        correction = super().correct(z, v, sample)
+        if sample.memory[1] >= self.first:
+            sample.next_memory = np.array([0.0, 9.0])
+        return correction
+
+
+def test_an_assigned_memory_is_an_error():
+    with pytest.raises(ModelError, match=r"Assigning.correct assigned sample.next_memory; exp"):
+        estimator(Assigning(0.0))
+    mhe = estimator(Assigning(4.0))  # only when it runs: then the stage fails, and says why
+    estimates = [mhe.update(y) for y in YS[:7]]
+    failed = [qpmhe.Status.MODEL_FAILED in one.status for one in estimates]
+    assert failed == [False] * 4 + [True] * 3
+    assert "assigned sample.next_memory" in estimates[-1].message
+
+
 def test_the_compiled_step_refuses_it_by_name():
     pytest.importorskip("casadi")
 

@@ -60,7 +60,6 @@ typedef $real mhe_real;
 #define MHE_ROLLED $rolled /* whether some directions of x(t+1) - f have no disturbance in any trial */
 #define MHE_FREE $free /* the other directions, where there are such */
 #define MHE_HELD $held    /* states that are held where the window does not see them */
-#define MHE_CONTINUOUS $continuous /* 0: f is a map; 1: an Euler step of a rate; 4: Runge-Kutta */
 
 /* Step lengths, tolerances and thresholds. */
 $limits

@@ -1,0 +1,199 @@
+"""Steps of an ODE by each method: order, stiff problems, derivatives, units, failures."""
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import qpmhe
+from qpmhe.errors import OptionError
+from qpmhe.model.discretize import METHODS
+from qpmhe.model.implicit_steps import COLLOCATIONS, ImplicitStep
+
+ORDERS = {"euler": 1, "rk4": 4} | {name: one.order for name, one in COLLOCATIONS.items()}
+NONE = np.zeros(0)
+
+
+def pendulum(x, u):
+    return np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0]) - 0.1 * x[..., 1]], -1)
+
+
+def robertson(x):
+    one, two, three = 0.04 * x[..., 0], 1e4 * x[..., 1] * x[..., 2], 3e7 * x[..., 1] ** 2
+    return np.stack([two - one, one - two - three, three], -1)
+
+
+def van_der_pol(x):
+    return np.stack([x[..., 1], 1e3 * (1.0 - x[..., 0] ** 2) * x[..., 1] - x[..., 0]], -1)
+
+
+def system(rate, n, m=0, **options):
+    return qpmhe.System.from_ode(rate, lambda x: x[..., :1], n=n, p=1, m=m, **options)
+
+
+def untraced(rate):
+    """The same function, called state by state: a branch on a value stops the trace."""
+    return lambda x, *u: rate(x, *u) if float(x[0]) < 1e300 else x
+
+
+def right(rate, x, dt, tolerance=1e-12):
+    found = solve_ivp(
+        lambda t, x: rate(x), (0.0, dt), x, method="Radau", rtol=tolerance, atol=1e-16,
+        max_step=dt / 100,
+    )
+    return found.y[:, -1]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_error_falls_with_the_order(method):
+    x, u, counts = np.array([1.0, 0.3]), np.array([0.2]), (2, 4, 8)
+    exact = solve_ivp(
+        lambda t, x: pendulum(x, u), (0.0, 1.0), x, method="DOP853", rtol=1e-13, atol=1e-14
+    ).y[:, -1]
+    errors = [
+        np.abs(system(pendulum, 2, 1, dt=1.0, method=method, steps=k).f(x, u) - exact).max()
+        for k in counts
+    ]
+    slopes = -np.diff(np.log(errors)) / np.diff(np.log(counts))
+    assert slopes.min() > ORDERS[method] - 0.4, slopes
+
+
+@pytest.mark.parametrize("kind", ["traced", "called"])
+@pytest.mark.parametrize(("rate", "x", "dt", "steps", "within"), [
+    (robertson, [1.0, 0.0, 0.0], 1.0, 4, 1e-7),  # the first millisecond is not resolved
+    (robertson, [0.7, 1e-5, 0.3], 40.0, 2, 1e-7),
+    (van_der_pol, [2.0, 0.0], 1.0, 4, 1e-7),
+], ids=["robertson", "robertson, long", "van der Pol"])
+def test_stiff_problems(kind, rate, x, dt, steps, within):
+    """Against SciPy's Radau at 1e-12, per component; one explicit step does not survive."""
+    made = system(rate if kind == "traced" else untraced(rate), len(x), dt=dt, method="radau",
+                  steps=steps)
+    expected = right(rate, x, dt)
+    found = made.model().functions.f(np.array(x), NONE)
+    np.testing.assert_allclose(found, expected, rtol=within, atol=within * 1e-3)
+    explicit = system(rate, len(x), dt=dt, method="rk4", steps=steps)
+    with np.errstate(all="ignore"):
+        assert not np.allclose(explicit.f(np.array(x)), expected, rtol=0.1)
+
+
+def jacobian_of_robertson(x, u):
+    del u
+    zero = 0.0 * x[:, 0]
+    return np.stack([
+        np.stack([zero - 0.04, 1e4 * x[:, 2], 1e4 * x[:, 1]], -1),
+        np.stack([zero + 0.04, -1e4 * x[:, 2] - 6e7 * x[:, 1], -1e4 * x[:, 1]], -1),
+        np.stack([zero, 6e7 * x[:, 1], zero], -1),
+    ], 1)
+
+
+@pytest.mark.parametrize("method", COLLOCATIONS)
+def test_the_derivative_is_the_variational_equation_by_the_same_method(method):
+    """Collocation and differentiation commute: x' = f, S' = f_x S in one step gives dx+/dx."""
+    def rate(x, u):
+        del u
+        return robertson(x)
+
+    def extended(xs, u):
+        x, S = xs[:, :3], xs[:, 3:].reshape(-1, 3, 3)
+        moved = jacobian_of_robertson(x, u) @ S
+        return np.concatenate((robertson(x), moved.reshape(-1, 9)), axis=1)
+
+    def slope_of_extended(xs, u):
+        # By differences, exact: the extended rate is quadratic along each axis.
+        size = 1e-3 * np.ones(12)
+        columns = [
+            (extended(xs + d, u) - extended(xs - d, u)) / (2 * d.max()) for d in np.diag(size)
+        ]
+        return np.stack(columns, -1)
+
+    x = np.array([[0.9, 2e-5, 0.1], [0.7, 1e-5, 0.3]])
+    u, dt = np.zeros((2, 0)), np.array([1.0, 5.0])
+    _, slopes = ImplicitStep(rate, jacobian_of_robertson, method, 2).linear(x, u, dt)
+    start = np.concatenate((x, np.tile(np.eye(3).ravel(), (2, 1))), axis=1)
+    found = ImplicitStep(extended, slope_of_extended, method, 2).value(start, u, dt)
+    # Differences of a stiff rate keep about seven digits, of which Newton's rest is free.
+    np.testing.assert_allclose(found[:, 3:].reshape(2, 3, 3), slopes, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_traced_and_called_functions_have_the_same_step_and_derivative(method):
+    options = {"dt": 0.4, "method": method, "steps": 2}
+    x, u = np.random.default_rng(0).normal(size=(5, 2)), np.full((5, 1), 0.3)
+    traced, called = (
+        system(one, 2, 1, **options).model() for one in (pendulum, untraced(pendulum))
+    )
+    np.testing.assert_allclose(traced.step(x, u), called.step(x, u), rtol=1e-13, atol=1e-14)
+    exact, differences = traced.linear(x, u)[0], called.linear(x, u)[0]
+    np.testing.assert_allclose(differences, exact, rtol=0, atol=1e-7)
+    along = traced.residuals(np.vstack((x, x[:1])), x[:, :1], u)
+    np.testing.assert_allclose(along[:, :2], np.vstack((x[1:], x[:1])) - traced.step(x, u))
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e-6, 1e9])
+def test_units_scale_the_step(unit):
+    scale = unit ** np.array([1.0, -1.0, 0.5])
+    x = np.array([0.9, 2e-5, 0.1])
+    plain, scaled = (
+        system(rate, 3, dt=1.0, method="radau").model()
+        for rate in (robertson, lambda z: robertson(z / scale) * scale)
+    )
+    found = scaled.functions.f(x * scale, NONE) / scale
+    np.testing.assert_allclose(found, plain.functions.f(x, NONE), rtol=1e-11)
+
+
+def test_steps_of_other_lengths_and_inputs():
+    made = system(pendulum, 2, 1, dt=0.5, method="radau", steps=2)
+    x, u = np.array([1.0, 0.3]), np.array([0.2])
+    short = system(pendulum, 2, 1, dt=0.2, method="radau", steps=2)
+    np.testing.assert_array_equal(made.timed.f(x, np.append(u, 0.2)), short.f(x, u))
+    assert made.steps == 2
+    assert made.method == "radau"
+    options = {"dt": 0.5, "n": 2, "p": 2, "method": "radau", "steps": 3}
+    again = pickle.loads(pickle.dumps(qpmhe.System.from_ode(van_der_pol, np.positive, **options)))
+    assert (again.steps, again.method) == (3, "radau")
+
+
+def test_parameters_go_through_the_step():
+    """A rate constant as a state: the step of the augmented system is the system's own."""
+    def rate(x, theta):
+        return np.stack([-theta[..., 0] * x[..., 0] ** 2, x[..., 0] - 30.0 * x[..., 1]], -1)
+
+    made = system(rate, 2, 1, dt=1.0, method="radau", steps=2)
+    augmented = qpmhe.augment_parameters(made, nominal=[0.4])
+    x = np.array([1.5, 0.2])
+    found = augmented.f(np.append(x, 0.7))
+    np.testing.assert_allclose(found, np.append(made.f(x, np.array([0.7])), 0.7), rtol=1e-13)
+    assert augmented.steps == 2
+    slope = augmented.model().functions.f_jacobian(np.append(x, 0.7), NONE)
+    moved = [augmented.f(np.append(x, 0.7 + d)) for d in (1e-6, -1e-6)]
+    np.testing.assert_allclose(slope[:, 2], (moved[0] - moved[1]) / 2e-6, rtol=1e-7)
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_an_iteration_that_fails_is_a_failed_stage(engine):
+    """The rate has no value below 0, where a large input pulls each stage."""
+    def rate(x, u):
+        return -np.sqrt(x) - u
+
+    made = system(rate, 1, 1, dt=1.0, method="radau")
+    cost = qpmhe.QuadraticCost.from_covariances(prior=[[1.0]], disturbance=[[0.01]], noise=[[0.01]])
+    if engine == "compiled" and not qpmhe.codegen.compiler.find_compiler():
+        pytest.skip("there is no C compiler")
+    mhe = qpmhe.MovingHorizonEstimator(
+        made, qpmhe.Luenberger([[0.3]]), cost, horizon=4, initial_state=[4.0], engine=engine
+    )
+    assert mhe.update([4.0], [0.0]).improved in (True, False)
+    failed = mhe.update([2.2], [50.0])
+    assert qpmhe.Status.MODEL_FAILED in failed.status
+    assert np.isfinite(mhe.update([1.5], [0.0]).state).all()
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"method": "gauss"}, "method is 'gauss'; expected .*radau"),
+    ({"steps": 0}, "steps is 0; expected an integer >= 1"),
+    ({"steps": 1.5}, "steps is 1.5"),
+])
+def test_methods_and_steps_are_checked(options, words):
+    with pytest.raises(OptionError, match=words):
+        system(pendulum, 2, 1, dt=0.1, **options)
