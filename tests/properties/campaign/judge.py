@@ -290,7 +290,7 @@ class Judge:
             return []
         moved = rounding(case, x, window, mean, with_prior)
         if case.G is not None and name == "candidate's cost":
-            moved = max(moved, self._rounding_of_path(candidate, window, mean, ours.J))
+            moved = np.fmax(moved, self._rounding_of_path(candidate, window, mean, ours.J))
         if apart <= MEASURED * moved:
             self.count("J apart by measured rounding")
             return []
