@@ -30,6 +30,10 @@ _MOVED = (
     "the observer's state before was changed, by a late measurement (amend), by set or by a "
     "sample's own bounds"
 )
+_RESTORED = (
+    "the candidate violated a set and was restored into it (RESTORED): the estimate's cost may be "
+    "above the candidate's"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +99,7 @@ class Monitor:
         The sample after which the observer's bound no longer holds, and why.
     barred : str
         Why the theorem's bound, which goes back to the first sample, does not follow; empty while
-        it does.
+        it does. An estimate with `Status.RESTORED` ends it; the bound by the measured cost stays.
     steps : int
         Samples seen.
 
@@ -219,13 +223,18 @@ class Monitor:
             self.steps += 1
             self._before.append((self._z, self._radius))
             self._inputs.append(given)
-        if not self.barred:
+        if not self.barred or self._measured is not None:
             reason = self.reason or self._left(estimate, again)
-            self.barred = f"from sample {t} on: {reason}" if reason else ""
+            if reason:
+                self._measured = None
+            elif Status.RESTORED in estimate.status:
+                reason = _RESTORED
+            if reason and not self.barred:
+                self.barred = f"from sample {t} on: {reason}"
         lower, upper = self.bound.around(self._radius, self._z)
         error = float(self.bound.farthest(self._radius, estimate.state - self._z, self._z))
         kind = "observer"
-        if self._measured is not None and not self.barred:
+        if self._measured is not None:
             stages = len(self._before) - 1
             least = self._measured.error(self._before[0][1], stages, estimate.cost)
             if least < error:
@@ -296,7 +305,8 @@ class Monitor:
         with np.errstate(all="ignore"):
             costs = _costs(self._certificate, estimate, np.array(self._inputs))
         # Comparisons with NaN are false.
-        if not costs[0] <= estimate.cost <= costs[1]:
+        most = math.inf if Status.RESTORED in estimate.status else costs[1]
+        if not costs[0] <= estimate.cost <= most:
             return "the estimate's cost is not its trajectory's, or above the candidate's"
         return ""
 

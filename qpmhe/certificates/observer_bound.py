@@ -72,6 +72,7 @@ _EVENTS = {
     Status.MISSING: "a measurement was missing",
     Status.MODEL_FAILED: "the model failed, and the observer restarted",
     Status.METRIC_SINGULAR: "the observer was projected in the projection's own metric",
+    Status.RESTARTED: "the observer was restarted from an estimate (RESTARTED)",
 }
 _PROJECTED = (
     "the observer was projected onto X in another metric than the certified one, "

@@ -73,6 +73,11 @@ class CompiledEstimate(Estimate):
         return float(self._block[1])
 
     @property
+    def restored_cost(self) -> float:  # type: ignore[override]
+        """NaN: the compiled step does not restore a candidate."""
+        return float("nan")
+
+    @property
     def trajectory(self) -> Array:  # type: ignore[override]
         """Estimates of all states in the window."""
         return self._rows(2, self._numbers[0] + 1, self._sizes[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from ..estimation.conditions import USUAL, Conditions
 from ..estimation.constraints import Constraints
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
-from ..estimation.settings import Infeasible, Settings
+from ..estimation.settings import Settings
 from ..memory.fields import MemorySizes
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
@@ -43,7 +43,6 @@ _CLOCK_TEXT = """
 _MOST = int(np.iinfo(np.int32).max)
 # From so many states on, LAPACK's calls take less time than loops that a compiler made.
 _LAPACK_STATES = 40
-_POLICIES = get_args(Infeasible)
 # What corrects an observer, in the order of the numbers in C.
 _OBSERVERS = ("gain", "extended", "unscented", "function")
 # In single precision rounding makes eigenvalues of correlations of this size.
@@ -221,7 +220,7 @@ class Layout:
         fields += [(name, r, n) for name in ("inner_lower", "inner_upper", "aside")]
         options = (
             "metric_settled", "project", "max_qps", "uncapped", "patience", "max_iterations",
-            "infeasible", "start_at_best", "reinitialize", "smooth",
+            "start_at_best", "reinitialize", "smooth",
         )
         fields += [(name, np.int32) for name in options]
         if self.clock:
@@ -436,7 +435,6 @@ def _filled(
     record["uncapped"], record["patience"] = settings.max_qps is None, settings.patience
     most = settings.max_solver_iterations
     record["max_iterations"] = 0 if settings.backend == "banded" else min(most or 50, _MOST)
-    record["infeasible"] = _POLICIES.index(settings.infeasible)
     record["start_at_best"] = settings.warm_start
     record["reinitialize"] = settings.candidate == "reinitialized"
     record["smooth"] = settings.arrival == "smoothed"

@@ -47,6 +47,15 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"{name}, a function, has no C form ({residual.expression.reason}); take "
                 "qpmhe.angles, or engine='python'."
             )
+    if settings.infeasible == "restore":
+        return (
+            "engine='compiled' does not have infeasible='restore'; take infeasible='drop_rows', or "
+            "engine='python'."
+        )
+    if settings.restart:
+        return (
+            "engine='compiled' does not have restart=True; leave it out, or take engine='python'."
+        )
     if system.extensions:
         return (
             f"engine='compiled' does not have {' and '.join(system.extensions)}; take "

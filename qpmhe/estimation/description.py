@@ -41,6 +41,8 @@ def described(
     }
     for name in system.described:
         _describe(name, getattr(system, name), found)
+    if settings.restart:
+        found["restart"] = settings.restart
     if system.held:
         found["hold"] = np.array(list(system.held.items()))
     if settings.parameters:

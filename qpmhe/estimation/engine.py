@@ -104,6 +104,7 @@ class PythonEngine:
         self._with_terms = settings.qp_limit > 0
         self._reinitialized = settings.candidate == "reinitialized"
         self._smoothed = settings.arrival == "smoothed"
+        self._restarts = settings.restart
         self._window = self._fresh_window(initial_state, self._tools)
         self._watch = ObserverWatch(settings.horizon)
         # When the traces are compared with the functions that they stand for.
@@ -146,6 +147,7 @@ class PythonEngine:
         return Window(
             tools.system, self._observer, tools.cost, settings.horizon, initial_state,
             self._with_terms, settings.project_observer, self._reinitialized, tools.usual,
+            settings.restart,
         )
 
     @property
@@ -189,7 +191,11 @@ class PythonEngine:
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
             window.make_room()  # before the undo point: `undo` cannot reverse it
-        self._set_undo_point(reinitialized or (window.projects and window.moves_state(own)))
+        # The first estimate that an observer may start at is the one of x(1).
+        challenged = self._restarts and window.time - window.restarted >= self._settings.horizon
+        self._set_undo_point(
+            reinitialized or challenged or (window.projects and window.moves_state(own))
+        )
         try:
             with np.errstate(all="ignore"):
                 if window.end - window.start == window.horizon:
@@ -199,6 +205,8 @@ class PythonEngine:
                 window.push(y, u, dt, own)
                 if reinitialized:
                     window.reinitialize(window.history[window.start : window.end])
+                elif challenged:
+                    window.challenge()
                 estimate = self._estimate(began)
             window.history[window.end] = estimate.state
             self._warn()
@@ -255,6 +263,8 @@ class PythonEngine:
         trial, candidate, message = outcome.trial, problem.candidate, outcome.message
         status = Status.IMPROVED if outcome.improved else Status.CANDIDATE
         if outcome.events:
+            if Status.RESTORED in outcome.events:
+                status = Status(0)  # better than no candidate, but in the sets
             status |= outcome.events
         if window.events:
             status |= Status(window.events)
@@ -316,6 +326,7 @@ class PythonEngine:
             self._disturbances,
             window.z[window.end].copy(),
             window.rejected if window.rejects else None,
+            outcome.restored_cost,
         )
         # Where the newest stage failed, J of the candidate is infinite.
         if not finite and outcome.improved and window.newest_failed:

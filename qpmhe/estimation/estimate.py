@@ -14,8 +14,9 @@ Array = NDArray[np.float64]
 class Status(enum.Flag):
     """Outcome and events of a step.
 
-    Either IMPROVED or CANDIDATE is always set, and all other flags that apply. Test for a flag with
-    ``Status.IMPROVED in estimate.status``. `explain` gives each flag's meaning and remedy.
+    One of IMPROVED, RESTORED and CANDIDATE is always set, and all other flags that apply. Test for
+    a flag with ``Status.IMPROVED in estimate.status``. `explain` gives each flag's meaning and
+    remedy.
     """
 
     IMPROVED = enum.auto()
@@ -42,6 +43,8 @@ class Status(enum.Flag):
     OBSERVER_RESET = enum.auto()
     DERIVATIVE_NEARBY = enum.auto()
     CAP_REACHED = enum.auto()
+    RESTORED = enum.auto()
+    RESTARTED = enum.auto()
 
     def explain(self) -> str:
         """What happened, and what to do about it, in sentences."""
@@ -85,7 +88,8 @@ _TEXTS = {
     ),
     Status.ROWS_DROPPED: (
         "No trajectory satisfying all sets was found at a cost up to the candidate's; the "
-        "inequalities in estimate.dropped were left out. Widen these sets, or raise max_qps."
+        "inequalities in estimate.dropped were left out. Widen these sets, or raise max_qps; "
+        "infeasible='restore' accepts a higher cost before it gives up an inequality."
     ),
     Status.OBSERVER_PROJECTED: "The observer's step left the set of states; it was projected.",
     Status.PREDICTION_OUTSIDE: (
@@ -99,7 +103,8 @@ _TEXTS = {
     ),
     Status.OBSERVER_FAR: (
         "The observer has been far from the estimates for a whole horizon; use another gain or "
-        "observer, or candidate='reinitialized', which restarts it from the estimates."
+        "observer, or candidate='reinitialized', which restarts it from the estimates at each "
+        "sample, or restart=True, which does where that predicts the measurements better."
     ),
     Status.TIME_UP: "The time budget was spent; the best trajectory so far is the estimate.",
     Status.GRADUATED: (
@@ -136,6 +141,17 @@ _TEXTS = {
     Status.CAP_REACHED: (
         "The last trial did not lower the true cost and was rejected, and max_qps left no QP for a "
         "more damped step; raise max_qps if this happens often."
+    ),
+    Status.RESTORED: (
+        "No trajectory satisfying all sets was found at a cost up to the candidate's: the nearest "
+        "one to the candidate takes its place, and the estimate's true cost is at most "
+        "estimate.restored_cost. The paper's theorem does not cover this sample."
+    ),
+    Status.RESTARTED: (
+        "The observer has predicted the window's measurements far worse than another one that "
+        "starts at the estimate of a horizon before, with the prior's covariance: that one "
+        "continues from here on, and what is proved about the former ends. If this happens often, "
+        "use another gain or observer, or larger covariances of its disturbance."
     ),
 }
 
@@ -194,7 +210,10 @@ class Estimate:
         v(i) = y(i) - h(x(i)) along the trajectory; NaN where y is missing or was not sampled.
     cost, candidate_cost : float
         True cost J of the estimate and of the observer's candidate, including soft penalties; cost
-        <= candidate_cost.
+        <= candidate_cost, but where the status has RESTORED.
+    restored_cost : float
+        With RESTORED, J of the nearest trajectory to the candidate that satisfies all sets; cost
+        <= restored_cost. NaN otherwise.
     candidate : (N_t + 1, n) array
         The observer's trajectory.
     observer_state : (n,) array
@@ -209,7 +228,8 @@ class Estimate:
         Outcome and events.
     message : str
         What a failed model, observer or cost raised, and at which state; or the message of a failed
-        QP solver, or which backend did not solve the QPs.
+        QP solver, or which backend did not solve the QPs; or which inequalities no trajectory was
+        found to satisfy, with ``infeasible="restore"``.
     qps, corrections, nearest_points : int
         Numbers of QPs solved, of second-order corrections, and of QPs for a feasible trajectory
         near an infeasible candidate.
@@ -225,8 +245,8 @@ class Estimate:
     __slots__ = (
         "_filtered", "_rejected", "_residuals", "_width", "candidate", "candidate_cost",
         "corrections", "cost", "dropped", "message", "nearest_points", "observer_state",
-        "qps", "solve_time", "solver_iterations", "state", "status", "step_time", "time",
-        "trajectory",
+        "qps", "restored_cost", "solve_time", "solver_iterations", "state", "status", "step_time",
+        "time", "trajectory",
     )
 
     engine = "python"
@@ -251,6 +271,7 @@ class Estimate:
         disturbances: int | None = None,
         observer_state: Array | None = None,
         rejected: NDArray[np.bool_] | None = None,
+        restored_cost: float = float("nan"),
     ) -> None:
         self.time = time
         self._rejected = rejected
@@ -258,7 +279,7 @@ class Estimate:
         self.trajectory = trajectory
         self.state: Array = trajectory[-1]
         self._residuals = residuals
-        self.cost, self.candidate_cost = cost, candidate_cost
+        self.cost, self.candidate_cost, self.restored_cost = cost, candidate_cost, restored_cost
         self.candidate = candidate
         self.observer_state: Array = candidate[-1] if observer_state is None else observer_state
         self.status, self.message = status, message
@@ -302,8 +323,8 @@ class Estimate:
             text += f" Dropped: {'; '.join(map(str, self.dropped))}."
         elif Status.CANDIDATE_OUTSIDE in self.status:
             text += (
-                " The estimate satisfies all sets." if self.improved
-                else " The estimate violates them as well."
+                " The estimate violates them as well." if Status.CANDIDATE in self.status
+                else " The estimate satisfies all sets."
             )
         return f"{text} {self.message}".strip()
 

@@ -74,7 +74,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         ends before, with `Status.UNCONVERGED`, at 100 QPs, and without a cap on iterations or time
         at three in a row that the backend has not solved to its tolerance. Where a QP's step does
         not lower J at any length, the next QP is damped, and counts. If inequalities are
-        dropped, at least one QP is solved without them, even beyond the cap.
+        dropped, or the candidate is restored into the sets, at least one QP is solved after that,
+        even beyond the cap.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.
@@ -94,10 +95,12 @@ class MovingHorizonEstimator(EstimatorMemory):
         Whether the observer's state is projected onto X after each step, in the observer's metric:
         `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its linearised
         error. False gives the paper's plain observer, which may leave X.
-    infeasible : {"drop_rows", "keep_candidate"}
+    infeasible : {"drop_rows", "restore"}
         What to do if the candidate violates a set and no trajectory satisfying all sets is found at
-        a cost up to the candidate's: ``drop_rows`` leaves out, in this step only, the inequalities
-        that the candidate violates; ``keep_candidate`` returns the candidate.
+        a cost up to the candidate's. ``drop_rows`` leaves out, in this step only, the inequalities
+        that the candidate violates. ``restore`` first looks for the nearest trajectory that
+        satisfies all sets, and lowers the cost from there: the sets come before the cost, which may
+        then be above the candidate's. The paper's theorem does not cover such a step.
     warm_start : bool
         Whether the sequence starts at the previous estimate, shifted by one step, if its true J is
         lower than the candidate's. Either way J(estimate) <= J(candidate).
@@ -116,6 +119,13 @@ class MovingHorizonEstimator(EstimatorMemory):
         this estimate already uses N - 1 of the window's measurements, so they count twice. The
         candidate stays the observer's trajectory, and its J then has a prior term. If a loss is not
         finite there, the step uses z(t-N).
+    restart : bool
+        Whether the observer may be restarted from an estimate, at most once in N samples. At each
+        sample a second observer runs over the window, from the estimate that was made of its first
+        state before its measurements came, with the prior's covariance. It takes the first one's
+        place where it has predicted these measurements far better, by an F-test of the squared
+        errors. The status then has `Status.RESTARTED`, with which what the theorem and certificates
+        prove ends. Each sample costs N observer steps more.
     parameters : (k,) array_like, optional
         Usual values of the model's parameters, the last k of the system's m inputs; ``u`` then has
         m - k numbers. They hold until `set` changes them; `update` takes values for a single
@@ -169,12 +179,13 @@ class MovingHorizonEstimator(EstimatorMemory):
         isolated: bool = False,
         arrival: str = "observer",
         parameters: ArrayLike | None = None,
+        restart: bool = False,
     ) -> None:
         is_copy = "settings" in vars(self)  # from `__setstate__`: no warning is given twice
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
             engine, project_observer, infeasible, warm_start, candidate, time_budget,
-            isolated, arrival, nominal_parameters(parameters),
+            isolated, arrival, nominal_parameters(parameters), restart,
         )
         self.system, self.observer, self.cost = system, observer, cost
         require(system, System, "system", "qpmhe.System")

@@ -50,12 +50,22 @@ NEAREST_POINTS = 5
 #: what the last one missed: it approaches no feasible one.
 NEARER = 0.9
 
+#: Largest number of QPs for a trajectory into which a candidate is restored, from each start.
+RESTORING = 20
+
+#: A step towards the sets is taken if it takes away this share, times its length, of the miss.
+TOWARDS = 0.1
+
 #: Largest miss of a row of a feasible trial, as a share of the row's scale: QP solvers end on the
 #: boundary up to their tolerance.
 FEASIBLE = 5e-9
 
 #: An observer more than this many standard deviations of the prior from an estimate is far.
 FAR = 10.0
+
+#: With this probability, of two samples of equally large normal errors the first does not seem so
+#: much larger that its observer is restarted.
+LARGER = 0.99
 
 #: A correction is in the range of the disturbances if less than this share of it is not.
 IN_RANGE = 1e-12

@@ -51,7 +51,7 @@ class ObserverSteps(WindowSamples):
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, horizon: int, initial_state: Array,
-        with_terms: bool, project: bool, usual: Conditions,
+        with_terms: bool, project: bool, usual: Conditions, restarts: bool,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         covariance, memory = observer.initial_covariance(), observer.initial_memory()
@@ -59,12 +59,13 @@ class ObserverSteps(WindowSamples):
             n, p, m, horizon, sensors=len(observer.sensors), held=len(system.held),
             covariance=covariance is not None, majorised=not cost.quadratic,
             roots=observer.propagates_roots, memory=0 if memory is None else len(memory),
+            restarts=restarts,
         )
         super().__init__(system, cost, sizes, initial_state, covariance, with_terms)
         self._observer = observer
         self._with_jacobians = with_terms or observer.needs_jacobians
         # What the covariance restarts at where it is lost; C finds such a loss as no number.
-        self._first_covariance = covariance
+        self._first_covariance, self._first_memory = covariance, memory
         self._raises_lost = covariance is not None and observer.c_form is not None
         # For observers and losses: a user's code cannot write into the window.
         self._read_only_covariance = (

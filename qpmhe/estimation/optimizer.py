@@ -28,8 +28,10 @@ from .limits import (
     NEAREST_POINTS,
     NEARLY,
     OLD_DAMPING,
+    RESTORING,
     ROUNDING,
     STALLED,
+    TOWARDS,
 )
 from .problem import Problem
 from .settings import Settings
@@ -47,6 +49,9 @@ _ENDS = (
 # What no longer holds where another sequence begins.
 _OUTDATED = Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED | Status.CAP_REACHED
 
+# A message names so many missed rows.
+_NAMED = 6
+
 
 class Outcome:
     """The result of the sequence of QPs, updated while it runs.
@@ -57,7 +62,10 @@ class Outcome:
         The best trajectory so far, at first the candidate. Its cost is infinite as long as it
         violates a constraint of the problem being solved.
     improved : bool
-        Whether the trial is a better estimate than the candidate.
+        Whether the trial takes the candidate's place: it is better or, with `Status.RESTORED`, in
+        sets that the candidate violates.
+    restored_cost : float
+        J of the trajectory into which the candidate was restored; NaN if it was not.
     events : Status
         Why the sequence stopped, and what happened.
     followed : array or None
@@ -72,6 +80,7 @@ class Outcome:
 
     # Class attributes as defaults: few of them change in most steps.
     improved: bool = False
+    restored_cost: float = math.nan
     events: Status = Status(0)
     message: str = ""
     qps: int = 0
@@ -123,9 +132,11 @@ class Optimizer:
     Where the candidate satisfies all rows, so does the result. Where it does not, the result is
 
     (a) a trajectory that satisfies all rows, with J no greater than the candidate's; else
-    (b) one that satisfies all rows but those that the candidate violates, with such a J (only
-        with ``infeasible="drop_rows"``); else
-    (c) the candidate.
+    (b) with ``infeasible="restore"``, one that satisfies all rows, with J no greater than that of
+        the nearest such trajectory to the candidate; else
+    (c) one that satisfies all rows but those that the candidate violates, with J no greater than
+        the candidate's; else
+    (d) the candidate.
     """
 
     def __init__(
@@ -136,7 +147,7 @@ class Optimizer:
         self._uncapped, self._patience = settings.max_qps is None, settings.patience
         self._backend = settings.backend_name
         self._warm_start = settings.warm_start
-        self._may_drop = settings.infeasible == "drop_rows"
+        self._restores = settings.infeasible == "restore"
         # Most estimators have no soft rows and no nonlinear constraints.
         self._extended = subproblem.extended
         self._solution = self._softened_solution if self._extended else self._solve
@@ -180,7 +191,7 @@ class Optimizer:
                 self._search_from_rolled_out(problem, outcome)
             outcome.improved = outcome.trial is not candidate
         else:
-            self._restore(problem, outcome, start, shifted)
+            self._search_from_outside(problem, outcome, start, shifted)
         if self._uncapped and outcome.qps >= self._limit and not outcome.events & _ENDS:
             outcome.events |= Status.UNCONVERGED
         return outcome
@@ -198,7 +209,7 @@ class Optimizer:
             if outcome.trial is rolled_out:
                 outcome.trial = candidate
 
-    def _restore(
+    def _search_from_outside(
         self,
         problem: Problem,
         outcome: Outcome,
@@ -208,11 +219,11 @@ class Optimizer:
         """The sequence of QPs from a candidate that violates a set."""
         candidate = problem.candidate
         outside = replace(candidate, cost=math.inf)  # any feasible trial is better
-        outcome.trial = outside
+        outcome.trial = nearest = outside
         # (a) As usual; else from a feasible trajectory near the candidate or the last estimate.
         self._search(problem, outcome, start, self._limit)
         if not outcome.trial.cost < math.inf:
-            outcome.trial = self._feasible_near(problem, outcome, outside)
+            outcome.trial = nearest = self._feasible_near(problem, outcome, outside)
             if not outcome.trial.cost < math.inf and (previous := shifted()) is not None:
                 trial = problem.evaluate(problem.clipped(previous))
                 outcome.trial = self._feasible_near(problem, outcome, trial)
@@ -221,18 +232,65 @@ class Optimizer:
         if outcome.trial.cost < candidate.cost and outcome.trial.violation <= FEASIBLE:
             outcome.improved = True
             return
-        outcome.trial = candidate  # (c), if dropping rows is not allowed or does not help
-        if not self._may_drop or outcome.time_is_up():
-            return
-        outcome.events &= ~_OUTDATED
-        relaxed = problem.without_violated()  # (b)
-        outcome.trial = relaxed.candidate
-        self._search(relaxed, outcome, start, max(1, self._limit - outcome.qps))
-        outcome.improved = outcome.trial is not relaxed.candidate
-        if outcome.improved:
-            outcome.dropped = problem.missed_rows(outcome.trial)
-            if outcome.dropped:
-                outcome.events |= Status.ROWS_DROPPED
+        missed: tuple[DroppedRow, ...] = ()
+        if self._restores:
+            missed = self._restore(problem, outcome, nearest, shifted)  # (b)
+            if outcome.improved:
+                return
+        outcome.trial = candidate  # (d), if dropping rows does not help
+        if not outcome.time_is_up():
+            outcome.events &= ~_OUTDATED
+            relaxed = problem.without_violated()  # (c)
+            outcome.trial = relaxed.candidate
+            self._search(relaxed, outcome, start, max(1, self._limit - outcome.qps))
+            outcome.improved = outcome.trial is not relaxed.candidate
+            if outcome.improved:
+                outcome.dropped = problem.missed_rows(outcome.trial)
+                if outcome.dropped:
+                    outcome.events |= Status.ROWS_DROPPED
+        if missed:
+            listed = [f"the {row}" for row in missed[:_NAMED]]
+            listed += [f"{len(missed) - _NAMED} more"] * (len(missed) > _NAMED)
+            outcome.message = (
+                "no trajectory that satisfies all sets was found; the nearest to one misses "
+                f"{', '.join(listed)}. {outcome.message}"
+            ).strip()
+
+    def _restore(
+        self,
+        problem: Problem,
+        outcome: Outcome,
+        nearest: Trial,
+        shifted: Callable[[], Array | None],
+    ) -> tuple[DroppedRow, ...]:
+        """Improve the nearest feasible trajectory to the candidate, if (a) has not gone lower.
+
+        ``nearest`` is the one that (a) has found, or the candidate. Returns the rows that the
+        nearest trial misses, if no trial is feasible.
+        """
+        found, missed = outcome.trial, nearest
+        if not nearest.cost < math.inf:
+            missed = nearest = self._restored(problem, outcome, nearest)
+        if not min(nearest.cost, found.cost) < math.inf and (previous := shifted()) is not None:
+            trial = problem.evaluate(problem.clipped(previous))
+            nearest = self._restored(problem, outcome, trial)
+            if nearest.violation < missed.violation:
+                missed = nearest
+        if not nearest.cost < math.inf:
+            nearest = found
+        if not nearest.cost < math.inf:
+            return problem.missed_rows(missed)
+        outcome.restored_cost, outcome.improved = nearest.cost, True
+        outcome.events |= Status.RESTORED
+        outcome.trial = found
+        if nearest.cost <= found.cost:
+            outcome.trial = nearest
+            outcome.events &= ~_OUTDATED
+            self._search(problem, outcome, None, max(1, self._limit - outcome.qps))
+        if outcome.trial.cost < problem.candidate.cost:  # (a), after all
+            outcome.restored_cost = math.nan
+            outcome.events &= ~Status.RESTORED
+        return ()
 
     def _search(self, problem: Problem, outcome: Outcome, start: Array | None, limit: int) -> None:
         """Lower the cost by at most ``limit`` QPs, from the start if that is better.
@@ -366,6 +424,30 @@ class Optimizer:
             if not nearest.violation < NEARER * before.violation:
                 break
         return nearest if nearest.cost < math.inf else trial
+
+    def _restored(self, problem: Problem, outcome: Outcome, trial: Trial) -> Trial:
+        """The nearest feasible trajectory to a trial, or the last one on the way.
+
+        As `_feasible_near`, with shorter steps where a full one does not lower the miss.
+        """
+        for _ in range(RESTORING):
+            if trial.cost < math.inf:
+                break
+            qp = self._subproblem.nearest_point(problem, trial)
+            solution = None if qp is None else self._solve(qp, outcome)
+            if solution is None:
+                break
+            outcome.nearest_points += 1
+            if solution.d is None:
+                break
+            for length in (1.0, *LENGTHS[1:]):
+                ahead = self._trial(problem, trial, length * solution.d)
+                if ahead.violation < (1.0 - TOWARDS * length) * trial.violation:
+                    break
+            else:
+                break
+            trial = ahead
+        return trial
 
     def _trials(
         self, problem: Problem, qp: QP, outcome: Outcome, step: Array, correct: bool, shorten: bool

@@ -11,7 +11,7 @@ from .._checks import choice, count, dimension, flag, positive
 from ..errors import BackendError, OptionError
 from .limits import PATIENCE
 
-Infeasible = Literal["drop_rows", "keep_candidate"]
+Infeasible = Literal["drop_rows", "restore"]
 Candidate = Literal["observer", "reinitialized"]
 Arrival = Literal["observer", "smoothed"]
 Engine = Literal["auto", "python", "compiled"]
@@ -40,6 +40,7 @@ class Settings:
     isolated: bool = False
     arrival: str = "observer"
     parameters: tuple[float, ...] = ()
+    restart: bool = False
 
     def __post_init__(self) -> None:
         # Stored as Python's int: not all code that reads them accepts NumPy's integers.
@@ -55,7 +56,7 @@ class Settings:
         positive("tolerance", self.tolerance)
         if self.time_budget is not None:
             positive("time_budget", self.time_budget)
-        for name in ("project_observer", "warm_start", "isolated"):
+        for name in ("project_observer", "warm_start", "isolated", "restart"):
             flag(name, getattr(self, name))
         for name, choices in (
             ("engine", get_args(Engine)),
@@ -64,6 +65,11 @@ class Settings:
             ("arrival", get_args(Arrival)),
         ):
             choice(name, getattr(self, name), choices)
+        if self.restart and self.candidate == "reinitialized":
+            raise OptionError(
+                "restart is True, but candidate='reinitialized' restarts the observer at each "
+                "sample; leave one of them out."
+            )
         if self.isolated and self.engine == "compiled":
             raise OptionError(
                 "isolated is True, but engine='compiled' solves its QPs itself, without a "

@@ -113,7 +113,10 @@ class StepComparison:
 
     def _largest(self, one: Array, other: Array) -> StepError | None:
         shares = np.abs(difference(self._system.state_residual, one, other)) / self._units
-        shares[~np.isfinite(shares).all(axis=1)] = -1.0
+        finite = np.isfinite(one), np.isfinite(other)
+        # A model that is not finite either way is outside of its domain, else the step exploded.
+        shares[~finite[0] | ~finite[1]] = np.inf
+        shares[~finite[0].all(axis=1) & ~finite[1].all(axis=1)] = -1.0
         k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
         if shares[k, j] < 0.0:
             return None
@@ -151,12 +154,16 @@ def check_step(
         f"{' or '.join(remedies)} is fine enough" if remedies
         else "Take more substeps (steps=), or for stiff rates method='radau'"
     )
+    differs = (
+        f"differs from that of half the length by {error.deviations:.2g} standard deviations of "
+        f"the disturbance in state {error.component} (expected at most {comparison.most:g})"
+        if np.isfinite(error.deviations) else
+        f"and that of half the length are not both finite in state {error.component}"
+    )
     steps = f"{system.steps} substeps" if system.steps > 1 else "one step"
     warnings.warn(
         f"{steps} of {system.method} in dt = {system.dt:g} is too long: from x = {point} the "
-        f"result differs from that of half the length by {error.deviations:.2g} standard "
-        f"deviations of the disturbance in state {error.component} (expected at most "
-        f"{comparison.most:g}), so estimates may be wrong though each step improves its cost. "
+        f"result {differs}, so estimates may be wrong though each step improves its cost. "
         f"{remedy}. Or make the covariance of the disturbance as large as the error.",
         ModelWarning,
         stacklevel=level + 1,

@@ -55,5 +55,5 @@ class ObserverWatch:
         return (
             f"the observer was far from the estimates in {far} consecutive samples (more than "
             f"{FAR:g} standard deviations of the prior); use another gain or observer, or "
-            "candidate='reinitialized'."
+            "candidate='reinitialized' or restart=True."
         )

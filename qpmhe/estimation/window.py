@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,15 +17,23 @@ from ..terms.base import read_only
 from ..terms.hold import WindowHold
 from .conditions import USUAL, Conditions
 from .estimate import Status
-from .limits import LARGEST
+from .limits import LARGER, LARGEST
 from .observer_steps import OF_PROJECTION, ObserverSteps
 from .running import RunningObservers
 
 Array = NDArray[np.float64]
 
-_MISSING = Status.MISSING.value
+_MISSING, _RESTARTED = Status.MISSING.value, Status.RESTARTED.value
 # Observers run side by side if they hold at most this many numbers; otherwise `replay` does it.
 _MOST_RUNNING = 2**23
+
+
+@cache
+def larger(count: int) -> float:
+    """By how much a sum of so many squares must be above another: a quantile of F."""
+    from scipy.special import fdtri  # late: most programs do without
+
+    return float(fdtri(count, count, LARGER)) if count else math.inf
 
 
 class Window(ObserverSteps):
@@ -43,9 +53,10 @@ class Window(ObserverSteps):
         project: bool,
         reinitialized: bool = False,
         usual: Conditions = USUAL,
+        restarts: bool = False,
     ) -> None:
         super().__init__(
-            system, observer, cost, horizon, initial_state, with_terms, project, usual
+            system, observer, cost, horizon, initial_state, with_terms, project, usual, restarts
         )
         self._held = list(system.held)
         self.trust_start()
@@ -134,6 +145,7 @@ class Window(ObserverSteps):
         self.last_good, self.last_good_covariance = other.last_good_before(other.start)
         self.smoothed_prior, self.trusted = other.smoothed_prior, other.trusted
         self.watched, self.damping = other.watched, other.damping
+        self.restarted = other.restarted
         if self.metric is not None and other.metric is not None:
             self.metric.state = other.metric.state
         self.own = {time: own.without(changes) for time, own in other.own.items()}
@@ -155,6 +167,40 @@ class Window(ObserverSteps):
         """Replay the window from its first estimate; the last ones are x(t-N), ..., x(t-1)."""
         if not self._observers_ready or not self._follow(estimates):
             self.replay(self.length, estimates[-self.length])
+
+    def challenge(self) -> bool:
+        """Let an observer that starts now at the window's first estimate take a worse one's place.
+
+        It starts as the first one did, with the prior's covariance. Both have predicted the
+        window's measurements, none of which this estimate has used: the errors decide, by an F-test
+        of their sizes. The cost J does not: with another prior it is another function.
+        """
+        count, before, first = np.count_nonzero(self.observed), self.prediction_error, self.start
+        mark, events, failure = self.mark(True), self.events, self.failure
+        self.z[first] = self.history[first]
+        if self.covariance is not None:
+            self.covariance[first], self.is_vague[first] = self._first_covariance, False
+        if self.rejections is not None:
+            self.rejections[first] = 0
+        if self.memory is not None:
+            self.memory[first] = self._first_memory
+        self.enter_states(first, self.time - self.length)
+        self.replay(self.length)
+        if before > larger(count) * self.prediction_error:
+            self.events |= _RESTARTED
+            self.restarted = self.time
+            return True
+        self.roll_back(mark)
+        self.events, self.failure = events, failure
+        return False
+
+    @property
+    def prediction_error(self) -> float:
+        """The window's squared weighted errors y - h(z); infinity where the model has failed."""
+        if not np.isfinite(self.cost[self.start : self.end]).all():
+            return math.inf
+        v, weights = self.residuals[:, self._n :], self.weights[:, self._n :, self._n :]
+        return float(np.einsum("ki,kij,kj->", v, weights, v))
 
     @property
     def _observers_ready(self) -> bool:

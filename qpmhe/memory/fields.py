@@ -49,6 +49,8 @@ FIELDS = (
           about="samples in a row with a far observer, with rows dropped"),
     Field("damping", "once",
           about="with which a search for a shorter step begins, at least; 0 for none"),
+    Field("restarted", "once", kind="time", when="restarts",
+          about="samples taken when the observer was last restarted"),
     Field("trajectory", "once", "states n", about="of the last estimate"),
     Field("smoothed_prior", "once", "n", about="the prior in place of the window's first z"),
     Field("trusted", "once", "2 held", when="held",

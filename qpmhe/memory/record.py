@@ -110,6 +110,7 @@ class MemoryRecord:
         self.time = 0  # number of samples pushed: the window ends at x(time)
         self.watched: tuple[int, int] = (0, 0)
         self.damping = 0.0
+        self.restarted = 0
         self.trajectory: Array | None = None
         #: Prior mean in place of z(t-N), with ``arrival="smoothed"``.
         self.smoothed_prior: Array | None = None
@@ -306,6 +307,10 @@ class MemoryRecord:
             for found in state["watched"]
         )
         self.watched = far, dropped
+        if "restarted" in self._single:
+            self.restarted = check_size(
+                "restarted", state["restarted"], lambda found: 0 <= found <= time
+            )
         self.damping = float(state["damping"])
         if not 0.0 <= self.damping < math.inf:
             raise ValueError(f"damping is {self.damping!r}")

@@ -205,6 +205,32 @@ def test_the_measured_cost_may_give_less():
     assert reading.kind == "measured"
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
+def test_a_restored_estimate_ends_the_theorem_and_leaves_the_measured_bound():
+    """The noises' set excludes the candidate, and the prior makes a way into it dear."""
+    cost = qpmhe.QuadraticCost(prior=100.0, disturbance=100.0, noise=1.0)
+    certificate = certify(
+        scalar(noises=box(-3.0, 3.0)), qpmhe.Luenberger([[-0.45]]), cost, horizon=5,
+        region=box(-90.0, 90.0), sizes=Sizes(1e-6, 1e-6),
+    )
+    mhe = estimator(
+        certificate, horizon=5, initial_state=[60.0], max_qps=5, infeasible="restore"
+    )
+    watch, x = Monitor(certificate, mhe, initial_error=60.0), np.zeros(1)
+    restored, measured = 0, 0
+    for _ in range(20):
+        estimate = mhe.update(x)
+        reading = watch.check(estimate)
+        restored += qpmhe.Status.RESTORED in estimate.status
+        measured += reading.kind == "measured"
+        assert watch.applies == (not restored)
+        assert np.linalg.norm(x - estimate.state) <= reading.error
+    assert restored > 2
+    assert measured > 10
+    assert re.search(r"^from sample \d+ on: .*\(RESTORED\)", watch.barred)
+    assert watch.lost is None
+
+
 def changed(estimate, **values):
     """The estimate with other numbers."""
     for name, value in values.items():

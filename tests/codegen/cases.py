@@ -627,7 +627,7 @@ FEATURES = {
         ), conditions),
         # The window never is full of such samples, about which there is a warning.
         "states not projected": ("states in a polytope", conditions, {
-            "project_observer": False, "horizon": STEPS + 1, "infeasible": "keep_candidate",
+            "project_observer": False, "horizon": STEPS + 1,
         }),
         "extended in states": ("states in a polytope", filtered(), gaps, ONE),
         "unscented in states": ("states in a box", filtered(UKF, np.eye(2)), gaps, AGAIN),
@@ -653,7 +653,6 @@ FEATURES = {
         ),
         "narrow conditions": ("inputs", boxed, conditions, {"horizon": 1}),
         "tank conditions": (_tank, conditions),
-        "tank kept": ("tank conditions", {"infeasible": "keep_candidate"}, WARM),
         "tank in time": ("tank conditions", {"time_budget": 1e6}),
     },
     "observers": {

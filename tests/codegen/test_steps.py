@@ -56,9 +56,8 @@ def test_no_qp_is_begun_when_the_time_is_up(name):
             np.testing.assert_array_equal(estimate.trajectory, expected.trajectory)
 
 
-@pytest.mark.parametrize("name", ["tank conditions", "tank kept"])
-def test_the_ladder_keeps_its_promise_whenever_the_time_is_up(name):
-    one = case(name)
+def test_the_ladder_keeps_its_promise_whenever_the_time_is_up():
+    one = case("tank conditions")
     for budget in (0.5, 1.5, 2.5, 4.5, 8.5, 30.5):
         up, mhe = 0, one.estimator("compiled", time_budget=budget)
         for sample in one.samples:

@@ -116,7 +116,7 @@ def test_options_out_of_range():
         ("horizon", 0, "expected an integer >= 1"), ("max_qps", 1.5, "expected an integer >= 0"),
         ("tolerance", math.nan, "a finite number > 0"), ("time_budget", 0, "finite number > 0"),
         ("warm_start", "best", "True or False"),
-        ("infeasible", "drop", "'drop_rows'", "'keep_candidate'"),
+        ("infeasible", "drop", "'drop_rows'", "'restore'"),
     ):
         check(OptionError, [f"{name} is {value!r}", *words], estimator, **{name: value})
     names = [entry.name for entry in qpmhe.solvers.backends()]

@@ -59,6 +59,15 @@ def test_a_stiff_model_warns_once_with_number_and_remedy():
     mhe.update([1.0])
 
 
+def test_a_step_that_explodes_warns():
+    """One step leads to 1e40, and two half steps to no number."""
+    def rate(x):
+        return np.stack([-3e7 * x[..., 0] ** 2 - x[..., 0], -x[..., 1]], -1)
+
+    with pytest.warns(qpmhe.ModelWarning, match=r"not both finite in state 0.* method='radau'"):
+        build(*made(rate, dt=1.0))
+
+
 def test_a_mild_model_does_not():
     build(*made(MILD))
     build(*made(w=(100.0, 1e-2)))  # nor one whose disturbance covers the error

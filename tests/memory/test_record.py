@@ -146,7 +146,8 @@ def test_the_structures_of_c_have_the_table_s_names_and_sizes():
     """As text and as NumPy's type, member by member."""
     n, p, m, horizon = 3, 2, 1, 5
     sizes = MemorySizes.of(
-        n, p, m, horizon, sensors=2, held=1, covariance=True, roots=True, rows=(6, 4), x_set=True
+        n, p, m, horizon, sensors=2, held=1, covariance=True, roots=True, rows=(6, 4), x_set=True,
+        restarts=True,
     )
     numbers = {
         "MHE_NX": n, "MHE_NY": p, "MHE_NU": m, "MHE_HORIZON": horizon, "MHE_SENSORS": 2,

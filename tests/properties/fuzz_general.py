@@ -120,7 +120,7 @@ def broken(one, mhe, estimate):
         turns = one.how and np.isfinite(one.periods[0]).any()
         if abs(J - estimate.candidate_cost) > CLOSE * (1e-9 + abs(J)) and not turns:
             faults.append(f"candidate's cost {estimate.candidate_cost}, not {J}")
-    if not estimate.improved:
+    if Status.CANDIDATE in status:
         return faults
     J, missed = window.judged(estimate.trajectory)
     if abs(J - estimate.cost) > CLOSE * (1e-9 + abs(J)):

@@ -80,6 +80,7 @@ class Case:
             one.from_observer = False
         # The code is checked when it is loaded: what is wrong is optimised less.
         self.levels = LEVELS[int(rng.integers(len(LEVELS))) :]
+        self.restarted = -1
         self.scribble, self.snapshots = rng.random() < 0.3, rng.random() < 0.15
 
     @contextmanager
@@ -185,7 +186,7 @@ class Case:
                 close = np.allclose(told, own, rtol=1e-5, atol=1e-5 * np.abs(own).max())
                 wrong(not close, f"the hold's {name} is", told, "truly", own)
             hold.target = mhe.hold.target.copy()
-        if estimate.improved:
+        if Status.CANDIDATE not in estimate.status:
             hold.learn(estimate.trajectory[int(self.one.options["horizon"] == K)])
 
     def _check(self, estimate, t, K, z, P, history):
@@ -207,14 +208,23 @@ class Case:
         ):
             wrong(not abs(told - own) <= loose * abs(own) + 1e-10, name, "is", told, "truly", own)
         costs = estimate.cost, estimate.candidate_cost
-        higher = not costs[0] <= costs[1] or candidate_J * (1.0 + 2.0 * loose) + 1e-10 < J
-        wrong(higher, "the cost is above the candidate's:", *costs, J, candidate_J)
+        restored = Status.RESTORED in status
+        if restored:
+            most = limit = estimate.restored_cost
+            wrong(one.options["infeasible"] != "restore", "restored against the option")
+            wrong(Status.CANDIDATE_OUTSIDE not in status, "restored from inside", status)
+        else:
+            most, limit = costs[1], candidate_J
+            wrong(not math.isnan(estimate.restored_cost), "restored in secret", status)
+        higher = not costs[0] <= most or limit * (1.0 + 2.0 * loose) + 1e-10 < J
+        wrong(higher, "the cost is above the", restored, "limit:", *costs, most, J, limit)
         # Within the sets at the same cost is better, too.
         same, improved = costs[0] == costs[1], Status.IMPROVED in status
         wrong(improved and same and Status.CANDIDATE_OUTSIDE not in status, status, *costs)
-        wrong(improved == (Status.CANDIDATE in status) or not (improved or same), status, *costs)
-        kept = np.array_equal(x, candidate)
-        wrong(not improved and not kept, "the estimate is not the candidate")
+        wrong(improved + restored + (Status.CANDIDATE in status) != 1, status)
+        wrong(not (improved or restored or same), status, *costs)
+        moved, kept = improved or restored, np.array_equal(x, candidate)
+        wrong(not moved and not kept, "the estimate is not the candidate")
         size = 1.0 + max(float(np.abs(x).max()), *(
             float(np.nanmax(np.abs(one.y), initial=0.0)) for one in samples
         ))
@@ -225,7 +235,7 @@ class Case:
         self._check_sets(estimate, t + 1 - K, (x, *own[0]), (candidate, *own[1]), size)
         wrong(not np.array_equal(estimate.state, x[-1]), "state is not the last of the trajectory")
         expected, tolerance = x[-2], 0.0
-        if not improved:
+        if not moved:
             expected = self.watcher.filtered(z[t], P[t], samples[-1])
             tolerance = 0.0 if expected is z[t] else 1e-5
         close = np.allclose(estimate.filtered, expected, rtol=0, atol=tolerance * size)
@@ -248,6 +258,11 @@ class Case:
         again, watcher = range(K - 1, K), self.watcher
         if self.one.options["candidate"] == "reinitialized":
             z[first], again = history[first], range(K)
+        elif Status.RESTARTED in status:
+            wrong(not self.one.options["restart"], "restarted against the option")
+            wrong(t - self.restarted < K, "restarted twice within a horizon")
+            z[first], P[first], again = history[first], watcher.P0.copy(), range(K)
+            self.restarted = t
         wrong(not np.array_equal(found[0], z[first]), "the candidate starts at", found[0])
         tolerance = 1e-9 if watcher.exact else 1e-5
         for i in again:
@@ -298,10 +313,9 @@ class Case:
         free = {row for row in dropped if row[0] == "disturbances" and row[1] < len(low)
                 and low[row[1]] == high[row[1]]}
         wrong(free, "dropped", free, "which are free of noise")
-        wrong(Status.IMPROVED in status and not left <= dropped, "dropped", dropped, *words)
+        moved = Status.CANDIDATE not in status
+        wrong(moved and not left <= dropped, "dropped", dropped, *words)
         wrong(not perhaps and left, "misses", left, "and the candidate nothing")
-        against = self.one.options["infeasible"] == "keep_candidate" and dropped
-        wrong(against, "dropped", dropped, "against the option")
         if self.watcher.projects:
             for point in (*estimate.trajectory, estimate.filtered, *estimate.candidate):
                 found = misses(self.one.sets, "states", point, covariances[0])

@@ -55,22 +55,31 @@ def broken(one, estimate, feasible=FEASIBLE):
     faults, status, x = [], estimate.status, estimate.trajectory
     count = len(x) - 1
     window = one.samples[estimate.time + 1 - count : estimate.time + 1]
-    if not (estimate.cost <= estimate.candidate_cost or estimate.candidate_cost == np.inf):
+    restored, moved = Status.RESTORED in status, Status.CANDIDATE not in status
+    if restored != np.isfinite(estimate.restored_cost):
+        faults.append("restored in secret")
+    if restored and (Status.CANDIDATE_OUTSIDE not in status or estimate.dropped):
+        faults.append("restored into sets that are left")
+    if restored and one.options["infeasible"] != "restore":
+        faults.append("restored against the option")
+    if restored and not estimate.cost <= estimate.restored_cost:
+        faults.append("cost above that of the restored candidate")
+    if not (restored or estimate.cost <= estimate.candidate_cost or (
+        estimate.candidate_cost == np.inf
+    )):
         faults.append("cost above the candidate's")
     if (Status.ROWS_DROPPED in status) != bool(estimate.dropped):
         faults.append("rows dropped in secret")
-    if estimate.dropped and one.options["infeasible"] == "keep_candidate":
-        faults.append("rows dropped against the option")
-    if estimate.improved == (Status.CANDIDATE in status):
-        faults.append("improved and the candidate")
-    if not estimate.improved and not np.array_equal(x, estimate.candidate):
+    if estimate.improved + restored + (Status.CANDIDATE in status) != 1:
+        faults.append("improved, restored and the candidate")
+    if not moved and not np.array_equal(x, estimate.candidate):
         faults.append("not the candidate")
     outside, missed = misses(one, estimate)
-    projected = one.options["project_observer"] or (estimate.improved and not estimate.dropped)
+    projected = one.options["project_observer"] or (moved and not estimate.dropped)
     # Where trials are rolled out, none of them can be clipped.
     if projected and outside > (feasible if one.how else 0.0):
         faults.append(f"outside of X by {outside}")
-    if estimate.improved and one.how == "matrix":
+    if moved and one.how == "matrix":
         ahead = np.array([
             one.f(state, sample.known, sample.dt)
             for state, sample in zip(x, window, strict=False)
@@ -80,7 +89,7 @@ def broken(one, estimate, feasible=FEASIBLE):
         d = np.where(np.isfinite(period), d - period * np.round(d / period), d)
         if np.abs(d).max() > 1e-12 * (1.0 + np.abs(x).max()):
             faults.append(f"a disturbance in a direction that has none, {np.abs(d).max()}")
-    if estimate.improved and not estimate.dropped and missed > feasible:
+    if moved and not estimate.dropped and missed > feasible:
         faults.append(f"a set violated by {missed} and no row dropped")
     return faults
 

@@ -42,8 +42,9 @@ def observer_path(f, h, gain, z, Y):
 def keeps_promise(f, h, estimate, Y, weights, sets=NO_SETS):
     """Hold an estimate to the promise; Y are the measurements of its window."""
     status, trajectory, seen = estimate.status, estimate.trajectory, there(Y)
-    assert estimate.cost <= estimate.candidate_cost
-    assert (Status.IMPROVED in status) != (Status.CANDIDATE in status)
+    restored = Status.RESTORED in status
+    assert estimate.cost <= (estimate.restored_cost if restored else estimate.candidate_cost)
+    assert (Status.IMPROVED in status) + restored + (Status.CANDIDATE in status) == 1
     assert trajectory.shape == estimate.candidate.shape == (len(Y) + 1, estimate.state.size)
     for array in (trajectory, estimate.candidate, estimate.disturbances, estimate.noises[seen]):
         assert np.isfinite(array).all()
@@ -54,13 +55,18 @@ def keeps_promise(f, h, estimate, Y, weights, sets=NO_SETS):
         # Within the sets at the same cost is better, too.
         outside = Status.CANDIDATE_OUTSIDE in status
         assert estimate.cost < estimate.candidate_cost or outside
+    elif restored:
+        assert Status.CANDIDATE_OUTSIDE in status
+        assert not estimate.dropped
     else:
         assert estimate.cost == estimate.candidate_cost
         assert trajectory.tolist() == estimate.candidate.tolist()
     if np.isfinite(estimate.cost):
         true, slack = true_cost(f, h, trajectory, estimate.candidate[0], Y, weights)
         assert abs(estimate.cost - true) <= 1e-9 * true + slack
-        if not estimate.dropped and (estimate.improved or Status.CANDIDATE_OUTSIDE not in status):
+        if not estimate.dropped and (
+            estimate.improved or restored or Status.CANDIDATE_OUTSIDE not in status
+        ):
             within(sets, estimate, seen, weights)
 
 
@@ -70,9 +76,10 @@ def within(sets, estimate, seen, weights):
     # of large states is no better than their rounding. Misses count in deviations.
     _, by_w, by_v = (np.sqrt(np.linalg.inv(one).diagonal()) for one in weights)
     rounding = 4e-15 * np.abs(estimate.trajectory[1:]).max(axis=1, keepdims=True)
+    clipped = Status.CANDIDATE not in estimate.status
     for box, points, slack in zip(
         sets, (estimate.trajectory, estimate.disturbances, np.where(seen, estimate.noises, np.nan)),
-        (0.0 if estimate.improved else 1e-9, 1e-8 * by_w + rounding, 1e-8 * by_v), strict=True,
+        (0.0 if clipped else 1e-9, 1e-8 * by_w + rounding, 1e-8 * by_v), strict=True,
     ):
         if box is not None:
             assert not (points < box.lower - slack).any()

@@ -125,8 +125,10 @@ class Problem:
             "warm_start": bool(rng.random() < 0.3),
             "candidate": "reinitialized" if rng.random() < 0.2 else "observer",
             "project_observer": bool(rng.random() < 0.8),
-            "infeasible": ("drop_rows", "keep_candidate")[rng.integers(2)],
+            "infeasible": ("drop_rows", "restore")[rng.integers(2)],
         }
+        if self.options["candidate"] == "observer":
+            self.options["restart"] = bool(np.random.default_rng([seed, 2]).random() < 0.3)
 
     def draw_directions(self):
         """G: of the system, of a singular covariance of the disturbances, or none."""
@@ -488,6 +490,8 @@ class Problem:
         units = units or self.own_units
         if self.k:
             options["parameters"] = self.nominal * units.inputs[self.m :]
+        if (self.options | options).get("engine") == "compiled":  # which has neither
+            options |= {"infeasible": "drop_rows", "restart": False}
         return qpmhe.MovingHorizonEstimator(
             *self.parts(units), initial_state=self.start * units.states, **self.options | options,
         )

@@ -82,7 +82,7 @@ def levels(x):
 
 
 @pytest.mark.parametrize("options", [
-    {"max_qps": None}, {"max_qps": 5, "warm_start": True}, {"infeasible": "keep_candidate"},
+    {"max_qps": None}, {"max_qps": 5, "warm_start": True}, {"infeasible": "restore"},
     *({"backend": name} for name in available() if name not in NO_BITS),
 ], ids=str)
 def test_of_every_backend(options):

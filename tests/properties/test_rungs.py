@@ -1,7 +1,10 @@
 """What becomes of a candidate outside of the sets, and of a step whose time is up."""
 
+import re
+
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 import qpmhe
 from qpmhe import Status
@@ -78,9 +81,26 @@ def tight(name, **options):
     return found
 
 
+def least_miss(name, estimate):
+    """The largest miss of the sets by the trajectory that misses them least, found by SciPy."""
+    last, K = estimate.time, len(estimate.disturbances)
+    Y = record()[last + 1 - K : last + 1]
+
+    def missed(numbers):
+        x = numbers.reshape(K + 1, 3)
+        points = {"states": x, "disturbances": x[1:] - f(x[:-1]), "noises": Y - h(x[:-1])}
+        return np.concatenate([
+            np.maximum(np.maximum(box.lower - points[of], points[of] - box.upper), 0.0).ravel()
+            for of, box in SETS[name].items()
+        ])
+
+    exact = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+    return np.abs(least_squares(missed, estimate.trajectory.ravel(), **exact).fun).max()
+
+
 @quiet
 @pytest.mark.parametrize("max_qps", [0, 1, None])
-@pytest.mark.parametrize("infeasible", ["drop_rows", "keep_candidate"])
+@pytest.mark.parametrize("infeasible", ["drop_rows", "restore"])
 @pytest.mark.parametrize("name", SETS)
 def test_the_rungs_of_the_ladder(name, infeasible, max_qps):
     satisfied = 0
@@ -93,14 +113,19 @@ def test_the_rungs_of_the_ladder(name, infeasible, max_qps):
                 Status.CANDIDATE | Status.NO_QPS | expected
             )
             continue
+        moved = Status.CANDIDATE not in estimate.status
         assert outside or estimate.improved
-        assert estimate.improved or not estimate.dropped
+        assert moved or not estimate.dropped
         assert outside or estimate.nearest_points == 0
-        assert not estimate.dropped or infeasible == "drop_rows"
+        assert Status.RESTORED not in estimate.status or infeasible == "restore"
         # With a cap of 1, there is one QP for the rung below, too.
-        assert max_qps is None or estimate.qps <= 1 + (infeasible == "drop_rows" and outside)
-        assert estimate.nearest_points <= 5 * (1 + estimate.qps)
-        satisfied += outside and estimate.improved and not estimate.dropped
+        assert max_qps is None or estimate.qps <= 1 + outside
+        most = 5 * (1 + estimate.qps) + 2 * 20 * (infeasible == "restore")
+        assert estimate.nearest_points <= most
+        satisfied += outside and moved and not estimate.dropped
+        if infeasible == "restore":
+            assert moved
+            assert not estimate.dropped or least_miss(name, estimate) > 1e-4
     assert satisfied >= 2 or max_qps == 0
 
 
@@ -130,17 +155,19 @@ def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend):
             system, qpmhe.Luenberger([0.01]), qpmhe.QuadraticCost(prior=1, disturbance=1, noise=1),
             horizon=3, initial_state=[0.5], backend=backend, max_qps=1, infeasible=infeasible,
         )
-        for infeasible in ("drop_rows", "keep_candidate")
+        for infeasible in ("drop_rows", "restore")
     )
     for one in (mhe, other):
         assert Status.CANDIDATE_OUTSIDE not in one.update([0.7]).status
     for t in range(1, 4):
         if t < 3:
             estimate = mhe.update([5.0])
+            second = other.update([5.0])
         else:
             with pytest.warns(ObserverWarning, match="dropped in 3 consecutive samples"):
                 estimate = mhe.update([5.0])
-        candidate = other.update([5.0])
+            with pytest.warns(ObserverWarning, match="dropped in 3 consecutive samples"):
+                second = other.update([5.0])
         late = [("noises", 0, "upper", s) for s in range(max(1, t - 2), t + 1)]
         assert list(estimate.dropped) == late
         assert estimate.improved
@@ -149,9 +176,14 @@ def test_rows_that_exclude_all_that_is_better_are_dropped_one_by_one(backend):
         assert np.abs(estimate.trajectory).max() <= 1.0
         assert np.nanmax(estimate.noises[: -len(late)], initial=0.0) <= 2.0 + 1e-8
         assert estimate.qps >= 2
-        assert candidate.trajectory.tolist() == estimate.candidate.tolist()
-        assert candidate.dropped == ()
-        assert "The estimate violates them as well." in candidate.explain()
+        assert "infeasible='restore'" in estimate.explain()
+        # No trajectory is in all sets: the other policy ends at the same rung, and says why.
+        assert second.candidate.tolist() == estimate.candidate.tolist()
+        assert second.dropped == estimate.dropped
+        assert second.cost == pytest.approx(estimate.cost, rel=1e-6)
+        assert "no trajectory that satisfies all sets was found" in second.message
+        assert re.search(rf"misses the .*, row 0, at time {t}", second.message)
+        assert second.nearest_points <= 5 * (1 + second.qps) + 2 * 20
 
 
 @quiet

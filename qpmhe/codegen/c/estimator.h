@@ -93,9 +93,6 @@ $status
 /* Rows of a window: those of stage i on w(i), v(i) and x(i); a last stage has x only. */
 #define MHE_ROWS ((MHE_HORIZON + MHE_X_SET) * MHE_SIZE(MHE_STAGE_ROWS))
 
-/* What to do if no trajectory in the sets costs at most as much as the candidate. */
-enum { MHE_DROP_ROWS = 0, MHE_KEEP_CANDIDATE = 1 };
-
 /* Sides of an inequality, as bits. */
 enum { MHE_LOWER = 1, MHE_UPPER = 2 };
 
@@ -221,7 +218,6 @@ $term_fields#if MHE_SENSORS
     int32_t uncapped;          /* whether that only ends a sequence that does not converge */
     int32_t patience;          /* QPs in a row that may stay unsolved; 0: any number */
     int32_t max_iterations;    /* interior-point iterations in each; 0: no inequalities */
-    int32_t infeasible;        /* MHE_DROP_ROWS or MHE_KEEP_CANDIDATE */
     int32_t start_at_best;     /* start at the shifted previous estimate where it is better */
     int32_t reinitialize;      /* observer restarted at the estimate of the window's start */
     int32_t smooth;            /* prior at the previous estimate of the window's first state */

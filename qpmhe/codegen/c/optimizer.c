@@ -524,7 +524,7 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     if (o->best != o->candidate && o->best->cost < o->candidate->cost) return;
     if (o->best != o->candidate) o->spare = o->best;
     o->best = o->candidate;
-    if (e->settings->infeasible == MHE_KEEP_CANDIDATE || mhe_is_late(k, o)) return;
+    if (mhe_is_late(k, o)) return;
     o->events &= ~OUTDATED;
     const real *w = mhe_candidate_disturbances(e, k);
     mhe_violation(e, o->candidate, w, 0, k->left_out);
