@@ -112,7 +112,7 @@ class Beside:
             False,
         )
 
-    def compare(self, estimate, act):
+    def compare(self, estimate, act, explain=True):
         """The Python step's estimate, and a `Difference` or None.
 
         ``act(mhe, change)`` does what the compiled estimator has done, with changed numbers.
@@ -141,7 +141,7 @@ class Beside:
             better = "compiled" if estimate.cost < other.cost else "python"
         self.explained[kind, rows] += 1
         reason = "not examined"
-        if self.explained[kind, rows] <= _MEASURED[rows]:
+        if explain and self.explained[kind, rows] <= _MEASURED[rows]:
             reason = self._reason(estimate, other, kind, x, J, act)
         detail = (
             f"x {x:.1e}, J {J:.1e}, candidate {candidate:.1e}, by rounding {self.far}",

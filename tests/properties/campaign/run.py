@@ -250,7 +250,7 @@ class Run:
         if not self.beside or estimate is None:
             return
         other, difference = self._called(f"{name} of the Python step", lambda: self.beside.compare(
-            estimate, act
+            estimate, act, name != "set"  # done again, it would free the settings that C points to
         ))
         self.counts["compared"] += 1
         if not 0.0 <= other.cost <= other.candidate_cost:
