@@ -52,6 +52,8 @@ _NO_SQUARE = 1e150
 _LOST = 1e-2
 # Of one whose numbers grow to so many times the record's, too.
 _AWAY = 1e8
+# A projection onto X from so many times as far away loses the digits that are compared.
+_BEYOND = 1e6
 # Where fewer samples could be compared, another record is tried, from elsewhere and with inputs
 # that are smaller by this factor: with large ones, some models run away at once.
 _ENOUGH, _RECORDS, _SMALLER = 5, 3, 1e-2
@@ -258,6 +260,7 @@ class _Rehearsal:
         self._start = start
         arguments = system, observer, cost, settings
         self._compiled = CompiledEngine(*arguments, start, library)
+        self._first = observer.initial_covariance()
         self._python = _Follower(1.0, *arguments, start)
         self._nudged = _Follower(nudge_x, *arguments, start * nudge_x)
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
@@ -336,6 +339,13 @@ class _Rehearsal:
         Or its numbers have run away, so that they soon will.
         """
         largest = max(abs(expected.candidate).max(), abs(expected.observer_state).max())
+        window = self._python.memory.window
+        if window.projects and window.covariance is not None and self._first is not None:
+            first, last = (
+                math.sqrt(abs(P).max()) for P in (self._first, window.covariance[window.end])
+            )
+            if not last <= _BEYOND * max(first, self._size):
+                return True
         apart = abs(nudged.candidate - expected.candidate).max()
         if not (
             largest <= _AWAY * self._size and apart <= _LOST * abs(expected.candidate).max()

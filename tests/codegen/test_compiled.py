@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -225,3 +226,37 @@ def test_rows_dropped_for_long_are_worth_a_warning(engine):
     with pytest.warns(qpmhe.ObserverWarning, match="inequalities were dropped in") as caught:
         _ = [mhe.update([3.0 * t]) for t in range(30)]
     assert [w.filename for w in caught] == [__file__]
+
+
+def test_a_filter_that_explodes_does_not_convict_the_compiler():
+    """Its covariance reaches 1e44 before its state is projected: then rounding decides where."""
+    def model(x):
+        k = np.exp(-2.0 / x[..., 1])
+        return np.stack([
+            x[..., 0] + 0.05 * (1.0 - x[..., 0] - k * x[..., 0]),
+            x[..., 1] + 0.05 * (0.5 - x[..., 1] + k * x[..., 0] * 0.5),
+        ], axis=-1)
+
+    system = qpmhe.System(
+        model, lambda x: x[..., 1:], n=2, p=1,
+        states=qpmhe.Polytope(
+            [[-2.176804142227712, -0.8918632912266076], [0.7974960976184672, -0.3447393904184218]],
+            [-0.4892079221656913, 1.0818012714094656],
+        ),
+        disturbances=qpmhe.Box([0.0, -np.inf], [0.0, np.inf]),
+        noises=qpmhe.Polytope([[25.57346337740178]], [1.8707530379612545]),
+    )
+    covariances = {
+        "prior": np.diag([4.3589974589489594e-03, 71.335965840248321]),
+        "disturbance": np.diag([0.00727411073953611, 0.05153810601125028]),
+        "noise": [[0.00152904724371075]],
+    }
+    weights = {name: np.linalg.inv(one) for name, one in covariances.items()}
+    observer = qpmhe.UnscentedKalman(**covariances)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", qpmhe.errors.EngineWarning)
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, observer, qpmhe.QuadraticCost(**weights), horizon=5, max_qps=1,
+            initial_state=[0.3785754024951795, -9.807693590675465], engine="compiled",
+        )
+    assert mhe.engine == "compiled"

@@ -263,8 +263,7 @@ class Case:
         python = self.engine == "python"
         options |= {name: value for share, name, value in (
             (0.25, "warm_start", True), (0.2, "candidate", "reinitialized"),
-            (0.15 * python, "arrival", "smoothed"), (0.2, "infeasible", "keep_candidate"),
-            (0.2, "project_observer", False),
+            (0.15 * python, "arrival", "smoothed"), (0.2, "project_observer", False),
             (0.1 * python, "time_budget", float(10.0 ** r.uniform(-5.0, -2.0))),
             (0.15, "max_solver_iterations", int(r.integers(1, 8))),
             (0.3 * python, "backend", str(r.choice(BACKENDS))),

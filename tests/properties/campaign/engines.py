@@ -3,20 +3,22 @@
 A difference is explained, in this order: by rounding, where an engine differs as much from itself
 when its memory and its data change in their last digits; by the tolerance of the Python step's QPs,
 where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
-where it differs as much from itself when the QPs change in their last digits; by a direction in
-which J is nearly flat, where the step in C loses digits to the weights of active rows; by a cap or
-by a QP that a method has not solved. What is left is a fault.
+where it differs as much from itself when the QPs change in their last digits; by a cap or
+by a QP that a method has not solved, mostly since it has no feasible point; by a direction in which
+J is nearly flat, where the step in C loses digits to the weights of active rows. What is left is a
+fault.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from qpmhe import QpmheError, Status
-from qpmhe.codegen.exchange import hand_over
+from qpmhe.codegen.exchange import hand_over, record_of
 from qpmhe_solvers import RawSolution, Solver, SolveStatus, create
 from qpmhe_solvers.options import SolverOptions
 
@@ -27,7 +29,8 @@ FLAT = 1e8  # condition of a Hessian from which on J is nearly flat in a directi
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
-_MEASURED = 4  # differences of a kind that are explained, of each estimator
+# Differences of a kind that are explained, of each estimator.
+_MEASURED = {"quiet": 20, "active": 4}
 _TRIES = 6
 _TIGHT = (
     {"solver_tolerance": 1e-12}, {"backend": "daqp", "solver_tolerance": 1e-12},
@@ -38,7 +41,7 @@ _TIGHT = (
 class Difference(NamedTuple):
     """How two estimates of the same window differ, and why."""
 
-    kind: str  # candidate, status or estimate
+    kind: str  # candidate, status, estimate or memory
     rows: str  # "active" or "quiet"
     reason: str
     better: str  # the engine with the lower J, "neither"
@@ -53,6 +56,7 @@ class Nudging(Solver):
 
     def __init__(self):
         super().__init__(SolverOptions())
+        self.unsolved = False
         self.condition = 1.0  # the largest one of their Hessians in units of its diagonal
         self.r, self.inner = np.random.default_rng(4), create(
             "auto", SolverOptions(absolute_tolerance=1e-12)
@@ -68,7 +72,12 @@ class Nudging(Solver):
         values = np.linalg.eigvalsh(lower / np.outer(roots, roots))
         self.condition = max(self.condition, values[-1] / max(values[0], EPS))
         solved = found.status is SolveStatus.SOLVED
+        self.unsolved |= not solved  # also one of a correction, which no status tells
         return RawSolution(found.d, solved, found.iterations, found.bound_duals, found.row_duals)
+
+
+def _same(numbers):
+    return numbers
 
 
 def _nudge(r, record):
@@ -103,9 +112,12 @@ class Beside:
             False,
         )
 
-    def compare(self, estimate, y, inputs, given):
-        """The Python step's estimate, and a `Difference` or None."""
-        other = self.python.update(y, *inputs, **given)
+    def compare(self, estimate, act, explain=True):
+        """The Python step's estimate, and a `Difference` or None.
+
+        ``act(mhe, change)`` does what the compiled estimator has done, with changed numbers.
+        """
+        other = act(self.python, _same)
         x, J = self._apart(other, estimate)
         units = self.case.x_units
         size = units * (1.0 + np.abs(other.candidate / units).max())
@@ -117,6 +129,8 @@ class Beside:
             kind = "estimate"
         elif not same:
             kind = "status"
+        elif (kept := self._far_from(self._kept(), self.python._engine._window)) > CLOSE:
+            kind, x = "memory", kept
         else:
             return other, None
         quiet = not (estimate.solver_iterations or other.solver_iterations
@@ -127,14 +141,33 @@ class Beside:
             better = "compiled" if estimate.cost < other.cost else "python"
         self.explained[kind, rows] += 1
         reason = "not examined"
-        if self.explained[kind, rows] <= _MEASURED:
-            reason = self._reason(estimate, other, kind, x, J, (y, inputs, given))
+        if explain and self.explained[kind, rows] <= _MEASURED[rows]:
+            reason = self._reason(estimate, other, kind, x, J, act)
         detail = (
             f"x {x:.1e}, J {J:.1e}, candidate {candidate:.1e}, by rounding {self.far}",
             estimate.cost, other.cost, estimate.candidate_cost, str(estimate.status),
             str(other.status),
         )
         return other, Difference(kind, rows, reason, better, detail)
+
+    def _kept(self):
+        """What the compiled estimator has kept of the step."""
+        engine = self.compiled._engine
+        library = engine._library
+        return record_of(engine._memory[0], library.layout, library.directions)
+
+    def _far_from(self, one, other):
+        """By how much what was kept of a step differs, in units."""
+        units = self.case.x_units
+        if (one.trajectory is None) != (other.trajectory is None):
+            return np.inf
+        pairs = [(one.z[one.end], other.z[other.end])]
+        if one.trajectory is not None:
+            pairs.append((one.trajectory, other.trajectory))
+        return max(
+            float(np.abs((a - b) / (units * (1.0 + np.abs(b / units).max()))).max())
+            for a, b in pairs
+        )
 
     def _apart(self, one, other):
         units = self.case.x_units
@@ -145,60 +178,61 @@ class Beside:
             return x, 0.0
         return x, abs(one.cost - other.cost) / (abs(one.cost) + 1e-300)
 
-    def _reason(self, estimate, other, kind, x, J, arguments):
+    def _reason(self, estimate, other, kind, x, J, act):
         engine = self.compiled._engine
-        after = engine._memory.copy()
+        after, kept = engine._memory.copy(), self._kept() if kind == "memory" else None
         try:
-            if self._is_rounding(estimate, other, kind, x, J, arguments):
+            if self._is_rounding(estimate, other, kind, x, J, act):
                 return "rounding"
-            if self._is_tolerance(estimate, x, arguments):
+            if self._is_tolerance(estimate, x, act, kept):
                 return "tolerance of QPs"
-            if self._is_hessian(x, arguments):
+            if self._is_hessian(x, act):
                 return "rounding of the Hessian"
-            if self.nudging.settings.backend.condition > FLAT:
-                return "flat J"
         finally:
             engine._memory[...] = after
+        solver = self.nudging.settings.backend
         if "max_solver_iterations" in self.case.options:
             return "cap"
-        return "unsolved QP" if STOPPED & (estimate.status | other.status) else "open"
+        if solver.unsolved or STOPPED & (estimate.status | other.status):
+            return "unsolved QP"
+        return "flat J" if solver.condition > FLAT else "open"
 
-    def _is_rounding(self, estimate, other, kind, x, J, arguments):
-        y, inputs, given = arguments
+    def _is_rounding(self, estimate, other, kind, x, J, act):
         r, engine = np.random.default_rng(3), self.compiled._engine
-        far, statuses, first = np.zeros(2), set(), {}
+        far, statuses, first, far_kept = np.zeros(2), set(), {}, 0.0
         for k in range(_TRIES):
             engine._memory[...] = self.memory
-            moved = y
             if k:  # the first one repeats the step
                 _nudge(r, engine._memory)
-                moved = None if y is None else nudged(r, y)
             self._hand_over(self.python)
             for one in (self.compiled, self.python):
-                again = one.update(moved, *inputs, **given)
+                again = act(one, partial(nudged, r) if k else _same)
                 statuses.add(again.status & ~STOPPED)
                 far = np.maximum(far, self._apart(first.setdefault(one, again), again))
+            kept = self._kept()
+            far_kept = max(far_kept, self._far_from(first.setdefault("kept", kept), kept))
         if kind == "status" and {estimate.status & ~STOPPED, other.status & ~STOPPED} <= statuses:
             return True
         self.far = far
+        if kind == "memory":
+            return x <= 10.0 * far_kept
         return bool((np.array([x, J]) <= 10.0 * far + (0.0, 1e-9)).all())
 
-    def _is_hessian(self, x, arguments):
+    def _is_hessian(self, x, act):
         """Whether the Python step moves as far when its QPs change in their last digits."""
-        y, inputs, given = arguments
         if self.nudging is None:
             self.nudging = self.case.estimator(
                 "python", backend=Nudging(), max_solver_iterations=None
             )
-        found, self.nudging.settings.backend.condition = [], 1.0
+        found, solver = [], self.nudging.settings.backend
+        solver.condition, solver.unsolved = 1.0, False
         for _ in range(_TRIES):
             self.compiled._engine._memory[...] = self.memory
             self._hand_over(self.nudging)
-            found.append(self.nudging.update(y, *inputs, **given))
+            found.append(act(self.nudging, _same))
         return x <= 10.0 * max(self._apart(found[0], one)[0] for one in found)
 
-    def _is_tolerance(self, estimate, x, arguments):
-        y, inputs, given = arguments
+    def _is_tolerance(self, estimate, x, act, kept):
         if self.exact is None:
             self.exact = [
                 self.case.estimator("python", max_solver_iterations=None, **tight)
@@ -208,10 +242,12 @@ class Beside:
             self.compiled._engine._memory[...] = self.memory
             self._hand_over(python)
             try:
-                again = python.update(y, *inputs, **given)
+                again = act(python, _same)
             except QpmheError:  # a backend that cannot solve such QPs
                 continue
             away, J = self._apart(estimate, again)
+            if kept is not None:
+                away, J = self._far_from(kept, python._engine._window), np.inf
             same = (again.status & ~STOPPED) == (estimate.status & ~STOPPED)
             if away <= max(1e-7, 0.02 * x) or (J <= 1e-9 and same):
                 return True

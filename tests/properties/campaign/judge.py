@@ -247,16 +247,18 @@ class Judge:
         mean = candidate[0] if mean is None else mean
         own = judged(case, x, window, mean, not case.from_observer)
         of_candidate = judged(case, candidate, window, mean, not case.from_observer)
-        rolled = candidate
-        if case.G is not None:
+        rolled, of_rolled = candidate, of_candidate
+        if case.G is not None:  # J of the candidate is that of its roll-out, its rows are its own
             rolled = self._rolled_out(candidate, window)
-            of_candidate = judged(case, rolled, window, mean, not case.from_observer)
+            of_rolled = judged(case, rolled, window, mean, not case.from_observer)
             found += self._beside(own, x)
         for name, trajectory, ours, theirs in (
-            ("candidate's cost", rolled, of_candidate, estimate.candidate_cost),
+            ("candidate's cost", rolled, of_rolled, estimate.candidate_cost),
             ("cost", x, own, estimate.cost),
         ):
-            found += self._compared(name, trajectory, ours, theirs, window, mean, status)
+            found += self._compared(
+                name, trajectory, ours, theirs, window, mean, status, candidate
+            )
         slack = BOUND * (own.slack + of_candidate.slack)
         if (
             math.isfinite(estimate.candidate_cost) and not case.from_observer
@@ -270,7 +272,7 @@ class Judge:
             found += self._of_observer(estimate, window)
         return found
 
-    def _compared(self, name, x, ours, theirs, window, mean, status):
+    def _compared(self, name, x, ours, theirs, window, mean, status, candidate):
         case, with_prior = self.case, not self.case.from_observer
         if not (math.isfinite(ours.J) and ours.J < HUGE):
             if math.isfinite(theirs) and theirs < HUGE:
@@ -286,14 +288,17 @@ class Judge:
         bound = BOUND * loose * ours.slack + (1e-7 * abs(ours.J) if loose > 1.0 else 0.0)
         if not apart > bound:
             return []
-        if apart <= MEASURED * rounding(case, x, window, mean, with_prior):
+        moved = rounding(case, x, window, mean, with_prior)
+        if case.G is not None and name == "candidate's cost":
+            moved = np.fmax(moved, self._rounding_of_path(candidate, window, mean, ours.J))
+        if apart <= MEASURED * moved:
             self.count("J apart by measured rounding")
             return []
         return [(f"{name} differs", (ours.J, theirs, ours.slack, status))]
 
-    def _rolled_out(self, candidate, window):
+    def _rolled_out(self, candidate, window, nudge=1.0):
         """The candidate with the model's own states in directions without disturbances."""
-        D = metric(self.case)
+        D = nudge * metric(self.case)
         scaled = self.case.G / D[:, None]
         onto = D[:, None] * (scaled @ np.linalg.pinv(scaled)) / D
         path = [candidate[0]]
@@ -301,6 +306,18 @@ class Judge:
             ahead = functions(self.case, path[-1][None], sample.u[None])[0][0]
             path.append(ahead + onto @ (candidate[i + 1] - ahead))
         return np.array(path)
+
+    def _rounding_of_path(self, candidate, window, mean, J):
+        """By how much J of the roll-out moves with the last digits of candidate and weights."""
+        case, r = self.case, np.random.default_rng(2)
+        # The metric is the inverse of a weight.
+        error = max(EPS * np.linalg.cond(one) for one in (case.P, case.Q))
+        paths = (self._rolled_out(
+            nudged(r, candidate), window, 1.0 + error * r.uniform(-1.0, 1.0, case.n)
+        ) for _ in range(8))
+        return max(
+            abs(judged(case, path, window, mean, not case.from_observer).J - J) for path in paths
+        )
 
     def _beside(self, own, x):
         D = metric(self.case)
@@ -357,8 +374,9 @@ class Judge:
                 broken = over & (rows(one, before[i], seen) <= 0.0) & known
                 if broken.any() or (over.any() and not dropped):
                     j = int(np.argmax(broken if broken.any() else over))
+                    which = " that the candidate keeps" if broken.any() else ""
                     found.append((
-                        f"a row of {name} is missed" + " that the candidate keeps" * broken.any(),
+                        f"a row of {name} is missed{which}",
                         (i, j, missed[j], allowed[j], estimate.status),
                     ))
         return found + self._of_constraint(estimate, window, own, of_candidate)

@@ -241,23 +241,36 @@ class Run:
             if not same:
                 self.twin.forget_warm_start()
                 self.mhe.load_state_dict(self.twin.state_dict())
-        if self.beside:
-            other, difference = self._called("the Python step", lambda: self.beside.compare(
-                estimate, y, inputs, given
-            ))
-            self.counts["compared"] += 1
-            if not 0.0 <= other.cost <= other.candidate_cost:
-                self.fault("cost of the Python step", (other.cost, other.candidate_cost))
-            if difference:
-                self.counts[f"engines: {difference}"] += 1
-                if difference.reason == "open":
-                    self.fault(f"engines: {difference}", difference.detail)
+        self._stand_beside("update", estimate, lambda one, change: one.update(
+            y if y is None else change(y), *inputs, **given
+        ))
 
-    def _both(self, name, function):
-        """Call a function of the estimator, and of its twin."""
+    def _stand_beside(self, name, estimate, act):
+        """Compare with the Python step, which does the same from the same memory."""
+        if not self.beside or estimate is None:
+            return
+        other, difference = self._called(f"{name} of the Python step", lambda: self.beside.compare(
+            estimate, act, name != "set"  # done again, it would free the settings that C points to
+        ))
+        self.counts["compared"] += 1
+        if not 0.0 <= other.cost <= other.candidate_cost:
+            self.fault("cost of the Python step", (other.cost, other.candidate_cost))
+        if difference:
+            name = "" if name == "update" else f" after {name}"
+            self.counts[f"engines{name}: {difference}"] += 1
+            if difference.reason == "open":
+                self.fault(f"engines{name}: {difference}", difference.detail)
+
+    def _all(self, name, act):
+        """Do something with the estimator, its twin and the Python step."""
+        if self.beside:
+            self.beside.begin(self.mhe)
         if self.twin:
-            self._called(name, lambda: function(self.twin))
-        return self._called(name, lambda: function(self.mhe))
+            self._called(name, lambda: act(self.twin, lambda numbers: numbers))
+        estimate = self._called(name, lambda: act(self.mhe, lambda numbers: numbers))
+        if name != "reset":
+            self._stand_beside(name, estimate, act)
+        return estimate
 
     # What happens at times.
 
@@ -316,7 +329,7 @@ class Run:
         elif chance < 0.07:
             self._snapshot(int(r.integers(4)))
         elif chance < 0.073:
-            self._both("reset", lambda one: one.reset())
+            self._all("reset", lambda one, change: one.reset())
             self.window, self.time, self.last = [], 0, None
 
     def _asked(self, name, function):
@@ -337,7 +350,7 @@ class Run:
         y = np.where((r.random(case.p) < 0.5) | ~(np.abs(y) < 1e150), np.nan, y)
         sample.y = np.where(np.isfinite(y), y, sample.y)
         self.window[-back] = sample
-        estimate = self._both("amend", lambda one: one.amend(self.time - back, y.copy()))
+        estimate = self._all("amend", lambda one, change: one.amend(self.time - back, change(y)))
         self.counts["amended"] += 1
         self._judged(estimate)
 
@@ -362,7 +375,7 @@ class Run:
             if "parameters" in given:
                 one.u = np.append(one.u[: len(one.u) - case.k], given["parameters"])
         self.judge.iQ, self.judge.iR = self.usual.disturbance, self.usual.noise
-        estimate = self._both("set", lambda one: one.set(**copy.deepcopy(given)))
+        estimate = self._all("set", lambda one, change: one.set(**copy.deepcopy(given)))
         self.counts["set"] += 1
         if estimate is not None:
             self._judged(estimate)
