@@ -178,6 +178,46 @@ def test_functions_without_code_and_rootfinders_that_hide_their_failure_are_not_
         from_casadi(*falling("root")[:2], compiled=True)
 
 
+def solver_within(kind):
+    """One step of x' = -x - x^3 by a solver of CasADi, as a function of (x0, x1)."""
+    x, z = ca.MX.sym("x", 2), ca.MX.sym("z", 2)
+    if kind in ("cvodes", "idas", "collocation"):
+        solver = ca.integrator("inside", kind, {"x": x, "ode": -x - x**3}, 0, 0.1)
+        return ca.Function("f", [x], [solver(x0=x)["xf"]])
+    solver = ca.rootfinder("inside", kind, ca.Function("g", [z, x], [z - x + 0.1 * (z + z**3)]))
+    return ca.Function("f", [x], [solver(x, x)])
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("kind", ["cvodes", "idas", "collocation", "newton", "kinsol"])
+def test_a_solver_without_c_code_is_refused_by_name_before_casadi_prints(kind, nested, capfd):
+    f = solver_within(kind)
+    if nested:
+        x = ca.MX.sym("x", 2)
+        f = ca.Function("outer", [x], [f(x)], {"never_inline": True})
+    with pytest.raises(CompilationError) as caught:
+        from_casadi(f, H, compiled=True)
+    word = "newton" if kind == "collocation" else kind
+    assert f"'{word}', which f calls by the name" in str(caught.value)
+    assert caught.value.__cause__ is caught.value.__context__ is None
+    system = from_casadi(f, H)
+    x = np.array([0.7, -0.2])
+    found = system.f(x, NONE)
+    if kind in ("newton", "kinsol"):
+        np.testing.assert_allclose(found + 0.1 * (found + found**3), x, atol=1e-8)
+    else:
+        left = np.exp(-0.2)
+        exact = x * np.sqrt(left / (1 + x**2 * (1 - left)))
+        np.testing.assert_allclose(found, exact, atol=1e-5)
+    slope, step = system.f_jacobian(x, NONE), 1e-3
+    differences = [
+        (system.f(x + move, NONE) - system.f(x - move, NONE)) / (2 * step)
+        for move in step * np.eye(2)
+    ]
+    np.testing.assert_allclose(slope, np.transpose(differences), atol=1e-3)
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("compiled", BOTH)
 @pytest.mark.parametrize("way", ["function", "inner", "mapped"])
 def test_assertions_hold(way, compiled):
