@@ -386,7 +386,8 @@ class Jacobian:
     def _compare(self, probes: Iterable[tuple[Array, Array]]) -> None:
         """Raise where a given Jacobian is not the derivative."""
         given = self._given
-        if given is None:
+        # An integrator's own tolerances can exceed the accuracy of the differences.
+        if given is None or self.method == "integrator":
             return
         for x, u in probes:
             measured = self._measured(x, u)

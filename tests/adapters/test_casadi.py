@@ -218,6 +218,33 @@ def test_a_solver_without_c_code_is_refused_by_name_before_casadi_prints(kind, n
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("timed", [False, True])
+@pytest.mark.parametrize("kind", ["cvodes", "idas"])
+def test_derivatives_of_an_integrator_are_taken_as_they_are(kind, timed):
+    """Those of van der Pol's oscillator differ from differences by more than rounding."""
+    x, stiffness = ca.MX.sym("x", 2), 50
+    rate = ca.vertcat(x[1], stiffness * (1 - x[0] ** 2) * x[1] - x[0])
+    solver = ca.integrator("solver", kind, {"x": x, "ode": rate}, 0, 0.1)
+    f = ca.Function("f", [x], [solver(x0=x)["xf"]])
+    if timed:  # an ODE whose rate calls one
+        system = from_casadi(ca.Function("rate", [x], [f(x) - x]), H, dt=0.1, method="euler")
+    else:
+        system = from_casadi(f, H)
+    assert system.derivatives == {"f": "integrator", "h": "casadi"}
+    assert "by CasADi, to its integrator's tolerances" in system.explain()
+    mhe = estimator(system)
+    assert [mhe.update([0.5]).status for _ in range(4)][-1] == qpmhe.Status.IMPROVED
+    tight = ca.integrator(
+        "tight", kind, {"x": x, "ode": rate}, 0, 0.1, {"abstol": 1e-13, "reltol": 1e-12})
+    end = tight(x0=x)["xf"]
+    slopes = ca.Function("slopes", [x], [ca.jacobian(end, x)])
+    at = np.array([1.1197133695775516, 2.6171846326988435])
+    expected = slopes(at).full()
+    if timed:
+        expected = np.eye(2) + 0.1 * (expected - np.eye(2))
+    np.testing.assert_allclose(system.f_jacobian(at, NONE), expected, atol=1e-3)
+
+
 @pytest.mark.parametrize("compiled", BOTH)
 @pytest.mark.parametrize("way", ["function", "inner", "mapped"])
 def test_assertions_hold(way, compiled):
