@@ -414,10 +414,15 @@ static const mhe_x_set *mhe_x_set_behind(const mhe_estimator *e, const mhe_stage
     return mhe_x_set_at(e->settings, e->stages + (at == newest ? at : (at + 1) % MHE_HORIZON));
 }
 
-/* The metric in which the observer is projected, as a covariance: its own if it has one. */
-static const real *mhe_metric(const mhe_estimator *e, const real *covariance)
+/* The metric in which the observer is projected, as a covariance: its own if it has one. With
+ * `project` of 2 that is its diagonal, which is made in `other`. */
+static const real *mhe_metric(const mhe_estimator *e, const real *covariance, real *other)
 {
-    return MHE_COVARIANCE ? covariance : e->metric;
+    const real *own = MHE_COVARIANCE ? covariance : e->metric;
+    if (e->settings->project < 2) return own;
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) other[i * NX + j] = i == j ? own[i * NX + j] : 0;
+    return other;
 }
 
 /* Keep the observer's next state in X, or in another set; bits of the status. The stage's Jacobians are there as long
@@ -433,8 +438,9 @@ static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const mhe_x_set *
         e->metric_settled = mhe_settle(s, slope, &stage->terms, e->metric);
     }
     if (mhe_is_inside(set, next)) return 0;
-    const int events =
-        mhe_keep_inside(set, mhe_metric(e, covariance), predicted, next, stage->w);
+    real other[NX * NX];
+    const real *P = mhe_metric(e, covariance, other);
+    const int events = mhe_keep_inside(set, P, predicted, next, stage->w);
     mhe_wrap_state(s, next, stage->w);
     return events;
 }
@@ -443,9 +449,9 @@ static int mhe_stay_inside(mhe_estimator *e, mhe_stage *stage, const mhe_x_set *
 static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, const real *covariance,
                            real *state)
 {
-    real point[NX];
+    real point[NX], other[NX * NX];
     if (!e->settings->project || mhe_is_inside(set, state)) return;
-    mhe_project(set, mhe_metric(e, covariance), state, point);
+    mhe_project(set, mhe_metric(e, covariance, other), state, point);
     memcpy(state, point, sizeof point);
 }
 
