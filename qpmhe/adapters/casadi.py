@@ -26,7 +26,7 @@ from ..model.evaluation import (
     machine,
     results_of,
 )
-from ..model.expressions import CasadiModel, casadi_model, import_casadi
+from ..model.expressions import CasadiModel, casadi_model, import_casadi, integrated
 from ..model.functions import Trusted
 from ..model.model import Origin
 from ..model.sets import ConvexSet
@@ -119,7 +119,10 @@ def from_casadi(
         )
         evaluator = Evaluator(maker)
         one = {name: Trusted(partial(evaluator.one, name)) for name in NAMES}
-        origin = Origin(kernel=evaluator, jacobians="casadi", symbolic=model, is_timed=timed)
+        origin = Origin(
+            kernel=evaluator, jacobians="casadi", integrated=integrated(model), symbolic=model,
+            is_timed=timed,
+        )
         if not timed:
             origin = replace(
                 origin, dt=model.dt, how=model.how, make_augmented=augmented,

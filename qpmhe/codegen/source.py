@@ -69,6 +69,7 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
             f"the model has {model.n} states; compiled code keeps (n, n) arrays on the stack and "
             f"allows at most {_MOST_STATES}. Take engine='python'."
         )
+    _check_solvers(model)
     ca = import_casadi()
     generator = ca.CodeGenerator("mhe_model.c", {"casadi_int": "int", "include_math": False})
     calls = []
@@ -169,6 +170,28 @@ def _step_parts(model: CasadiModel) -> list[str]:
     if single:
         return [text]
     return [text, Template(template("substeps.c")).substitute(steps=how.steps)]
+
+
+# Classes of CasADi that have no C code, in words. CasADi itself prints a warning for each call.
+_WITHOUT_CODE = {
+    "CvodesInterface": "integrator 'cvodes'", "IdasInterface": "integrator 'idas'",
+    "Newton": "rootfinder 'newton'", "KinsolInterface": "rootfinder 'kinsol'",
+    "ImplicitToNlp": "rootfinder 'nlpsol'",
+}
+
+
+def _check_solvers(model: CasadiModel) -> None:
+    """Raise where a solver within the model has no C code: before CasADi prints that."""
+    for which in ("f", "h", "output_residual", "state_residual", "correction"):
+        function = getattr(model, which)
+        for inner in () if function is None else function.find_functions():
+            kind = _WITHOUT_CODE.get(inner.class_name())
+            if kind is not None:
+                raise CompilationError(
+                    f"CasADi writes no C code for the {kind}, which {which} calls by the name "
+                    f"{inner.name()!r}; use engine='python', or hand the ODE's rate over with "
+                    "dt and method='radau', which has C code."
+                )
 
 
 # A function that other programs would call, on one line or on several.

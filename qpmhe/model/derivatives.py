@@ -386,7 +386,8 @@ class Jacobian:
     def _compare(self, probes: Iterable[tuple[Array, Array]]) -> None:
         """Raise where a given Jacobian is not the derivative."""
         given = self._given
-        if given is None:
+        # Differences of values that are as accurate as an integrator's tolerances are no reference.
+        if given is None or self.method == "integrator":
             return
         for x, u in probes:
             measured = self._measured(x, u)

@@ -135,6 +135,15 @@ def casadi_model(
     return CasadiModel(made_f, made_h, n, p, m, positive("dt", dt), how)
 
 
+def integrated(model: CasadiModel) -> tuple[str, ...]:
+    """Which of f and h call an integrator of variable steps."""
+    kinds = {"CvodesInterface", "IdasInterface"}
+    return tuple(
+        name for name in ("f", "h")
+        if any(one.class_name() in kinds for one in getattr(model, name).find_functions())
+    )
+
+
 def _check_arguments(name: str, function: Any) -> None:
     if function.n_in() not in (1, 2) or function.n_out() != 1:
         raise ModelError(

@@ -177,6 +177,9 @@ class Origin:
         Evaluates f, h and their Jacobians in one call, where f and h are expressions.
     jacobians : str
         How the given Jacobians are computed, in a word.
+    integrated : tuple of str
+        Which of ``f`` and ``h`` call an integrator of CasADi, whose derivatives are as accurate as
+        its tolerances; they are taken as they are.
     remedy : str
         The remedy that the error about a wrong given Jacobian names; ``{name}`` is the function.
     symbolic : CasadiModel, optional
@@ -202,6 +205,7 @@ class Origin:
     sources: dict[str, Callable[[Array, Array], Any]] | None = None
     kernel: ModelKernel | None = None
     jacobians: str = "given"
+    integrated: tuple[str, ...] = ()
     remedy: str = ""
     symbolic: CasadiModel | None = None
     make_timed: Callable[[System], System] | None = None

@@ -616,6 +616,7 @@ class System:
 
 _METHODS = {
     "traced": "exact, by its trace", "given": "as given", "casadi": "exact, by CasADi",
+    "integrator": "by CasADi, to its integrator's tolerances",
     "jax": "exact, by JAX",
     "finite differences": "by finite differences",
 }

@@ -121,7 +121,8 @@ def tried_functions(system: System, given: Mapping[str, Any]) -> Functions:
     a, c = (
         Jacobian(
             function, given.get(f"{function.name}_jacobian"), m, probes, system.states, residual,
-            origin.jacobians, origin.remedy.format(name=function.name),
+            "integrator" if function.name in origin.integrated else origin.jacobians,
+            origin.remedy.format(name=function.name),
         )
         for function, residual in ((f, system.state_residual), (h, system.output_residual))
     )

@@ -178,6 +178,73 @@ def test_functions_without_code_and_rootfinders_that_hide_their_failure_are_not_
         from_casadi(*falling("root")[:2], compiled=True)
 
 
+def solver_within(kind):
+    """One step of x' = -x - x^3 by a solver of CasADi, as a function of (x0, x1)."""
+    x, z = ca.MX.sym("x", 2), ca.MX.sym("z", 2)
+    if kind in ("cvodes", "idas", "collocation"):
+        solver = ca.integrator("inside", kind, {"x": x, "ode": -x - x**3}, 0, 0.1)
+        return ca.Function("f", [x], [solver(x0=x)["xf"]])
+    solver = ca.rootfinder("inside", kind, ca.Function("g", [z, x], [z - x + 0.1 * (z + z**3)]))
+    return ca.Function("f", [x], [solver(x, x)])
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("kind", ["cvodes", "idas", "collocation", "newton", "kinsol"])
+def test_a_solver_without_c_code_is_refused_by_name_before_casadi_prints(kind, nested, capfd):
+    f = solver_within(kind)
+    if nested:
+        x = ca.MX.sym("x", 2)
+        f = ca.Function("outer", [x], [f(x)], {"never_inline": True})
+    with pytest.raises(CompilationError) as caught:
+        from_casadi(f, H, compiled=True)
+    word = "newton" if kind == "collocation" else kind
+    assert f"'{word}', which f calls by the name" in str(caught.value)
+    assert caught.value.__cause__ is caught.value.__context__ is None
+    system = from_casadi(f, H)
+    x = np.array([0.7, -0.2])
+    found = system.f(x, NONE)
+    if kind in ("newton", "kinsol"):
+        np.testing.assert_allclose(found + 0.1 * (found + found**3), x, atol=1e-8)
+    else:
+        left = np.exp(-0.2)
+        exact = x * np.sqrt(left / (1 + x**2 * (1 - left)))
+        np.testing.assert_allclose(found, exact, atol=1e-5)
+    slope, step = system.f_jacobian(x, NONE), 1e-3
+    differences = [
+        (system.f(x + move, NONE) - system.f(x - move, NONE)) / (2 * step)
+        for move in step * np.eye(2)
+    ]
+    np.testing.assert_allclose(slope, np.transpose(differences), atol=1e-3)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("timed", [False, True])
+@pytest.mark.parametrize("kind", ["cvodes", "idas"])
+def test_derivatives_of_an_integrator_are_taken_as_they_are(kind, timed):
+    """Differences of values that an integrator computes to its tolerances are less accurate."""
+    x, stiffness = ca.MX.sym("x", 2), 50
+    rate = ca.vertcat(x[1], stiffness * (1 - x[0] ** 2) * x[1] - x[0])
+    solver = ca.integrator("solver", kind, {"x": x, "ode": rate}, 0, 0.1)
+    f = ca.Function("f", [x], [solver(x0=x)["xf"]])
+    if timed:  # an ODE whose rate calls one
+        system = from_casadi(ca.Function("rate", [x], [f(x) - x]), H, dt=0.1, method="euler")
+    else:
+        system = from_casadi(f, H)
+    assert system.derivatives == {"f": "integrator", "h": "casadi"}
+    assert "by CasADi, to its integrator's tolerances" in system.explain()
+    mhe = estimator(system)
+    assert [mhe.update([0.5]).status for _ in range(4)][-1] == qpmhe.Status.IMPROVED
+    tight = ca.integrator(
+        "tight", kind, {"x": x, "ode": rate}, 0, 0.1, {"abstol": 1e-13, "reltol": 1e-12})
+    end = tight(x0=x)["xf"]
+    slopes = ca.Function("slopes", [x], [ca.jacobian(end, x)])
+    at = np.array([1.1197133695775516, 2.6171846326988435])
+    expected = slopes(at).full()
+    if timed:
+        expected = np.eye(2) + 0.1 * (expected - np.eye(2))
+    np.testing.assert_allclose(system.f_jacobian(at, NONE), expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize("compiled", BOTH)
 @pytest.mark.parametrize("way", ["function", "inner", "mapped"])
 def test_assertions_hold(way, compiled):
