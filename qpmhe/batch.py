@@ -97,7 +97,7 @@ class BatchEstimator:
         states = _starts(initial_states, self.members, system.n)
         self.system, self.observer, self.cost = system, observer, cost
         if isinstance(observer, Observer):
-            states = self._checked(states)
+            states = self._checked(states, options.get("projection_metric", "observer"))
         try:
             # A single estimator checks all that the members have in common.
             one = MovingHorizonEstimator(
@@ -113,12 +113,15 @@ class BatchEstimator:
                 f"memory than available ({error}); take a shorter horizon, or fewer members."
             ) from error
 
-    def _checked(self, states: Array) -> Array:
+    def _checked(self, states: Array, metric: Any) -> Array:
         """The initial states, if a single estimator takes each of them."""
         own = self._own().as_written()
         _, first, which = np.unique(states, axis=0, return_index=True, return_inverse=True)
         checked = [
-            check_start(own, self.observer, self.cost, states[k], f"initial_states[{k}]")[0]
+            check_start(
+                own, self.observer, self.cost, states[k], f"initial_states[{k}]",
+                metric=metric,
+            )[0]
             for k in first.tolist()
         ]
         return np.array(checked)[which.ravel()]
@@ -182,7 +185,8 @@ class BatchEstimator:
         """
         before = states = self._initial_states
         if initial_states is not None:
-            states = self._checked(_starts(initial_states, self.members, self.system.n))
+            given = _starts(initial_states, self.members, self.system.n)
+            states = self._checked(given, self.settings.projection_metric)
         try:
             self._initial_states = states
             self._engine.reset(states)

@@ -150,7 +150,9 @@ class Monitor:
                 f"the estimator's system is another than was certified: {changed}; certify the "
                 "system as it is now."
             )
-        self.bound = bound.of_observer(estimator.observer, self._system)
+        self.bound = bound.of_observer(
+            estimator.observer, self._system, estimator.settings.projection_metric
+        )
         self.sizes = bound.sizes if sizes is None else sizes
         self._entering = bound.entering(self.sizes.disturbance, self.sizes.noise)
         self._radius = bound.initial(initial_error)

@@ -170,7 +170,9 @@ class ObserverBound:
         """Whether a projection of the observer onto X keeps the bound: in P, it does."""
         return self.projection is not None and np.array_equal(self.projection, self.metric)
 
-    def of_observer(self, observer: Observer, system: System) -> ObserverBound:
+    def of_observer(
+        self, observer: Observer, system: System, projection_metric: str = "observer"
+    ) -> ObserverBound:
         """The same for an observer with this gain, or a `MismatchError`; its metric may differ."""
         gain = gain_if_constant(observer, system)
         if gain is None or not np.array_equal(gain, self.gain):
@@ -179,7 +181,8 @@ class ObserverBound:
                 f"the bound is of an observer with the gain {self.gain.tolist()}; the estimator's "
                 f"is {theirs}. Certify the estimator's observer."
             )
-        return replace(self, projection=observer.metric)
+        own = projection_metric == "observer"
+        return replace(self, projection=observer.metric if own else None)
 
     @cached_property
     def _inverse(self) -> Array:
@@ -337,7 +340,9 @@ class ObserverBound:
         z, source, own = run.observer_states, run.source, self
         inputs, steps, usual = None, None, None
         if source is not None:
-            own = self.of_observer(source.observer, source.system)
+            own = self.of_observer(
+                source.observer, source.system, source.settings.projection_metric
+            )
             inputs, steps, usual = source.inputs, source.steps, source.system.dt
             _check_model(self.stability, self.region, source.system, z[:-1], inputs)
         radius = self.radii(len(run), initial_error, disturbances, noises)

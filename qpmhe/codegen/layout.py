@@ -45,6 +45,7 @@ _CLOCK_TEXT = """
 _MOST = int(np.iinfo(np.int32).max)
 # From so many states on, LAPACK's calls take less time than loops that a compiler made.
 _LAPACK_STATES = 40
+_PROJECTIONS = (None, "observer", "diagonal")
 # In single precision rounding makes eigenvalues of correlations of this size.
 _LEAST_SINGLE = 1e-6
 
@@ -469,7 +470,7 @@ def _filled(
         record["metric"] = inverse(initial if metric is None else metric).ravel()
         record["metric_weight"] = initial.ravel()
         record["metric_settled"] = metric is not None or layout.covariance
-    record["project"] = settings.project_observer
+    record["project"] = _PROJECTIONS.index(settings.projection)
     record["max_qps"] = min(settings.qp_limit, _MOST)
     record["uncapped"], record["patience"] = settings.max_qps is None, settings.patience
     most = settings.max_solver_iterations

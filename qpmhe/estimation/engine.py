@@ -146,7 +146,7 @@ class PythonEngine:
         settings = self._settings
         return Window(
             tools.system, self._observer, tools.cost, settings.horizon, initial_state,
-            self._with_terms, settings.project_observer, self._reinitialized, tools.usual,
+            self._with_terms, settings.projection, self._reinitialized, tools.usual,
             settings.restart,
         )
 

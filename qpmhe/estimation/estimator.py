@@ -95,6 +95,9 @@ class MovingHorizonEstimator(EstimatorMemory):
         Whether the observer's state is projected onto X after each step, in the observer's metric:
         `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its linearised
         error. False gives the paper's plain observer, which may leave X.
+    projection_metric : {"observer", "diagonal"}
+        The metric of this projection: the observer's own, or the inverse of the diagonal of its
+        covariance. The latter clips components to their bounds, and leaves the others as they are.
     infeasible : {"drop_rows", "restore"}
         What to do if the candidate violates a set and no trajectory satisfying all sets is found at
         a cost up to the candidate's. ``drop_rows`` leaves out, in this step only, the inequalities
@@ -172,6 +175,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         tolerance: float = 1e-9,
         engine: str = "auto",
         project_observer: bool = True,
+        projection_metric: str = "observer",
         infeasible: str = "drop_rows",
         warm_start: bool = False,
         candidate: str = "observer",
@@ -184,8 +188,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         is_copy = "settings" in vars(self)  # from `__setstate__`: no warning is given twice
         self.settings = Settings(
             horizon, backend, max_qps, max_solver_iterations, solver_tolerance, tolerance,
-            engine, project_observer, infeasible, warm_start, candidate, time_budget,
-            isolated, arrival, nominal_parameters(parameters), restart,
+            engine, project_observer, projection_metric, infeasible, warm_start, candidate,
+            time_budget, isolated, arrival, nominal_parameters(parameters), restart,
         )
         self.system, self.observer, self.cost = system, observer, cost
         require(system, System, "system", "qpmhe.System")

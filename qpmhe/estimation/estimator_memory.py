@@ -51,7 +51,10 @@ class EstimatorMemory:
         self, initial_state: ArrayLike, system: System
     ) -> tuple[Array, System]:
         state = vector("initial_state", initial_state, system.n)
-        return check_start(system, self.observer, self.cost, state, u=self._usual_input)
+        return check_start(
+            system, self.observer, self.cost, state, u=self._usual_input,
+            metric=self.settings.projection_metric,
+        )
 
     def reset(self, initial_state: ArrayLike | None = None) -> None:
         """Forget all measurements and restart.
@@ -73,7 +76,8 @@ class EstimatorMemory:
         try:
             self._initial_state = state
             # X may be another one than that in which the former state is.
-            start, _ = inside(self._engine.system, self.observer, self.cost, state)
+            metric = self.settings.projection_metric
+            start, _ = inside(self._engine.system, self.observer, self.cost, state, metric)
             self._engine.reset(start, system)
         except BaseException:
             self._initial_state = before

@@ -51,7 +51,7 @@ class ObserverSteps(WindowSamples):
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, horizon: int, initial_state: Array,
-        with_terms: bool, project: bool, usual: Conditions, restarts: bool,
+        with_terms: bool, projection: str | None, usual: Conditions, restarts: bool,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         covariance, memory = observer.initial_covariance(), observer.initial_memory()
@@ -91,8 +91,9 @@ class ObserverSteps(WindowSamples):
         # Projects the observer onto X: usually, and at the state that is being computed.
         self._usual_nearest: NearestPoint | None = None
         self._projections: dict[int, tuple[ConvexSet, NearestPoint]] = {}  # onto X of samples
-        if project and system.states is not None:
-            self._usual_nearest = NearestPoint(system.states)
+        self._diagonal = projection == "diagonal"
+        if projection is not None and system.states is not None:
+            self._usual_nearest = NearestPoint(system.states, self._diagonal)
             if self.covariance is None or observer.metric is not None:
                 noise = np.sqrt(inverse(cost.noise).diagonal())
                 self.metric = ErrorMetric(
@@ -132,7 +133,7 @@ class ObserverSteps(WindowSamples):
         if id(states) not in self._projections:
             if len(self._projections) > 2 * self.horizon:
                 self._projections.clear()
-            self._projections[id(states)] = states, NearestPoint(states)
+            self._projections[id(states)] = states, NearestPoint(states, self._diagonal)
         return self._projections[id(states)][1]
 
     def _compute_stage(self, k: int, time: int) -> None:

@@ -14,6 +14,7 @@ from .limits import PATIENCE
 Infeasible = Literal["drop_rows", "restore"]
 Candidate = Literal["observer", "reinitialized"]
 Arrival = Literal["observer", "smoothed"]
+ProjectionMetric = Literal["observer", "diagonal"]
 Engine = Literal["auto", "python", "compiled"]
 
 # Bounds the sequence of QPs with max_qps=None where it does not converge.
@@ -33,6 +34,7 @@ class Settings:
     tolerance: float = 1e-9
     engine: str = "auto"
     project_observer: bool = True
+    projection_metric: str = "observer"
     infeasible: str = "drop_rows"
     warm_start: bool = False
     candidate: str = "observer"
@@ -60,6 +62,7 @@ class Settings:
             flag(name, getattr(self, name))
         for name, choices in (
             ("engine", get_args(Engine)),
+            ("projection_metric", get_args(ProjectionMetric)),
             ("infeasible", get_args(Infeasible)),
             ("candidate", get_args(Candidate)),
             ("arrival", get_args(Arrival)),
@@ -132,6 +135,11 @@ class Settings:
         """Whether these settings ask for a QP solver, which only the Python step uses."""
         is_own = isinstance(self.backend, str) and self.backend in ("auto", "banded")
         return self.isolated or not is_own
+
+    @property
+    def projection(self) -> str | None:
+        """The metric in which the observer is projected onto X; None where it is not."""
+        return self.projection_metric if self.project_observer else None
 
     @property
     def patience(self) -> int:

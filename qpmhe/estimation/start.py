@@ -58,14 +58,14 @@ def check_cost(system: System, cost: Cost) -> None:
 
 def check_start(
     system: System, observer: Observer, cost: Cost, state: Array, name: str = "initial_state",
-    u: Array | None = None,
+    u: Array | None = None, metric: str = "observer",
 ) -> tuple[Array, System]:
     """Check that model and observer work at an initial state.
 
     Returns the state, projected onto X, and the system as it is evaluated from there on.
     """
     try:
-        start, is_moved = inside(system, observer, cost, state)
+        start, is_moved = inside(system, observer, cost, state, metric)
         if is_moved:
             warnings.warn(
                 f"{name} is {state.tolist()}, outside of the state set {system.states!r}; the "
@@ -84,14 +84,14 @@ def check_start(
 
 
 def inside(
-    system: System, observer: Observer, cost: Cost, state: Array
+    system: System, observer: Observer, cost: Cost, state: Array, metric: str
 ) -> tuple[Array, bool]:
     """An initial state in X, in its turn, and whether it was projected."""
     if system.states is None:
         return state, False
     if system.turns is not None:
         state = system.turns(state)
-    nearest = NearestPoint(system.states)
+    nearest = NearestPoint(system.states, metric == "diagonal")
     if nearest.contains(state):
         return state, False
     weight = observer.metric

@@ -50,13 +50,13 @@ class Window(ObserverSteps):
         horizon: int,
         initial_state: Array,
         with_terms: bool,
-        project: bool,
+        projection: str | None,
         reinitialized: bool = False,
         usual: Conditions = USUAL,
         restarts: bool = False,
     ) -> None:
         super().__init__(
-            system, observer, cost, horizon, initial_state, with_terms, project, usual, restarts
+            system, observer, cost, horizon, initial_state, with_terms, projection, usual, restarts
         )
         self._held = list(system.held)
         self.trust_start()

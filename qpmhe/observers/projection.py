@@ -1,4 +1,4 @@
-"""Projection of the observer onto X: the nearest point in the observer's own metric."""
+"""Projection of the observer onto X: the nearest point in its own metric, or a diagonal one."""
 
 from __future__ import annotations
 
@@ -51,6 +51,8 @@ class NearestPoint:
     ----------
     convex_set : ConvexSet
         X, not empty.
+    diagonal : bool
+        Whether the metric is that of the covariance's diagonal alone.
 
     References
     ----------
@@ -58,7 +60,8 @@ class NearestPoint:
     programs, Mathematical Programming 27 (1983).
     """
 
-    def __init__(self, convex_set: ConvexSet) -> None:
+    def __init__(self, convex_set: ConvexSet, diagonal: bool = False) -> None:
+        self._diagonal = diagonal
         self._lower, self._upper = convex_set.lower, convex_set.upper
         eye = np.eye(convex_set.dimension)
         sides = (
@@ -96,7 +99,7 @@ class NearestPoint:
         Where a singular covariance leads to no point of the set, the metric is diagonal, with the
         sizes of the components as standard deviations.
         """
-        found = self._nearest(point, covariance)
+        found = self._nearest(point, self._taken(covariance))
         if found is not None:
             return Projected(found, True)
         sizes = np.maximum(np.abs(point), self._largest)
@@ -110,12 +113,16 @@ class NearestPoint:
         if not np.isfinite(self._widths).all():
             return False
         try:
-            metric = inverse(covariance)
+            metric = inverse(self._taken(covariance))
         except np.linalg.LinAlgError:
             return False
         offset = point - nearest
         # Within the set |e_i| <= w_i, so that e' M e <= w' |M| w: larger than any distance in it.
         return bool(offset @ metric @ offset > self._widths @ np.abs(metric) @ self._widths)
+
+    def _taken(self, covariance: Array) -> Array:
+        """The part of a covariance that makes the metric."""
+        return np.diag(covariance.diagonal()) if self._diagonal else covariance
 
     def _nearest(self, point: Array, covariance: Array) -> Array | None:
         rows = self._rows

@@ -62,7 +62,7 @@ class IpoptEstimator:
             )
         self._system, self._cost, self._f, self._h = system, cost, f, h
         self._prior = cost.prior
-        self._window = Window(system, observer, cost, horizon, initial_state, False, True)
+        self._window = Window(system, observer, cost, horizon, initial_state, False, "observer")
         self._formulation = Formulation(system, observer, cost)
         self._options: dict[str, Any] = {
             "print_time": False,

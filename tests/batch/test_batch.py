@@ -167,6 +167,20 @@ def test_initial_states_outside_of_the_set_are_projected_with_a_warning():
     np.testing.assert_array_equal(batch.states[0], [9.0, 0.0])
 
 
+def test_initial_states_are_clipped_in_the_diagonal_metric():
+    """In the metric of a prior that ties the states, the other one moves along."""
+    system, observer, _ = parts(states=qpmhe.Box([-9.0, -9.0], [9.0, 9.0]))
+    tied = qpmhe.QuadraticCost(prior=[[2.0, 1.0], [1.0, 2.0]], disturbance=np.eye(2), noise=1.0)
+    for metric, clips in (("observer", False), ("diagonal", True)):
+        with pytest.warns(qpmhe.ObserverWarning, match="outside of the state set"):
+            batch = batch_of((system, observer, tied), 1, [[9.5, 0.0]], projection_metric=metric)
+        assert batch.states[0][0] == 9.0
+        assert bool(batch.states[0][1] == 0.0) is clips
+        with pytest.warns(qpmhe.ObserverWarning, match="outside of the state set"):
+            batch.reset([[9.5, 0.0]])
+        assert bool(batch.states[0][1] == 0.0) is clips
+
+
 ONES = np.ones((3, 5, 1))
 REFUSED = [
     (ShapeError, ["Y has shape (2, 1)", "(3, 1)", "member"], "update", [[1.0], [2.0]]),

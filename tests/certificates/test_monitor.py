@@ -140,16 +140,20 @@ def test_steps_and_inputs_that_were_not_certified():
         watch.check(mhe.update([0.2], [0.3]))
 
 
-@pytest.mark.parametrize("projects", [True, False])
-def test_a_projection_onto_x_keeps_the_bounds_in_the_certified_metric_alone(projects):
+@pytest.mark.parametrize(("is_certified", "name"), [
+    (True, "observer"), (False, "observer"), (True, "diagonal"),
+])
+def test_a_projection_onto_x_keeps_the_bounds_in_the_certified_metric_alone(is_certified, name):
+    projects = is_certified and name == "observer"
     X, projected = box([0.0, -10.0], [10.0, 0.5]), 0  # which the observer often leaves
     system, rng = plant(states=X), np.random.default_rng(0)
     stability = certify_observer(system, qpmhe.Luenberger(GAIN), X, rho=0.9)
-    observer = qpmhe.Luenberger(GAIN, metric=stability.P if projects else None)
+    observer = qpmhe.Luenberger(GAIN, metric=stability.P if is_certified else None)
     certificate = certify(system, observer, COST, horizon=4, sizes=SIZES, stability=stability)
-    assert (certificate.of().model_lipschitz is not None) is projects
+    assert (certificate.of().model_lipschitz is not None) is is_certified
     for _ in range(8):
-        mhe, x = estimator(certificate, initial_state=[0.0, 0.5]), [np.array([1.0, 0.2])]
+        x = [np.array([1.0, 0.2])]
+        mhe = estimator(certificate, initial_state=[0.0, 0.5], projection_metric=name)
         watch = Monitor(certificate, mhe, initial_error=x[0] - mhe.observer_state)
         w, v = rng.choice([-0.1, 0.1], (25, 2)), rng.choice([-0.2, 0.2], (25, 1))
         errors, before = [], projected

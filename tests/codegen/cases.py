@@ -529,6 +529,7 @@ SMALL = {"disturbances": Box([-0.05, -0.08], [0.1, 0.06])}
 SINGULAR = {"prior": np.diag([1.0, 0.0, 0.5]), "disturbance": np.diag([0.02, 0.0, 0.0])}
 AGAIN, WARM, ALONE = {"candidate": "reinitialized"}, {"warm_start": True}, {"max_qps": 0}
 ONE, MANY, SMOOTH = {"max_qps": 1}, {"max_qps": None}, {"arrival": "smoothed"}
+DIAGONAL = {"projection_metric": "diagonal"}
 METRIC = by(lambda one: Luenberger([0.8, -0.3], metric=[[2.0, 1.0], [1.0, 1.0]]))
 LEAVING = by(lambda one: Luenberger([[0.6, 0.0], [0.3, -0.4], [0.1, 0.7]]))
 
@@ -629,6 +630,8 @@ FEATURES = {
         "states not projected": ("states in a polytope", conditions, {
             "project_observer": False, "horizon": STEPS + 1,
         }),
+        "states in a diagonal metric": ("states in a polytope", METRIC, conditions, DIAGONAL),
+        "extended in states, diagonal": ("states in a polytope", filtered(), gaps, DIAGONAL),
         "extended in states": ("states in a polytope", filtered(), gaps, ONE),
         "unscented in states": ("states in a box", filtered(UKF, np.eye(2)), gaps, AGAIN),
         "steady in states": (lambda: _steady(_reaction_in(WEDGE, (2.0, 1.5))), gaps),

@@ -27,13 +27,17 @@ def random_case(rng, rank):
     return qpmhe.Box(lower, upper) & rows, 3.0 * rng.standard_normal(n), factor
 
 
-@pytest.mark.parametrize("rank", [None, 1, 2, 3])
-def test_projections_are_those_of_cvxpy(rank):
+@pytest.mark.parametrize(("rank", "diagonal"), [
+    (None, False), (None, True), (1, False), (2, False), (3, False),
+])
+def test_projections_are_those_of_cvxpy(rank, diagonal):
     cvxpy = pytest.importorskip("cvxpy")
     rng, reached, moved = np.random.default_rng(5), 0, 0
     for _ in range(60):
         convex_set, point, factor = random_case(rng, rank)
-        found = NearestPoint(convex_set)(point, factor @ factor.T)
+        found = NearestPoint(convex_set, diagonal)(point, factor @ factor.T)
+        if diagonal:
+            factor = np.diag(np.sqrt(np.sum(factor * factor, axis=1)))
         assert convex_set.violation(found.point) <= 1e-9
         step = cvxpy.Variable(factor.shape[1])
         target, inside = point + factor @ step, []

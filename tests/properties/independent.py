@@ -108,7 +108,12 @@ class Watcher:
             for point in (following, ahead)
         )
         metric = self.metric if covariance is None else covariance
-        return nearest(self.sets, following, metric), covariance
+        return self._inside(following, metric), covariance
+
+    def _inside(self, point, covariance):
+        if self.one.options.get("projection_metric") == "diagonal":
+            covariance = np.diag(covariance.diagonal())
+        return nearest(self.sets, point, covariance)
 
     def _settle(self, z, sample):
         """The Lyapunov metric of the error A - K C, if it is stable here."""
@@ -151,7 +156,7 @@ class Watcher:
             K = cross @ np.linalg.inv(S + R)
             after = P - K @ cross.T
         found = z + K @ v
-        return nearest(self.sets, found, after) if self.projects else found
+        return self._inside(found, after) if self.projects else found
 
     def _free_step(self, z, P, sample):
         there = np.isfinite(sample.y)

@@ -129,6 +129,10 @@ class Problem:
         }
         if self.options["candidate"] == "observer":
             self.options["restart"] = bool(np.random.default_rng([seed, 2]).random() < 0.3)
+        # Of a generator of its own: what is drawn behind stays as it was.
+        own = np.random.default_rng(rng.bit_generator.seed_seq.spawn(1)[0])
+        if own.random() < 0.3:
+            self.options["projection_metric"] = "diagonal"
 
     def draw_directions(self):
         """G: of the system, of a singular covariance of the disturbances, or none."""

@@ -188,7 +188,7 @@ $part_fields    mhe_real discount;         /* factor on a stage's cost for each 
      * taken that are not finite. */
     mhe_real inner_lower[MHE_NX], inner_upper[MHE_NX], aside[MHE_NX];
     int32_t metric_settled;    /* whether `metric` is for good */
-    int32_t project;           /* keep the observer in X */
+    int32_t project;           /* keep the observer in X: 1 in its metric, 2 in the diagonal one */
     int32_t max_qps;           /* QPs for each sample */
     int32_t uncapped;          /* whether that only ends a sequence that does not converge */
     int32_t patience;          /* QPs in a row that may stay unsolved; 0: any number */

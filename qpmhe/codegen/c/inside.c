@@ -17,7 +17,9 @@ static int mhe_stay_inside(mhe_estimator *e, int i, const mhe_x_set *onto, const
     const mhe_x_set *set = onto ? onto : mhe_x_set_behind(e, stage);
     mhe_settle_metric(e, stage);
     if (mhe_is_inside(set, next)) return 0;
-    const int events = mhe_keep_inside(set, mhe_metric(e, i), predicted, next, stage->w);
+    real other[NX * NX];
+    const real *P = mhe_metric_taken(e, mhe_metric(e, i), other);
+    const int events = mhe_keep_inside(set, P, predicted, next, stage->w);
     mhe_wrap_state(s, next, stage->w);
     return events;
 }

@@ -304,12 +304,22 @@ static int mhe_keep_inside(const mhe_x_set *set, const real *P, const real *pred
     return reached ? events : events | MHE_METRIC_SINGULAR;
 }
 
+/* The metric of the projection, as a covariance: the observer's, or with `project` of 2 its diagonal,
+ * which is made in `other`. */
+static const real *mhe_metric_taken(const mhe_estimator *e, const real *own, real *other)
+{
+    if (e->settings->project < 2) return own;
+    for (int i = 0; i < NX; i++)
+        for (int j = 0; j < NX; j++) other[i * NX + j] = i == j ? own[i * NX + j] : 0;
+    return other;
+}
+
 /* Put a state of the observer into a set to which no correction leads. */
 static void mhe_put_inside(const mhe_estimator *e, const mhe_x_set *set, const real *metric,
                            real *state)
 {
-    real point[NX];
+    real point[NX], other[NX * NX];
     if (!e->settings->project || mhe_is_inside(set, state)) return;
-    mhe_project(set, metric, state, point);
+    mhe_project(set, mhe_metric_taken(e, metric, other), state, point);
     memcpy(state, point, sizeof point);
 }

@@ -21,6 +21,7 @@ _WHY = {
     "SOLVER_STOPPED": "solver stopped",
     "SOLVER_FAILED": "solver failed", "MODEL_FAILED": "model failed", "TIME_UP": "time up",
     "ROWS_DROPPED": "rows dropped", "CANDIDATE_OUTSIDE": "candidate outside",
+    "RESTORED": "restored", "RESTARTED": "observer restarted",
 }
 
 

@@ -1,0 +1,1 @@
+"""Forty variables of weather on a circle, and the figures that others publish on it."""
