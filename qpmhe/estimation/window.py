@@ -160,6 +160,7 @@ class Window(ObserverSteps):
         first = self.end - steps
         if state is not None:
             self.z[first] = state
+            self.enter_states(first, self.time - steps)
         for k in range(first, self.end):
             self._compute_stage(k, self.time - (self.end - k))
 
@@ -218,7 +219,8 @@ class Window(ObserverSteps):
             k = self.end - (now - time)
             self._fill_sample(k, time, self._find_observed(k, time))
             observers.nearest = self._nearest = self._projection(time + 1)
-            observers.advance(time, estimates[time - now], self.y[k], self._sample)
+            observers.advance(time, self._in_states(estimates[time - now], time), self.y[k],
+                              self._sample)
         self._advanced_to = now
         self.z[self.start : self.end + 1], self.residuals[...], self.events = (
             observers.trajectory(first, now)
@@ -228,6 +230,13 @@ class Window(ObserverSteps):
         if observed is not None and self._is_missing(now - 1, observed):
             self.events |= _MISSING
         return not observers.failed[first % self.horizon] and self._set_all_stages()
+
+    def _in_states(self, estimate: Array, time: int) -> Array:
+        """An estimate of x(time) in the X that has come with its sample since."""
+        nearest = self._projection(time)
+        if nearest is None or self.metric is None or nearest.contains(estimate):
+            return estimate
+        return nearest(estimate, self.metric.covariance).point
 
     def _set_all_stages(self) -> bool:
         """Compute the Jacobians, terms and costs of all stages; whether all are finite."""

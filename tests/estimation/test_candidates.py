@@ -1,13 +1,17 @@
 """The prior's mean at the former estimate; `properties/independent.py` has the other candidates."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.codegen.compiler import find_compiler
 
 from .plain import spd
 from .systems import swing
 
+ENGINES = ["python"] + (["compiled"] if find_compiler() else [])
 GENERATOR = np.random.default_rng(1)
 P, Q, R = 0.05 * spd(GENERATOR, 2), 5.0 * spd(GENERATOR, 2), spd(GENERATOR, 1)
 START, HORIZON, LATE = np.array([2.0, -1.0]), 6, 12
@@ -76,3 +80,31 @@ def test_ipopt_with_the_prior_update_of_other_toolboxes(options):
             solution = check(mhe.amend(LATE, data[-2]))
             weights, usual = [3.0 * one for one in weights], 3.0 * usual
             solution = check(mhe.set(noise_weight=3.0 * R))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("observer", [
+    qpmhe.Luenberger([[0.3]]),
+    qpmhe.ExtendedKalman(prior=[[1.0]], disturbance=[[0.1]], noise=[[0.1]]),
+], ids=["constant gain", "extended"])
+def test_a_reinitialized_candidate_starts_in_the_states_of_its_own_sample(observer, engine):
+    """The estimate that it starts from was made before the sample brought its X."""
+    system = qpmhe.System(
+        lambda x: 0.9 * x, lambda x: x, n=1, p=1, states=qpmhe.Box([-10.0], [np.inf])
+    )
+    cost = qpmhe.QuadraticCost(prior=[[1.0]], disturbance=[[10.0]], noise=[[10.0]])
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=3, initial_state=[1.0], candidate="reinitialized",
+        engine=engine,
+    )
+    rng, lower = np.random.default_rng(0), []
+    for t in range(20):
+        lower.append(0.3 if t % 4 == 1 else -10.0)
+        own = {"bounds": {"states": qpmhe.Box([lower[t]], [np.inf])}} if t % 4 == 1 else {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", qpmhe.ObserverWarning)
+            found = mhe.update([0.3 * rng.standard_normal() - 0.4], **own)
+        least = [*lower[-len(found.candidate) + 1 :], lower[-1]]
+        assert (found.candidate[:, 0] >= least).all()
+        assert qpmhe.Status.CANDIDATE_OUTSIDE not in found.status
+        assert (found.trajectory[:, 0] >= least).all()

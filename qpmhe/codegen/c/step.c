@@ -61,6 +61,7 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
     if (e->settings->reinitialize) {
         mhe_stage *oldest = mhe_stage_at(e, 0);
         memcpy(oldest->z, oldest->history, sizeof oldest->z);
+        mhe_put_first_inside(e); /* that estimate was made before its sample brought an X */
         events = (events & MHE_DERIVATIVE_NEARBY) | mhe_replay(e, 0);
     }
     mhe_estimate_now(e, k, o, events, before);
