@@ -135,9 +135,14 @@ class BatchedFunction:
         raw = self.function(x.copy(), u.copy()) if self.takes_input else self.function(x.copy())
         if type(raw) is np.ndarray and raw.dtype == np.float64 and raw.shape == self.shape:
             return raw
-        if x.dtype == np.object_:  # symbols of a trace come back as such
-            return np.asarray(raw, np.object_).reshape(self.shape)
+        if x.dtype == np.object_:
+            return self._as_symbols(raw)
         return self._as_value(raw)
+
+    def _as_symbols(self, raw: Any) -> Array:
+        """The value of a user's function of the symbols of a trace."""
+        found: Array = np.asarray(raw, np.object_).reshape(self.shape)
+        return found
 
     def _as_value(self, raw: Any) -> Array:
         """The checked value of a user's function."""
@@ -169,6 +174,8 @@ class BatchedFunction:
             # Copied row by row: a function may return one and the same array every time.
             value = np.empty((x.shape[0], *self.shape), dtype=np.result_type(x, np.float64))
             function, usual, as_value = self.function, value.shape[1:], self._as_value
+            if value.dtype == np.object_:  # symbols of a trace come back as such
+                as_value = self._as_symbols
             rows = zip(x.copy(), u.copy(), strict=True) if self.takes_input else zip(x.copy())
             for i, arguments in enumerate(rows):
                 raw = function(*arguments)
