@@ -93,41 +93,48 @@ class PriorWeights:
         if covariance is None or not self._varies:
             weight = cost.initial_weight(covariance)
             return InitialWeight(weight, weight)
-        if root is None and self._takes_rows:
-            root = cholesky(covariance).T
-        if root is not None:
-            found = self._from_root(covariance, root, later)
-            if found is not None:
-                return found
+        own = cholesky(covariance).T if root is None and self._takes_rows else root
+        found = None if own is None else self._from_root(covariance, own, later, root is not None)
+        if found is not None and found.distance_root is not None:
+            return found
         nearly, regular = self._regular(covariance + self.added)
+        if found is not None:
+            return found._replace(distance=cost.initial_weight(regular) + self.least)
         weight = cost.initial_weight(nearly) + self.least
         if regular is nearly:
             return InitialWeight(weight, weight)
         return InitialWeight(weight, cost.initial_weight(regular) + self.least)
 
     def _from_root(
-        self, covariance: Array, root: Array, later: Array | None
+        self, covariance: Array, root: Array, later: Array | None, is_observers: bool
     ) -> InitialWeight | None:
-        """From the root, unless the covariance's inverse is nearer: see `_LOST`."""
+        """From the root, unless the covariance's inverse is nearer: see `_LOST`.
+
+        Without a root for the distance where this has no digits: in a direction of hardly any
+        variance, rounding is none.
+        """
         variances = self._variances(covariance + self.added)
         wider = [
             triangle(np.concatenate((root, cholesky(self.added + one).T)))
             for one in variances or (0.0,)
         ]
-        if not self._is_better(wider[0], later):
+        is_sure = is_observers and later is not None and self._has_digits(wider[0], later)
+        if not (self._is_regular(wider[0]) if self._takes_rows else is_sure):
             return None
         least = cholesky(self.least).T
         near, *others = (triangle(np.concatenate((np.linalg.inv(one).T, least))) for one in wider)
         far = others[0] if others else near
-        return InitialWeight(near.T @ near, far.T @ far, near, far)
+        return InitialWeight(near.T @ near, far.T @ far, near, far if is_sure else None)
 
-    def _is_better(self, root: Array, later: Array | None) -> bool:
-        """Whether the weight loses fewer digits by the root: see `_LOST`."""
-        own = (root**2).sum(axis=0)
+    @staticmethod
+    def _is_regular(root: Array) -> bool:
+        """Whether a root has more than rounding in each direction."""
+        return bool((root.diagonal() ** 2 / (root**2).sum(axis=0)).min() > _SINGULAR)
+
+    def _has_digits(self, root: Array, later: Array) -> bool:
+        """Whether a root's inverse keeps more digits than the covariance's: see `_LOST`."""
+        own, behind = (root**2).sum(axis=0), later.diagonal()
         pivot = (root.diagonal() ** 2 / own).min()
-        if self._takes_rows or later is None:
-            return bool(self._takes_rows and pivot > _SINGULAR)
-        behind = later.diagonal()
         shrunk = (own / np.where(behind > 0.0, behind, np.inf)).max()
         return bool(pivot * self._cost.least_correlation * shrunk * shrunk > _LOST)
 

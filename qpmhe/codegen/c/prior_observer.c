@@ -78,7 +78,7 @@ static void mhe_weigh_prior(mhe_estimator *e, mhe_workspace *k)
     prior->weight = prior->distance_weight = prior->own_weight;
     /* A state that is known exactly is judged by its typical magnitude. */
     if (count) prior->distance_weight = prior->own_distance;
-    if (mhe_weigh_prior_by_root(e, prior, known, count)) return;
+    if (mhe_weigh_prior_by_root(e, prior, covariance, known, count)) return;
     mhe_weight_plus(o, covariance, known, MHE_KNOWN, prior->own_weight);
     if (count) mhe_weight_plus(o, covariance, known, 1, prior->own_distance);
 }

@@ -38,7 +38,8 @@ static void mhe_weight_from_root(const mhe_covariances *o, const real *covarianc
  * variance of a component given those before it, as a share of its variance, and d the largest factor
  * by which the window's data reduce a variance, rounding of the weight has a share of eps / (r d) in a
  * variance behind the window, and the least eigenvalue l of an inverse one of l d. */
-static int mhe_root_is_better(const mhe_covariances *o, const real *root, const real *later)
+static int mhe_root_is_better(const mhe_covariances *o, const real *root, const real *later,
+                              int takes_rows)
 {
     real pivot = 1, shrunk = 0;
     for (int j = 0; j < NX; j++) {
@@ -51,12 +52,17 @@ static int mhe_root_is_better(const mhe_covariances *o, const real *root, const 
     }
     /* A root of a singular covariance has only rounding in a direction. */
     const real singular = sizeof(real) == 8 ? (real)1e-26 : (real)1e-10;
-    return MHE_ROLLED ? pivot > singular : pivot * o->least * shrunk * shrunk > EPSILON;
+    return takes_rows ? pivot > singular : pivot * o->least * shrunk * shrunk > EPSILON;
 }
+
+/* The weight with the variances of some states increased. */
+static void mhe_weight_plus(const mhe_covariances *o, const real *covariance, const real *plus,
+                            real factor, real *out);
 
 /* The prior's weight by a root of the covariance, where that is better; `count`: states that are
  * known exactly, with these variances. */
-static int mhe_weigh_prior_by_root(mhe_estimator *e, mhe_prior *prior, const real *known, int count)
+static int mhe_weigh_prior_by_root(mhe_estimator *e, mhe_prior *prior, const real *covariance,
+                                   const real *known, int count)
 {
     const mhe_covariances *o = &e->settings->covariances;
     const mhe_stage *first = mhe_stage_at(e, 0);
@@ -69,9 +75,18 @@ static int mhe_weigh_prior_by_root(mhe_estimator *e, mhe_prior *prior, const rea
         root = own_root;
     }
     mhe_widen_root(o, root, known, MHE_KNOWN, wider);
-    if (!mhe_root_is_better(o, wider, mhe_next_covariance(e, e->length - 1))) return 0;
+    const real *later = mhe_next_covariance(e, e->length - 1);
+    if (!mhe_root_is_better(o, wider, later, MHE_ROLLED)) return 0;
+    const int is_sure = first->is_vague && mhe_root_is_better(o, wider, later, 0);
     prior->root = prior->distance_root = prior->own_root;
     mhe_weight_from_root(o, wider, prior->own_weight, prior->own_root);
+    if (!is_sure) {
+        /* In a direction of hardly any variance, rounding is no distance. */
+        prior->distance_root = 0;
+        prior->distance_weight = prior->own_distance;
+        mhe_weight_plus(o, covariance, known, 1, prior->own_distance);
+        return 1;
+    }
     if (!count) return 1;
     prior->distance_root = prior->own_distance_root;
     mhe_widen_root(o, root, known, 1, wider);
