@@ -54,6 +54,8 @@ _LOST = 1e-2
 _AWAY = 1e8
 # A projection onto X from so many times as far away loses the digits that are compared.
 _BEYOND = 1e6
+# Rounding of a projection, as a share of the observer's deviations.
+_EPSILONS = 4.0 * float(np.finfo(np.float64).eps)
 # Where fewer samples could be compared, another record is tried, from elsewhere and with inputs
 # that are smaller by this factor: with large ones, some models run away at once.
 _ENOUGH, _RECORDS, _SMALLER = 5, 3, 1e-2
@@ -341,10 +343,10 @@ class _Rehearsal:
         largest = max(abs(expected.candidate).max(), abs(expected.observer_state).max())
         window = self._python.memory.window
         if window.projects and window.covariance is not None and self._first is not None:
-            first, last = (
-                math.sqrt(abs(P).max()) for P in (self._first, window.covariance[window.end])
-            )
-            if not last <= _BEYOND * max(first, self._size):
+            # A candidate that is re-initialised goes through all stages of the window again.
+            stages = window.covariance[window.start : window.end + 1]
+            first, largest_of_all = (math.sqrt(abs(P).max()) for P in (self._first, stages))
+            if not largest_of_all <= _BEYOND * max(first, self._size):
                 return True
         apart = abs(nudged.candidate - expected.candidate).max()
         if not (
@@ -373,6 +375,11 @@ class _Rehearsal:
                 f"{found.candidate_cost:.6g}"
             )
         states = abs(np.vstack((expected.candidate, expected.trajectory))).max(axis=0)
+        window = self._python.memory.window
+        if window.projects and window.covariance is not None:
+            # A projection moves by deviations of the observer, and rounds to a share of these.
+            variances = window.covariance[window.start : window.end + 1].diagonal(0, 1, 2)
+            states += _EPSILONS / ROUNDING * np.sqrt(variances.max(axis=0))
         width = expected.disturbances.shape[1]
         outputs = np.nan_to_num(abs(expected.noises)).max(axis=0) + np.nan_to_num(abs(y))
         for name, sizes in (

@@ -107,8 +107,12 @@ def test_powers_of_ten_change_no_estimate(seed, kind):
             one.corrections or one.nearest_points
         )
         accuracy = 1e-5 if exact and kind != "soft" else 1e-3
+        # A QP with penalties is solved to a share of what its sequence began with.
+        began = {name: expected for name, _, expected in values}["candidate_cost"]
+        size = max(1.0, began) if kind == "soft" and np.isfinite(began) else 1.0
         for name, value, expected in values:
             if kind != "soft" or "cost" in name:
                 np.testing.assert_allclose(
-                    value, expected, rtol=accuracy, atol=accuracy, err_msg=f"{name} at {one.time}"
+                    value, expected, rtol=accuracy, atol=accuracy * size,
+                    err_msg=f"{name} at {one.time}",
                 )
