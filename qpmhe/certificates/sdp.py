@@ -32,6 +32,7 @@ _FLOOR = 1e-6  # of what noises count
 _SLACK = 1e-7
 _DIGITS = 4  # of a gain, after the first
 _PRINTED, _NOTHING = 8, 1e-6  # of weights: as they are verified, so they are printed
+_SPLITTING = {"eps": 1e-9, "max_iters": 100_000}  # of SCS, where Clarabel breaks down
 _LEAST = 1e-3  # seconds for a solver, for which zero may mean no limit
 # What a noise counts as at least, of the largest one, in the sizes of states and outputs.
 _SMALLEST_NOISE = 1e-4
@@ -171,13 +172,22 @@ class SemidefiniteProgram:
         """Solve one of the problems, and fill its form in; without its measure."""
         problem = self._problem(squares)
         self._margin.value, self._rest.value = margin, max(rate * rate - margin, 0.0)
-        limit = {"time_limit": max(seconds, _LEAST)} if math.isfinite(seconds) else {}
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                problem.solve(solver="CLARABEL", **limit)
-        except Exception as error:  # a solver may raise anything
-            return ConicSolution(f"the solver raised {type(error).__name__}")
+        limit = max(seconds, _LEAST) if math.isfinite(seconds) else None
+        failure = ""
+        for solver, options in (
+            ("CLARABEL", {} if limit is None else {"time_limit": limit}),
+            # Slower, but it ends where an interior point breaks down; what it finds is verified.
+            ("SCS", _SPLITTING if limit is None else {**_SPLITTING, "time_limit_secs": limit}),
+        ):
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    problem.solve(solver=solver, **options)
+                break
+            except Exception as error:  # a solver may raise anything
+                failure = failure or f"the solver raised {type(error).__name__}"
+        else:
+            return ConicSolution(failure)
         status = str(problem.status)
         if status in ("infeasible", "infeasible_inaccurate"):
             return ConicSolution("infeasible")

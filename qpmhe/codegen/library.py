@@ -29,6 +29,7 @@ from .source import MAIN, estimator_files, template
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1
+_UNUSED = "#if defined(__GNUC__)\n#pragma GCC diagnostic ignored \"-Wunused-function\"\n#endif\n"
 # Before any header: what declares the clock.
 _CLOCK_HEAD = "#define _POSIX_C_SOURCE 199309L\n#include <time.h>\n"
 
@@ -233,6 +234,8 @@ def lapack_functions() -> Any:
 def _engine_files(model: CasadiModel, layout: Layout, record: NDArray[Any]) -> dict[str, str]:
     """Source of an estimator, with a clock where it keeps a time budget."""
     made = estimator_files(model, layout, record)
+    # A part may hold functions that others of its estimators call; `write` leaves them out.
+    made[MAIN] = f"{_UNUSED}{made[MAIN]}"
     if layout.clock:
         made[MAIN] = f"{_CLOCK_HEAD}{made[MAIN]}\n{template('clock.c')}"
     return made

@@ -86,6 +86,7 @@ def test_every_use_that_begins_after_the_change_is_refused(change):
             use()
 
 
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.EngineWarning")  # the estimator sees it, too
 @pytest.mark.parametrize("change", [to_one, scaled_output, bent_output])
 def test_a_change_while_the_monitor_watches_ends_the_bound(change):
     plant = Plant()

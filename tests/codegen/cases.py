@@ -558,6 +558,7 @@ FEATURES = {
         "angles unscented": (_ship, gaps, filtered(UKF), SMOOTH, WARM),
         "angles across the seam": (
             lambda: _ship(states=Box([2.0, -1.0], [4.5, 2.0])), conditions, AGAIN, WARM,
+            {"solver_tolerance": 1e-12},
         ),
         "angles in sets": (lambda: _ship(
             disturbances=Box([-0.1, -0.1], [0.1, 0.1]), noises=Box([-8.0, -0.5], [8.0, 0.5])
