@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import qpmhe
-from qpmhe.model.discretize import discretize
+from qpmhe.model.discretize import Discretization, discretize
 from qpmhe.models.batch_reactor import batch_reactor
 from qpmhe.models.batch_reactor import casadi_output as reactor_output
 from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
@@ -72,7 +72,7 @@ class Problem:
 
     def step(self, x: Any) -> Any:
         """One step of the discretised model for a CasADi column (n)."""
-        step, _ = discretize(self.rate, None, self.method)
+        step, _ = discretize(self.rate, None, Discretization(self.method))
         return step(self.scenario.dt, x)
 
     def casadi_system(self) -> qpmhe.System:
