@@ -15,7 +15,7 @@ from .discretize import Discretization, discretize
 from .functions import BatchedFunction, Trusted
 from .model import Origin
 from .points import FEW, points
-from .system_arguments import SystemOptions, checked_set, timed_options
+from .system_arguments import SystemOptions, checked_scales, checked_set, timed_options
 
 if TYPE_CHECKING:
     from .augmentation import Augmentation
@@ -42,6 +42,8 @@ def made_from_ode(
     slope = given and _over_leading(given)
     if how.is_implicit and slope is None:
         differences = Jacobian(batched, None, m, probes, states)
+        if options.get("scales") is not None:  # else steps are shares of 1 and of the states
+            differences.use_scales(checked_scales(options["scales"], n), None, ())
         slope = partial(_of_inputs, differences.batch, m)
     step, step_jacobian = discretize(_over_leading(batched), slope, how)
     length = positive("dt", dt)
