@@ -4,8 +4,9 @@ One substep of length h from x has stages Z_i, the increments at its nodes:
 
     Z_i = h sum_j A_ij f_c(x + Z_j, u),        x⁺ = x + sum_i d_i Z_i.
 
-The start is Z = 0, so that the step is a function of x, u and h alone. The implicit function theorem
-gives its derivative, from the Jacobians at the converged stages: exact, whatever the iteration did.
+The start is Z = 0, so that the step is a function of x, u and h alone. The implicit function
+theorem gives its derivative, from the Jacobians at the converged stages: exact, whatever the
+iteration did.
 """
 
 from __future__ import annotations
