@@ -42,8 +42,9 @@ def made_from_ode(
     slope = given and _over_leading(given)
     if how.is_implicit and slope is None:
         differences = Jacobian(batched, None, m, probes, states)
-        if options.get("scales") is not None:  # else steps are shares of 1 and of the states
-            differences.use_scales(checked_scales(options["scales"], n), None, ())
+        sizes = options.get("scales")
+        if sizes is not None:  # else steps are shares of 1 and of the states
+            differences.use_scales(checked_scales(sizes, n), None, ())
         slope = partial(_of_inputs, differences.batch, m)
     step, step_jacobian = discretize(_over_leading(batched), slope, how)
     length = positive("dt", dt)
