@@ -34,6 +34,7 @@ from ..model.functions import Trusted
 from ..model.model import Functions, Origin
 from ..model.system import System
 from ..observers import Observer
+from ..observers.base import KalmanType
 from ..terms.base import Trial
 from .comparison import ROUNDING, Interpreter, points
 from .engine import CompiledEngine
@@ -264,7 +265,11 @@ class _Rehearsal:
         self._compiled = CompiledEngine(*arguments, start, library)
         self._first = observer.initial_covariance()
         self._python = _Follower(1.0, *arguments, start)
-        self._nudged = _Follower(nudge_x, *arguments, start * nudge_x)
+        # Differences between sigma points that are far apart lose digits.
+        if isinstance(observer, KalmanType):
+            spread = np.outer(nudge_x, nudge_x) * observer.initial_covariance()
+            observer = observer.with_prior(spread)
+        self._nudged = _Follower(nudge_x, system, observer, cost, settings, start * nudge_x)
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
         count = min(settings.horizon + _BY_RUN + _BY_MEMBERS, most)
         self._own = _own_conditions(system, cost, settings)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from types import NoneType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -293,6 +294,12 @@ class KalmanType(Observer):
     def initial_covariance(self) -> Array:
         """P(0)."""
         return self._prior
+
+    def with_prior(self, prior: Array) -> Self:
+        """The same observer with another P(0), (n, n), positive semidefinite."""
+        found = copy(self)
+        found._prior, _ = positive_semidefinite("prior covariance", prior, len(self._prior))
+        return found
 
     @property
     def sensors(self) -> tuple[tuple[int, ...], ...]:

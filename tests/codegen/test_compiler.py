@@ -642,6 +642,27 @@ def test_a_covariance_that_runs_away_is_not_taken_for_wrong_code(script):
     assert mhe.engine == "compiled"
 
 
+def test_sigma_points_far_apart_are_not_taken_for_wrong_code(script):
+    """Of a state of size 1 with a prior deviation of 1e9, differences of f lose nine digits."""
+
+    def f(x):
+        a, b = x[..., 0], x[..., 1]
+        return np.stack([0.9 * a + 0.1 * b, 0.8 * b + np.where(a > 0.5, 0.1, -0.1)], axis=-1)
+
+    system = qpmhe.System(
+        f, lambda x: x[..., :1] * np.abs(x[..., :1]), n=2, p=1, m=0,
+        disturbance_matrix=[[1.08], [2.77]],
+    )
+    Q, R = [[6.7e-5]], [[9.5e-4]]
+    prior = np.array([[5.8e17, 6.4e16], [6.4e16, 4.5e17]])
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.UnscentedKalman(prior=prior, disturbance=Q, noise=R),
+        qpmhe.QuadraticCost.from_covariances(disturbance=Q, noise=R),
+        initial_state=[0.63, 0.24], horizon=5, max_qps=1, engine="compiled",
+    )
+    assert mhe.engine == "compiled"
+
+
 def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypatch):
     # Of both libraries; the Python step must not use the model's.
     script.lies(f"{STEP_LIES['noises']};{MODEL_LIES['residuals']}", [FAST, MIDDLE, PLAIN])
