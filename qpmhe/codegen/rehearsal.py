@@ -50,7 +50,7 @@ _MANY_STATES, _FEW_SAMPLES = 40, 12
 _NO_SQUARE = 1e150
 # Of a record on which the nudge has grown to this share of J, rounding decides.
 _LOST = 1e-2
-# Of one whose numbers grow to so many times the record's, too.
+# Of one whose numbers or deviations grow to so many times the record's, too.
 _AWAY = 1e8
 # A projection onto X from so many times as far away loses the digits that are compared.
 _BEYOND = 1e6
@@ -342,11 +342,12 @@ class _Rehearsal:
         """
         largest = max(abs(expected.candidate).max(), abs(expected.observer_state).max())
         window = self._python.memory.window
-        if window.projects and window.covariance is not None and self._first is not None:
+        if window.covariance is not None and self._first is not None:
             # A candidate that is re-initialised goes through all stages of the window again.
             stages = window.covariance[window.start : window.end + 1]
             first, largest_of_all = (math.sqrt(abs(P).max()) for P in (self._first, stages))
-            if not largest_of_all <= _BEYOND * max(first, self._size):
+            most = _BEYOND if window.projects else _AWAY
+            if not largest_of_all <= most * max(first, self._size):
                 return True
         apart = abs(nudged.candidate - expected.candidate).max()
         if not (

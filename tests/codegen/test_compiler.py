@@ -618,6 +618,30 @@ def test_a_model_that_runs_away_is_not_taken_for_wrong_code(script):
         assert mhe.engine == "compiled"
 
 
+def test_a_covariance_that_runs_away_is_not_taken_for_wrong_code(script):
+    """Sigma points of a quadratic rate, far apart from the start: P grows to 1e85 in six steps.
+
+    The observer's states may still be small then, and twice as large by another rounding.
+    """
+
+    def f(x):
+        rate = 0.016 * x[..., 0] * x[..., 0] - 0.0064 * x[..., 1]
+        return np.stack([x[..., 0] - 2.0 * rate, x[..., 1] + rate], axis=-1)
+
+    system = qpmhe.System(f, lambda x: x[..., :1] + x[..., 1:], n=2, p=1, m=0)
+    Q, R = [[0.0232, 0.005], [0.005, 0.0218]], [[0.2]]
+    observer = qpmhe.UnscentedKalman(
+        prior=[[130470.0, 2468.0], [2468.0, 10151.0]], disturbance=Q, noise=R,
+        innovation=qpmhe.HuberInnovation(),
+    )
+    cost = qpmhe.QuadraticCost.from_covariances(disturbance=Q, noise=R, discount=0.02)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, initial_state=[2.9, 1.0], horizon=30, max_qps=1,
+        candidate="reinitialized", engine="compiled",
+    )
+    assert mhe.engine == "compiled"
+
+
 def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypatch):
     # Of both libraries; the Python step must not use the model's.
     script.lies(f"{STEP_LIES['noises']};{MODEL_LIES['residuals']}", [FAST, MIDDLE, PLAIN])
