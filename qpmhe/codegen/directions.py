@@ -75,18 +75,30 @@ class Directions:
 
     def elimination(self, system: System, cost: Cost) -> dict[str, Array]:
         """A basis F of the free directions, F^+ and c, with d = F e + c for all d of trials."""
-        constraints, n = self.constraints_of(system, cost), system.n
+        constraints, shift = self.constraints_of(system, cost), np.zeros(system.n)
         space, basis = cost.space, constraints.basis
+        inverse = basis.T
         if space is None:
-            shift = np.zeros(n)
             shift[constraints.noise_free] = constraints.constant
-            return {"free": basis, "free_inverse": basis.T, "shift": shift}
-        directions = constraints.directions
-        shift = np.zeros(n) if directions is None else directions.offset
-        # In scaled numbers, the basis is orthonormal.
+        else:
+            # In scaled numbers, the basis is orthonormal.
+            inverse = (basis / space.scale[:, None]).T / space.scale
+            if constraints.directions is not None:
+                shift = constraints.directions.offset
+        if not basis.size:
+            basis = inverse = np.zeros(1)  # C has no arrays of length 0
+        return {"free": basis, "free_inverse": inverse, "shift": shift}
+
+    def projections(self, system: System, cost: Cost) -> dict[str, Array]:
+        """Projections of d along the noise-free directions, and those of the cost as rows."""
+        space, directions = cost.space, self.constraints_of(system, cost).directions
+        assert space is not None
+        assert directions is not None
+        rows = np.zeros((self.quiet, system.n))
+        rows[: space.noise_free.shape[1]] = space.noise_free.T
         return {
-            "free": basis, "free_inverse": (basis / space.scale[:, None]).T / space.scale,
-            "shift": shift,
+            "keep": directions.projection, "candidate_keep": directions.candidate_projection,
+            "directions": rows,
         }
 
     @property

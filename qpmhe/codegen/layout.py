@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from .._checks import SINGULAR
 from .._linalg import inverse
-from ..costs import Cost, LossForm, Subspace
+from ..costs import Cost, LossForm
 from ..errors import OptionError
 from ..estimation.conditions import USUAL, Conditions
-from ..estimation.constraints import Constraints
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
 from ..estimation.settings import Settings
@@ -48,6 +47,13 @@ _LAPACK_STATES = 40
 _PROJECTIONS = (None, "observer", "diagonal")
 # In single precision rounding makes eigenvalues of correlations of this size.
 _LEAST_SINGLE = 1e-6
+
+
+# Parts with numbers of their own, in words, other than terms, observer and innovation.
+_PARTS = {
+    "covariances": "the observer's covariances", "elimination": "directions that have disturbances",
+    "quiet": "directions that have none",
+}
 
 
 @dataclass(frozen=True)
@@ -143,7 +149,7 @@ class Layout:
                     (k, one.dtype.kind == "i", one.size if one.ndim else 0)
                     for k, one in data.items()
                 ))
-                for name, data in _numbers(terms, own, system.p).items()
+                for name, data in _numbers(directions, system, cost, terms, real, USUAL).items()
             ),
         )
 
@@ -157,18 +163,16 @@ class Layout:
         bits = (f"    {name.upper()}_{flag.name} = {flag.value}" for flag in Status)
         values = {
             "nx": self.nx, "ny": self.ny, "nu": self.nu, "horizon": self.horizon,
-            "real": self.real, "loss": int(self.loss),
-            "widened": int(self.widened), "own_losses": self.own_losses,
-            "lapack": int(self.lapack),
-            "clock": int(self.clock), "clock_text": _CLOCK_TEXT if self.clock else "",
-            "output_residual": self.residuals[0], "state_residual": self.residuals[1],
-            "covariance": int(self.covariance), "deviations": self.deviations,
+            "real": self.real, "loss": int(self.loss), "own_losses": self.own_losses,
+            "lapack": int(self.lapack), "clock_text": _CLOCK_TEXT if self.clock else "",
+            "deviations": self.deviations,
             "constant_gain": int(self.constant_gain), "rejects": int(self.rejects),
             "needs_jacobians": int(self.needs_jacobians),
             "observer_prior": int(self.observer_prior),
             "sensors": self.sensors,
             "turns": int(self.turns), "quiet": self.quiet, "held": self.held,
-            "rolled": int(self.free is not None), "free": self.free or 0,
+            "rolled": int(self.free is not None),
+            "free": self.nx if self.free is None else self.free,
             "limits": c_definitions(name.upper(), self.real), "status": ",\n".join(bits),
             "stage_members": self.sizes.c_text(True),
             "estimator_members": self.sizes.c_text(False),
@@ -187,7 +191,7 @@ class Layout:
                 f"    {'int32_t' if whole else f'{prefix}_real'} "
                 f"{field}{f'[{size}]' if size else ''};\n" for field, whole, size in data
             )
-            about = "a term of J" if name in self.terms else f"the {name}"
+            about = "a term of J" if name in self.terms else _PARTS.get(name, f"the {name}")
             types.append(f"\n/* The numbers of {about}. */\ntypedef struct {{\n{rows}}} "
                          f"{prefix}_{name};\n")
             fields.append(f"    {prefix}_{name} {name};\n")
@@ -205,13 +209,6 @@ class Layout:
             ("noise_deviations", r, p), *((f"{name}_loss", loss) for name in TERMS),
             ("output_periods", r, p), ("state_periods", r, n), ("turn_middle", r, n),
         ]
-        if self.covariance:
-            bounds = [("added", r, n * n), ("least_weight", r, n * n)]
-            fields.append(("covariances", _struct([
-                ("initial", r, n * n), ("disturbance", r, n * n), ("noise", r, p * p),
-                *(bounds if self.observer_prior else []),
-                ("least", r), ("noise_share", r), ("typical", r, n),
-            ])))
         for name, data in self.numbers_of:
             fields.append((name, _struct([
                 (field, np.int32 if whole else r, *((size,) if size else ()))
@@ -222,14 +219,6 @@ class Layout:
             ("solver_tolerance", r),
         ]
         fields += [(name, self.set_type(name)) for name in SET_NAMES]
-        if self.free is not None:
-            free = max(n * self.free, 1)
-            fields += [("free", r, free), ("free_inverse", r, free), ("shift", r, n)]
-        if self.quiet:
-            fields += [
-                ("keep", r, n * n), ("candidate_keep", r, n * n),
-                ("quiet", r, self.quiet * n),
-            ]
         fields += [(name, r, self.metric_size) for name in ("metric", "metric_weight")]
         fields += [(name, r, n) for name in ("inner_lower", "inner_upper", "aside")]
         options = (
@@ -356,15 +345,48 @@ def observer_form(system: System, observer: Observer, cost: Cost) -> ObserverFor
 
 
 def _numbers(
-    terms: tuple[TermForm, ...], observer: ObserverForm, outputs: int
+    directions: Directions, system: System, cost: Cost, terms: tuple[TermForm, ...], real: str,
+    usual: Conditions,
 ) -> dict[str, Mapping[str, NDArray[Any]]]:
     """The numbers of the parts of C that have some, by the parts' names."""
-    found = {term.name: term.data for term in terms}
-    if observer.data:
-        found["observer"] = observer.data
-    if observer.innovation is not None:
-        found["innovation"] = observer.innovation.c_data(outputs)
+    form = observer_form(directions.system, directions.observer, directions.cost)
+    found: dict[str, Mapping[str, NDArray[Any]]] = {}
+    if form.prior is not None:
+        found["covariances"] = _covariances(
+            form, PriorWeights(system, directions.observer, cost), system, cost, real, usual
+        )
+    if directions.free is not None:
+        found["elimination"] = directions.elimination(system, cost)
+    if directions.quiet:
+        found["quiet"] = directions.projections(system, cost)
+    found |= {term.name: term.data for term in terms}
+    if form.data:
+        found["observer"] = form.data
+    if form.innovation is not None:
+        found["innovation"] = form.innovation.c_data(system.p)
     return found
+
+
+def _covariances(
+    form: ObserverForm, prior: PriorWeights, system: System, cost: Cost, real: str,
+    usual: Conditions,
+) -> dict[str, NDArray[Any]]:
+    """The covariances of an observer, and how they weigh the prior."""
+    assert form.prior is not None
+    assert form.disturbance is not None
+    assert form.noise is not None
+    disturbance = covariance_of(usual.disturbance_weight, form.disturbance)
+    noise = covariance_of(usual.noise_weight, form.noise)
+    found = {
+        "initial": form.prior, "disturbance": system.state_covariance(disturbance), "noise": noise,
+    }
+    if cost.observer_prior is not None:
+        found |= {"added": prior.added, "least_weight": prior.least}
+    return found | {
+        "least": np.array(SINGULAR if real == "double" else _LEAST_SINGLE),
+        "noise_share": np.array(least_share(noise)),
+        "typical": np.zeros(system.n) if prior.typical is None else prior.typical,
+    }
 
 
 def settings_record(
@@ -402,25 +424,7 @@ def _filled(
 ) -> NDArray[Any]:
     record, observer = np.zeros((), layout.settings_type()), directions.observer
     form, single = cost.c_form, layout.real == "float"
-    own = observer_form(directions.system, observer, directions.cost)
     assert form is not None
-    prior_weights = PriorWeights(system, observer, cost)
-    if layout.covariance:
-        part = record["covariances"]
-        assert own.disturbance is not None
-        assert own.noise is not None
-        disturbance = covariance_of(usual.disturbance_weight, own.disturbance)
-        for name, matrix in (
-            ("initial", own.prior), ("disturbance", system.state_covariance(disturbance)),
-            ("noise", covariance_of(usual.noise_weight, own.noise)),
-            ("typical", prior_weights.typical),
-        ):
-            _fill(part, name, matrix)
-        part["noise_share"] = least_share(covariance_of(usual.noise_weight, own.noise))
-        part["least"] = _LEAST_SINGLE if single else SINGULAR
-        if layout.observer_prior:
-            _fill(part, "added", prior_weights.added)
-            _fill(part, "least_weight", prior_weights.least)
     record["discount"] = form.discount
     for name, loss in zip(TERMS, form.losses, strict=True):
         _fill(record, f"{name}_weight", getattr(form, name))
@@ -438,12 +442,13 @@ def _filled(
     record["tolerance"] = max(settings.tolerance, 1e-6 if single else 0.0)
     record["solver_tolerance"] = max(settings.solver_tolerance, 1e-4 if single else 0.0)
     initial = cost.initial_weight(observer.initial_covariance())
-    regular = prior_weights(observer.initial_covariance()).distance
+    prior = PriorWeights(system, observer, cost)
+    regular = prior(observer.initial_covariance()).distance
     weights = form.disturbance, form.noise, regular
     for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = getattr(system, name)
         if name == "disturbances" and cost.space is not None:
-            _fill_directions(record, directions.constraints_of(system, cost), cost.space)
+            _fill_rows(record[name], directions.constraints_of(system, cost).disturbances)
             continue
         if one is None:
             continue
@@ -456,11 +461,9 @@ def _filled(
         rows = one.matrix.shape[0]
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
-    if layout.free is not None:
-        for name, matrix in directions.elimination(system, cost).items():
-            _fill(record, name, matrix)
     terms = directions.terms_of(system, cost) if layout.terms else ()
-    for name, data in _numbers(terms, own, system.p).items():
+    numbers = _numbers(directions, system, cost, terms, layout.real, usual)
+    for name, data in numbers.items():
         for field, values in data.items():
             _fill(record[name], field, values)
     record["inner_lower"], record["inner_upper"] = system.f_jacobian.inner
@@ -487,10 +490,8 @@ def _loss_number(term: str, loss: LossForm) -> int:
     return LOSSES.index(loss.kind) if loss.kind in LOSSES else len(LOSSES) + TERMS.index(term)
 
 
-def _fill_directions(record: Any, constraints: Constraints, space: Subspace) -> None:
-    """Fill in the rows on d and the noise-free directions."""
-    part, rows = record["disturbances"], constraints.disturbances
-    directions = constraints.directions
+def _fill_rows(part: Any, rows: Rows | None) -> None:
+    """Fill in the rows on d in place of the set W."""
     part["lower"], part["upper"] = -np.inf, np.inf
     for kind in ("scale", "deviation", "row_scale", "row_deviation"):
         part[kind] = 1.0
@@ -501,10 +502,6 @@ def _fill_directions(record: Any, constraints: Constraints, space: Subspace) -> 
             ("deviation", rows.deviation), ("fixed", rows.fixed),
         ):
             part[f"row_{name}"][: values.size] = values
-    if directions is not None:
-        record["keep"] = directions.projection.ravel()
-        record["candidate_keep"] = directions.candidate_projection.ravel()
-        record["quiet"][: space.noise_free.size] = space.noise_free.T.ravel()
 
 
 def _kind(residual: Residual | None) -> int:

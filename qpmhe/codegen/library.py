@@ -65,9 +65,10 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     form = observer.c_form
     if form is None:
         return (
-            f"{type(observer).__name__} has no C form; take an observer of qpmhe's own "
-            "(Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, UnscentedKalman, "
-            "OutputInjection)."
+            f"{type(observer).__name__} has no C form: of observers of your own, those have one "
+            "that correct by z and v alone, without a covariance, Jacobians or a `filter`; take "
+            "one of qpmhe's (Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, "
+            "UnscentedKalman, OutputInjection), or engine='python'."
         )
     if form.innovation is not None and form.innovation.c_name is None:
         return (

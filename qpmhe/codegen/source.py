@@ -255,28 +255,16 @@ def model_files(model: CasadiModel) -> dict[str, str]:
     return {"model.c": head + prologue() + model_source(model) + template("model_api.c")}
 
 
-def header(name: str, values: dict[str, Any]) -> str:
-    """The estimator's header with its sizes filled in."""
-    members = {key: renamed(text, name) for key, text in values.items() if key.endswith("_members")}
-    text = Template(renamed(template("estimator.h"), name))
-    return text.substitute(values | members, name=name)
-
-
 def estimator_files(
     model: CasadiModel, layout: Layout, settings: NDArray[Any], name: str = "mhe"
 ) -> dict[str, str]:
     """Header and source of a whole estimator."""
-    head = header(name, {**layout.header_values(name), "version": __version__})
+    members: dict[str, str] = {}
+    parts = [_without_members(part, members) for part in _parts(layout)]
     single = layout.real == "float"
-    before = "algebra", "residuals", *(["sides"] if layout.has_rows else [])
     body = prologue() + "\n".join((
         model_source(model, single), *([_own_losses(model)] if layout.loss else []),
-        *_parts(before), *_own_sets(layout),
-        *_parts(("conditions", *_cost_parts(layout), "cost")), layout.sizes.c_functions(),
-        *_parts(_observer_parts(layout)), template("window.c"), *_parts(_prior_parts(layout)),
-        *_parts(layout.terms), _further_terms(layout.terms),
-        *_parts([] if layout.held else ["hold_none"]),
-        *_parts(_search_parts(layout)), template("step.c"),
+        *_declared(parts),
     ))
     data = (
         "\n/* Weights, gain, sets and options of the estimator that this was made from. */\n"
@@ -285,10 +273,68 @@ def estimator_files(
     if single:
         body, data = in_single_precision(body), in_single_precision(data)
     text = renamed(f'#include "mhe.h"\n{body}{data}', name).replace('"mhe.h"', f'"{name}.h"')
+    head = _header(name, {**layout.header_values(name), "version": __version__}, members)
     return {f"{name}.h": head, f"{name}.c": text}
 
 
-def _parts(names: Iterable[str]) -> list[str]:
+# What a part has in a structure of the header, or beside these: up to the next such line.
+_MEMBERS = re.compile(r"^@(\w+)\n(.*?)(?=^@)", re.M | re.S)
+_FUNCTION = re.compile(r"^(static [^;={]*?\b(mhe_\w+)\([^;{]*\))\s*\{", re.M)
+_PROTOTYPE = re.compile(r"^static [^;={}]*?\b(mhe_\w+)\([^;{]*\);\n", re.M)
+
+
+def _without_members(part: str, members: dict[str, str]) -> str:
+    """The part's functions; ``members`` gets what it has in the header, by structures."""
+    for place, text in _MEMBERS.findall(part):
+        members[place] = members.get(place, "") + text
+    return re.sub(r"^@\n", "", _MEMBERS.sub("", part), flags=re.M)
+
+
+def _declared(parts: list[str]) -> list[str]:
+    """The parts, each behind declarations of the functions of later parts that it calls."""
+    heads: dict[str, tuple[int, str]] = {}
+    for k, part in enumerate(parts):
+        heads.update((name, (k, head)) for head, name in _FUNCTION.findall(part))
+    declared: set[str] = set()
+    for k, part in enumerate(parts):
+        declared.update(_PROTOTYPE.findall(part))
+        called = dict.fromkeys(re.findall(r"\bmhe_\w+(?=\()", part))
+        later = [one for one in called if one in heads and heads[one][0] > k]
+        later = [one for one in later if one not in declared]
+        declared.update(later)
+        parts[k] = "".join(f"{heads[one][1]};\n" for one in later) + "\n" * bool(later) + part
+    return parts
+
+
+def _header(name: str, values: dict[str, Any], members: dict[str, str]) -> str:
+    """The estimator's header with its sizes filled in, and with what the parts add to it."""
+    places = ("types", "functions", *(
+        f"mhe_{one}" for one in ("settings", "terms", "estimate", "prior", "workspace", "log")
+    ))
+    unknown = members.keys() - set(places)
+    assert not unknown, unknown
+    ours = {f"in_{place.removeprefix('mhe_')}": members.get(place, "") for place in places}
+    ours |= {key: text for key, text in values.items() if key.endswith("_members")}
+    ours = {key: renamed(text, name) for key, text in ours.items()}
+    text = Template(renamed(template("estimator.h"), name))
+    return text.substitute(values | ours, name=name)
+
+
+def _parts(layout: Layout) -> list[str]:
+    """The parts of C that an estimator is put together from."""
+    return [
+        *_texts(("algebra",)), _residuals(layout), *_texts(["sides"] if layout.has_rows else []),
+        *_own_sets(layout),
+        *_texts(("conditions", _or_none("losses", layout.loss), "cost")),
+        layout.sizes.c_functions(),
+        *_texts((*_observer_parts(layout), "window", *_prior_parts(layout), *layout.terms)),
+        _further_terms(layout.terms),
+        *_texts([] if layout.held else ["hold_none"]),
+        *_texts((*_search_parts(layout), "step")),
+    ]
+
+
+def _texts(names: Iterable[str]) -> list[str]:
     """Text of these parts of the C."""
     return [template(f"{name}.c") for name in names]
 
@@ -296,25 +342,37 @@ def _parts(names: Iterable[str]) -> list[str]:
 def _observer_parts(layout: Layout) -> list[str]:
     """The parts of C that compute the observer, and keep it in X."""
     parts, rule = [], layout.innovation or "none"
-    parts.append(_or_none("quiet", layout.quiet > 0))
     if layout.covariance:
         parts += ["covariance"]
     if layout.deviations:
         parts += ["kalman", *(["innovation"] if layout.innovation else []), f"innovation_{rule}"]
-    parts += [f"observer_{layout.observer}", "sensors" if layout.innovation else "sensors_none"]
-    if layout.covariance:
-        parts += ["roots" if layout.deviations else "roots_none", "following"]
-    else:
-        parts += ["following_none"]
+    parts += [f"observer_{layout.observer}", _or_none("sensors", layout.innovation)]
+    if layout.covariance and not layout.deviations:
+        parts += ["kalman_none"]
+    parts += [_or_none("following", layout.covariance)]
     if not layout.sets[2][0]:
         return [*parts, "inside_none"]
     metric = "metric_covariance" if layout.covariance else "metric_own"
     return [*parts, "projection", metric, "inside"]
 
 
-def _or_none(part: str, is_there: bool) -> str:
+def _or_none(part: str, is_there: object) -> str:
     """The name of a part, or that of the one in its place."""
     return part if is_there else f"{part}_none"
+
+
+def _residuals(layout: Layout) -> str:
+    """The differences of outputs and of states: plain, of angles, or by the user's function."""
+    calls = {
+        name: (
+            "", f"    mhe_turn({size}, s->{name}_periods, differences);\n",
+            f"    mhe_turn_by(mhe_call_{name}_residual, {size}, {of}, differences);\n",
+        )[kind]
+        for (name, size, of), kind in zip(
+            (("output", "NY", "y"), ("state", "NX", "x")), layout.residuals, strict=True
+        )
+    }
+    return Template(template("residuals.c")).substitute(calls)
 
 
 def _own_sets(layout: Layout) -> list[str]:
@@ -327,31 +385,27 @@ def _own_sets(layout: Layout) -> list[str]:
     ]
 
 
-def _cost_parts(layout: Layout) -> tuple[str, ...]:
-    """The parts of C with losses, and with the prior's weight."""
-    return (
-        _or_none("widening", layout.widened), _or_none("losses", layout.loss),
-        "prior_cost_roots" if layout.has_prior_roots else "prior_cost",
-    )
-
-
 def _prior_parts(layout: Layout) -> tuple[str, ...]:
     """The parts of C that set the prior of a window."""
-    if not layout.observer_prior:
-        return "prior_observer_none", "prior"
-    return _or_none("prior_roots", layout.has_prior_roots), "prior_observer", "prior"
+    return (
+        _or_none("prior_roots", layout.has_prior_roots),
+        _or_none("prior_observer", layout.observer_prior), "prior",
+    )
 
 
 def _search_parts(layout: Layout) -> tuple[str, ...]:
     """The parts of C that look for an estimate."""
-    constrained, factor = layout.has_rows, "factor" if layout.free is None else "elimination"
-    rows = f"rows_{factor}", "rows", "active_set", "interior_point", "constrained"
-    roots = [] if factor == "factor" else [_or_none("elimination_roots", layout.has_prior_roots)]
+    if layout.free is None:
+        factor, blocks = "factor", ["factor_lapack" if layout.lapack else "factor_loops"]
+    else:
+        factor, blocks = "elimination", []
+    rows = f"rows_{factor}", "rows", "active_set", "interior_point", "constrained", "curved"
+    constrained = layout.has_rows
     return (
-        _or_none("sets", constrained), "trial", "damping", *roots, factor, "budget", "outcome",
-        *(rows if constrained else ["unconstrained"]), "trials", _or_none("curved", constrained),
-        "optimizer", _or_none("graduated", layout.widened),
-        _or_none("rolled_out", layout.quiet > 0), _or_none("outside", constrained), "improve",
+        *(["sets"] if constrained else []), "trial", "damping", factor, *blocks,
+        _or_none("budget", layout.clock), "outcome", "trials",
+        *((*rows, "outside") if constrained else ["sets_none"]), "optimizer",
+        _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet), "improve",
     )
 
 

@@ -9,7 +9,7 @@ from .fold import folded
 
 # Stands for lines that were left out.
 _GAP = "\x01\n"
-_DIRECTIVE = re.compile(r"#\s*(ifdef|ifndef|if|elif|else|endif)\b(.*)")
+_DIRECTIVE = re.compile(r"#\s*(if|endif)")
 _MACRO = re.compile(r"^#define (\w+)\b(\([^)]*\))?((?:[^\\\n]|\\[^\n]|\\\n)*)\n", re.M)
 _FUNCTION = re.compile(
     r"^static [^;={]*?\b(\w+)\([^;{]*\)\s*\{(?:[^\n]*\}\n|.*?^\}\n)", re.M | re.S
@@ -31,13 +31,13 @@ _STALE = re.compile(
 
 
 def stripped(header: str, source: str) -> tuple[str, str]:
-    """Header and source without conditionals that are decided, and what is without use then.
+    """Header and source without branches that are decided, and what is without use then.
 
-    Conditionals on the compiler stay. The object code is the same wherever the compiler leaves out
+    The object code is the same wherever the compiler leaves out
     functions that nobody calls, as GCC does from -O1 on.
     """
-    macros: dict[str, str] = {}
-    texts = [_resolved(header, macros, 1), _UNUSED.sub(r"\1", _resolved(source, macros, 0))]
+    macros = _macros(header, 1) | _macros(source, 0)
+    texts = [header, _UNUSED.sub(r"\1", source)]
     before: list[str] = []
     while texts != before:
         before = texts
@@ -61,37 +61,17 @@ def _without_unused(texts: list[str]) -> list[str]:
     return [_MACRO.sub(kept, _FUNCTION.sub(kept, text)) for text in texts]
 
 
-def _resolved(text: str, macros: dict[str, str], guards: int) -> str:
-    """The text without decided conditionals; ``macros`` gets what it defines in any case."""
-    kept: list[str] = []
-    # Of each conditional around a line: whether it is decided, was true so far, and is true here.
-    around: list[list[bool]] = []
+def _macros(text: str, guards: int) -> dict[str, str]:
+    """The macros that a text defines in any case: inside of so many conditionals at most."""
+    found, depth = {}, 0
     for line in text.replace("\\\n", "\x02").splitlines(keepends=True):
-        found = _DIRECTIVE.match(line)
-        if found is None:
-            if all(level[2] for level in around):
-                kept.append(line)
-                macro = _MACRO.match(line)
-                if macro and not macro[2] and sum(not level[0] for level in around) <= guards:
-                    macros[macro[1]] = macro[3].replace("\x02", " ")
-            continue
-        kind, condition = found.groups()
-        holds = _value(condition, macros) if kind in ("if", "elif") else None
-        if kind in ("if", "ifdef", "ifndef"):
-            around.append([holds is not None, bool(holds), holds is not False])
-        elif not around[-1][0]:
-            pass
-        elif kind == "elif" and holds is None and not around[-1][1]:
-            around[-1], line = [False, True, True], line.replace("elif", "if", 1)
-        elif kind != "endif":
-            around[-1][2] = not around[-1][1] and holds is not False
-            around[-1][1] |= around[-1][2]
-        decided = around[-1][0]
-        if kind == "endif":
-            around.pop()
-        if all(level[2] for level in around):
-            kept.append(_GAP if decided else line)
-    return "".join(kept).replace("\x02", "\\\n")
+        kind = _DIRECTIVE.match(line)
+        if kind:
+            depth += {"if": 1, "endif": -1}.get(kind[1], 0)
+        macro = _MACRO.match(line)
+        if macro and not macro[2] and depth <= guards:
+            found[macro[1]] = macro[3].replace("\x02", " ")
+    return found
 
 
 def _value(condition: str, macros: dict[str, str]) -> bool | None:

@@ -6,8 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field
+from functools import partial
 from types import NoneType
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +20,7 @@ from .._linalg import inverse
 from ..errors import ModelError, OptionError, ShapeError
 from ..model.sets import ConvexSet
 from ..model.system import System
-from ..model.tracing import Traced
+from ..model.tracing import Traced, traced
 from .innovation import Counts, Innovation, Mask, Prediction, Verdict
 from .roots import VAGUE, grown, least_share
 
@@ -133,6 +134,24 @@ class ObserverForm:
     plain: ObserverForm | None = None
 
 
+class _Unread:
+    """In place of a `Sample`, while a correction is traced: notes what is read of it."""
+
+    read = ""
+
+    def __getattr__(self, name: str) -> NoReturn:
+        if not name.startswith("__"):
+            self.read = self.read or name
+        raise AttributeError(name)
+
+
+def _correction(
+    correct: Callable[..., tuple[Any, Any]], sample: _Unread, z: Array, v: Array
+) -> Any:
+    """The correction of an observer without a covariance."""
+    return correct(z, v, sample)[0]
+
+
 class Observer(ABC):
     r"""An observer :math:`z(t+1) = f(z, u) + L(z, y - h(z, u))` with :math:`L(\cdot, 0) = 0`.
 
@@ -235,11 +254,31 @@ class Observer(ABC):
 
     @property
     def c_form(self) -> ObserverForm | None:
-        """The observer's data for the step in C; None if C cannot compute it."""
+        """The observer's data for the step in C; None if C cannot compute it.
+
+        A correction by z and v alone is traced: without a covariance, a memory, Jacobians, counted
+        sensors and an estimate of its own that has used y(t).
+        """
         gain, filter_gain = self.constant_gain, self.filter_gain
-        if gain is None or filter_gain is None:
-            return None
-        return ObserverForm("gain", {"gain": gain, "filter_gain": filter_gain})
+        if gain is not None:
+            if filter_gain is None:
+                return None
+            return ObserverForm("gain", {"gain": gain, "filter_gain": filter_gain})
+        has_more = (
+            self.needs_jacobians or self.sensors or self.initial_covariance() is not None
+            or self.initial_memory() is not None or type(self).filter is not Observer.filter
+        )
+        return None if has_more else ObserverForm("injection", correction=self._traced_correction)
+
+    def _traced_correction(self, n: int, p: int) -> Traced:
+        """`correct` as CasADi has it, if it reads z and v alone."""
+        unread = _Unread()
+        found = traced(partial(_correction, self.correct, unread), (n, p), name="correction")
+        if unread.read:
+            return Traced(None, f"it reads sample.{unread.read}")
+        if found.function is not None and found.shape != (n,):
+            return Traced(None, f"it has shape {found.shape}; expected ({n},)")
+        return found
 
     def filter(self, z: Array, v: Array, sample: Sample) -> tuple[Array, Array] | None:
         """The estimate of x(t) that uses y(t), and its covariance; None if there is none.

@@ -83,9 +83,9 @@ class OutputInjection(Observer):
 
     @property
     def c_form(self) -> ObserverForm | None:
-        """The correction, unless a derived class may compute otherwise."""
+        """The correction; of a derived class, which may correct otherwise, `Observer.c_form`."""
         if type(self) is not OutputInjection:
-            return None
+            return super().c_form
         return ObserverForm("injection", correction=self._expression)
 
     def _expression(self, n: int, p: int) -> Traced:

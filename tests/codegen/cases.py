@@ -463,6 +463,16 @@ def _saturated(z, v):
     return np.array([[0.3, 0.0], [0.1, 0.05], [0.0, 0.3]]) @ bounded * (1.0 + 0.2 * np.cos(z))
 
 
+class Own(qpmhe.Observer):
+    """A user's own, whose correction is traced."""
+
+    def check(self, system, initial_state):
+        pass
+
+    def correct(self, z, v, sample):
+        return 1.5 * _saturated(z, v), None
+
+
 def _failing(error=12.0):
     """A model that is not defined below zero, where errors lead the observer at times."""
     system = qpmhe.from_casadi(
@@ -691,6 +701,8 @@ FEATURES = {
         "injection in sets": ("inputs and states", by(
             lambda one: qpmhe.OutputInjection(lambda z, v: 2.0 * _saturated(z, v))
         )),
+        "own observer": ("inputs", by(lambda one: Own()), gaps, with_changes, WARM),
+        "own observer in sets": ("inputs and states", by(lambda one: Own()), gaps, AGAIN),
     },
     "steps": {
         "radau": (lambda: _kinetics("radau"), with_conditions),

@@ -86,7 +86,41 @@ class Counting(qpmhe.Luenberger):
     sensors = ((0,),)
 
 
+class Own(qpmhe.Observer):
+    """A user's own, with a correction that a test says."""
+
+    def __init__(self, correction, **attributes):
+        self.correction = correction
+        vars(self).update(attributes)
+
+    def check(self, system, initial_state):
+        pass
+
+    def correct(self, z, v, sample):
+        return self.correction(z, v, sample), None
+
+
+class Filtered(Own):
+    """With an estimate of x(t) that has used y(t)."""
+
+    def filter(self, z, v, sample):
+        return z, np.eye(3)
+
+
+def _branching(z, v, sample):
+    return 0.1 * v[0] * np.ones(3) if v[0] > 0.0 else 0.2 * v[0] * np.ones(3)
+
+
+def _listening(z, v, sample):
+    return np.full(3, 0.1) * v[0] * (1.0 if getattr(sample, "observed", None) is None else 0.5)
+
+
 @pytest.mark.parametrize(("observer", "text"), [
+    (Own(_branching), r"the correction of Own has no C form \(.*branch"),
+    (Own(_listening), r"the correction of Own has no C form \(it reads sample.observed\)"),
+    (Own(lambda z, v, sample: np.full(3, 0.1) * v, needs_jacobians=True),
+     "Own has no C form: .* without a covariance, Jacobians"),
+    (Filtered(lambda z, v, sample: np.full(3, 0.1) * v), "Filtered has no C form"),
     (qpmhe.ExtendedKalman(
         prior=np.eye(3), disturbance=np.eye(3), noise=[[1.0]], innovation=Wider(0.9)
     ), "Wider, the rule for innovations of ExtendedKalman, has no C form; take qpmhe.Gate"),

@@ -30,27 +30,6 @@ static real mhe_form(int n, const real *M, const real *a)
     return sum;
 }
 
-#if MHE_LAPACK
-/* SciPy's LAPACK and BLAS, as their callers in C see them; the caller hands them over. */
-static struct {
-    void (*dpotrf)(const char *uplo, const int *n, real *a, const int *lda, int *info);
-    void (*dtrsm)(const char *side, const char *uplo, const char *trans, const char *diag,
-                  const int *m, const int *n, const real *alpha, const real *a, const int *lda,
-                  real *b, const int *ldb);
-    void (*dsyrk)(const char *uplo, const char *trans, const int *n, const int *k,
-                  const real *alpha, const real *a, const int *lda, const real *beta, real *c,
-                  const int *ldc);
-    void (*dgemm)(const char *transa, const char *transb, const int *m, const int *n,
-                  const int *k, const real *alpha, const real *a, const int *lda, const real *b,
-                  const int *ldb, const real *beta, real *c, const int *ldc);
-} mhe_lapack;
-
-void mhe_set_lapack(void *const *functions)
-{
-    memcpy(&mhe_lapack, functions, sizeof mhe_lapack);
-}
-#endif
-
 /* What follows is for features that an estimator may not have. */
 #if defined(__GNUC__)
 #pragma GCC diagnostic push

@@ -1,21 +1,19 @@
-/* The time budget of a step, where there is a clock. */
+/* The time budget of a step. */
 
+@mhe_settings
+    double time_budget;        /* seconds from the start of a step, after which no QP begins */
+    double (*clock)(void);     /* seconds from any start; a null pointer: no budget is kept */
+@mhe_workspace
+    double (*clock)(void), deadline; /* of the present step */
+@
 static void mhe_begin(const mhe_estimator *e, mhe_workspace *k)
 {
-#if MHE_CLOCK
     const mhe_settings *s = e->settings;
     k->clock = s->time_budget > 0 ? s->clock : 0;
     if (k->clock) k->deadline = k->clock() + s->time_budget;
-#endif
-    (void)e; (void)k;
 }
 
 static int mhe_time_is_up(const mhe_workspace *k)
 {
-#if MHE_CLOCK
     return k->clock && k->clock() > k->deadline;
-#else
-    (void)k;
-    return 0;
-#endif
 }

@@ -15,11 +15,7 @@ static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACT
 /* Covariance of the disturbances of stage i, for the weights along the trajectory of the QP. */
 static void mhe_disturbance_covariance(mhe_estimator *e, const mhe_workspace *k, int i, real *spread)
 {
-#if MHE_ROLLED
     enum { COUNT = MHE_FREE };
-#else
-    enum { COUNT = NX };
-#endif
     const mhe_settings *s = e->settings;
     const real *Q = mhe_disturbance_weight(s, mhe_stage_at(e, i));
     const real next = mhe_floored(k->factors[i + 1]);
@@ -30,11 +26,7 @@ static void mhe_disturbance_covariance(mhe_estimator *e, const mhe_workspace *k,
             scaled[r * NX + c] = next * mhe_scaled(Q[r * NX + c], k->at[i]->disturbance_scale, r);
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < COUNT; c++) {
-#if MHE_ROLLED
-            F[r * COUNT + c] = s->free[r * COUNT + c];
-#else
-            F[r * COUNT + c] = r == c;
-#endif
+            F[r * COUNT + c] = mhe_free_direction(s, r, c);
             across[c * NX + r] = F[r * COUNT + c];
         }
     for (int j = 0; j < COUNT * COUNT; j++) weight[j] = 0;

@@ -7,8 +7,36 @@
  * problem in d(0) and the e(i). Householder reflections with row interchanges turn the rows that
  * d(i+1), ..., d(K) are in into rows S(i+1) of d(i+1) alone, from the last stage to the first; the prior
  * comes last. So nothing is squared, and a prior may be as vague as it likes beside the noise (Powell
- * and Reid, IFIP Congress 1968; Cox and Higham, BIT 38, 1998). */
+ * and Reid, IFIP Congress 1968; Cox and Higham, BIT 38, 1998).
+ *
+ * Of the settings: x(i+1) - f = free e + shift, and e = free_inverse (x(i+1) - f). */
 
+@types
+/* Rows of a least-squares problem, and the reflections that turn them into `rank` rows, each with zeros
+ * before its column `lead`; the first `free` of these are of disturbances. Columns are padded. */
+#define MHE_COLUMNS ((MHE_FREE + MHE_NX + 3) / 4 * 4)
+#define MHE_EQUATIONS (MHE_FREE + 2 * MHE_NX + MHE_NY + MHE_STAGE_ROWS)
+typedef struct {
+    mhe_real rows[MHE_EQUATIONS * MHE_COLUMNS];
+    mhe_real mirrors[MHE_COLUMNS * MHE_EQUATIONS], share[MHE_COLUMNS];
+    mhe_real root[MHE_SIZE(MHE_STAGE_ROWS)];
+    int32_t lead[MHE_COLUMNS], other[MHE_COLUMNS], source[MHE_SIZE(MHE_STAGE_ROWS)];
+    int32_t count, rank, free, inequalities;
+} mhe_block;
+@mhe_workspace
+    mhe_block blocks[MHE_HORIZON + 1];
+    mhe_block start;                  /* of the first state alone */
+    int32_t order[MHE_NX];            /* of its columns */
+    mhe_real sides_of[(MHE_HORIZON + 1) * MHE_EQUATIONS]; /* right-hand sides of the blocks' rows */
+    mhe_real targets[MHE_HORIZON * (MHE_FREE + MHE_NY)], drift[(MHE_HORIZON + 1) * MHE_NX];
+    mhe_real free_root[MHE_SIZE(MHE_FREE * MHE_FREE)], noise_root[MHE_NY * MHE_NY];
+    mhe_real free_roots[MHE_HORIZON * MHE_SIZE(MHE_FREE * MHE_FREE)];
+    mhe_real noise_roots[MHE_HORIZON * MHE_NY * MHE_NY];
+    mhe_real prior_root[MHE_NX * MHE_NX], prior_gradient[MHE_NX], first_target[MHE_NX];
+    mhe_real curvature[MHE_NX + MHE_HORIZON * MHE_FREE];
+    const mhe_real *limits_w;         /* disturbances about which the limits are */
+    const mhe_trial *around;          /* the trial that the QP is around */
+@
 #define COLUMNS MHE_COLUMNS
 #define EQUATIONS MHE_EQUATIONS
 
@@ -121,12 +149,39 @@ static void mhe_solve_transposed(int n, const real *U, real *side)
     }
 }
 
+/* own = -(A' Q w + C' R v), following = Q w; A and C are in place. Q and R are of the form that touches
+ * the cost. */
+static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
+                          const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
+{
+    (void)work;
+    const real *A = t->f_jacobian, *C = t->h_jacobian;
+    const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
+    mhe_scale_weights(s, work, stage, Q, w, v, t);
+    mhe_times(NX, Q, w, t->following);
+    for (int i = 0; i < NX; i++)
+        t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
+    for (int j = 0; j < NX; j++) t->own[j] = 0;
+    for (int k = 0; k < NX; k++)
+        for (int j = 0; j < NX; j++) t->own[j] -= t->following[k] * A[k * NX + j];
+    for (int k = 0; k < NY; k++) {
+        const real force = mhe_scaled(mhe_dot(NY, R + k * NY, v), t->noise_scale, k);
+        for (int j = 0; j < NX; j++) t->own[j] -= force * C[k * NX + j];
+    }
+}
+
+/* An entry of F, whose columns are the directions that have disturbances. */
+static real mhe_free_direction(const mhe_settings *s, int row, int column)
+{
+    return s->elimination.free[row * MHE_FREE + column];
+}
+
 /* Roots of the weights of stage i: of e, and of the observed outputs. */
 static void mhe_set_roots(mhe_estimator *e, mhe_workspace *k, int i)
 {
     const mhe_settings *s = e->settings;
     const mhe_stage *stage = mhe_stage_at(e, i);
-    const real *F = s->free, *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
+    const real *F = s->elimination.free, *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
     real scaled[NX * NX], product[SIZE(NX * MHE_FREE)], weight[SIZE(MHE_FREE * MHE_FREE)], V[NY * NY];
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < NX; c++)
@@ -165,7 +220,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     for (int j = 0; k->damping > 0 && j < NX; j++)
         first[j * NX + j] += k->damping * (first[j * NX + j] + k->seen[j]);
     mhe_root(NX, first, k->prior_root);
-    if (root) mhe_join_prior_root(k, root, factor);
+    if (root) mhe_join_prior_root(root, factor, k->prior_root);
     for (int i = 0; i < count; i++) {
         const real next = mhe_floored(k->factors[i + 1]);
         const mhe_terms *t = k->at[i];
@@ -196,15 +251,16 @@ static void mhe_add_inequalities(const mhe_estimator *e, mhe_workspace *k, int i
     mhe_block *b = k->blocks + i;
     int at = i * ROWS;
     const real *weights = k->rows.weight + at;
+    const real *F = s->elimination.free;
     real row[NX > NY ? NX : NY];
-    (void)s; (void)row;
+    (void)s; (void)F; (void)row;
     if (MHE_W_SET) {
         for (int r = 0; r < NX + MHE_W_ROWS && i < e->length; r++) {
             if (weights[r] == 0) continue;
             for (int c = 0; c < MHE_FREE; c++) {
-                row[c] = r < NX ? s->free[r * MHE_FREE + c] : 0;
+                row[c] = r < NX ? F[r * MHE_FREE + c] : 0;
                 for (int j = 0; r >= NX && j < NX; j++)
-                    row[c] += s->disturbances.rows[(r - NX) * NX + j] * s->free[j * MHE_FREE + c];
+                    row[c] += s->disturbances.rows[(r - NX) * NX + j] * F[j * MHE_FREE + c];
             }
             mhe_add_row(b, at + r, weights[r], 0, MHE_FREE, row, 1);
         }
@@ -238,7 +294,7 @@ static void mhe_add_inequalities(const mhe_estimator *e, mhe_workspace *k, int i
  * a number is not finite or the first state is not determined. */
 static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
 {
-    const mhe_settings *s = e->settings;
+    const real *F = e->settings->elimination.free;
     const int count = e->length;
     int is_usual = 0; /* whether the roots are those of the usual weights */
     for (int i = count; i >= 0; i--) {
@@ -274,7 +330,7 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
                 for (int c = 0; c < COLUMNS; c++) row[c] = 0;
                 for (int l = later->lead[j] - MHE_FREE; l < NX; l++) {
                     const real value = mhe_entry(later, j, MHE_FREE + l);
-                    for (int c = 0; c < MHE_FREE; c++) row[c] += value * s->free[l * MHE_FREE + c];
+                    for (int c = 0; c < MHE_FREE; c++) row[c] += value * F[l * MHE_FREE + c];
                     for (int c = 0; c < NX; c++) row[MHE_FREE + c] += value * A[l * NX + c];
                 }
             }
@@ -327,6 +383,7 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
 static void mhe_set_targets(mhe_estimator *e, mhe_workspace *k, const real *step, int nearest)
 {
     const mhe_settings *s = e->settings;
+    const real *F = s->elimination.free, *inverse = s->elimination.free_inverse;
     for (int i = 0; i < e->length; i++) {
         const mhe_terms *t = k->at[i];
         const real *Q = mhe_disturbance_weight(s, mhe_stage_at(e, i));
@@ -337,9 +394,9 @@ static void mhe_set_targets(mhe_estimator *e, mhe_workspace *k, const real *step
             moved[j] = step ? own[NX + j] - mhe_dot(NX, t->f_jacobian + j * NX, own) : 0;
             w[j] = k->limits_w[i * NX + j] + moved[j];
         }
-        for (int c = 0; c < MHE_FREE; c++) free_part[c] = mhe_dot(NX, s->free_inverse + c * NX, w);
+        for (int c = 0; c < MHE_FREE; c++) free_part[c] = mhe_dot(NX, inverse + c * NX, w);
         for (int j = 0; j < NX; j++) {
-            drift[j] = s->shift[j] - w[j] + mhe_dot(MHE_FREE, s->free + j * MHE_FREE, free_part);
+            drift[j] = s->elimination.shift[j] - w[j] + mhe_dot(MHE_FREE, F + j * MHE_FREE, free_part);
             w[j] = (moved[j] + drift[j]) * (1 + k->damping) +
                    (nearest ? 0 : k->around->w[i * NX + j]);
         }
@@ -347,7 +404,7 @@ static void mhe_set_targets(mhe_estimator *e, mhe_workspace *k, const real *step
         for (int c = 0; c < MHE_FREE; c++) target[c] = 0;
         for (int j = 0; j < NX; j++) {
             const real force = next * mhe_scaled(weighed[j], t->disturbance_scale, j);
-            for (int c = 0; c < MHE_FREE; c++) target[c] -= force * s->free[j * MHE_FREE + c];
+            for (int c = 0; c < MHE_FREE; c++) target[c] -= force * F[j * MHE_FREE + c];
         }
         mhe_solve_transposed(MHE_FREE, k->free_roots + i * SIZE(MHE_FREE * MHE_FREE), target);
         for (int j = 0; j < NY; j++) {
@@ -416,7 +473,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
         }
         for (int j = 0; j < NX; j++)
             next[j] = mhe_dot(NX, k->at[i]->f_jacobian + j * NX, own) +
-                      mhe_dot(MHE_FREE, s->free + j * MHE_FREE, disturbance) +
+                      mhe_dot(MHE_FREE, s->elimination.free + j * MHE_FREE, disturbance) +
                       (push ? 0 : k->drift[i * NX + j]);
     }
     return mhe_all_finite((count + 1) * NX, out);
@@ -453,7 +510,7 @@ static real mhe_squared_share(real force, real curvature)
  * forces of inequalities on all d, as if they were free; these are overwritten. */
 static real mhe_largest_force(mhe_estimator *e, mhe_workspace *k)
 {
-    const mhe_settings *s = e->settings;
+    const real *F = e->settings->elimination.free;
     real worst = 0;
     for (int i = e->length - 1; i >= 0; i--) {
         const real *later = k->residual + (i + 1) * NX, *A = k->at[i]->f_jacobian;
@@ -463,7 +520,7 @@ static real mhe_largest_force(mhe_estimator *e, mhe_workspace *k)
         real *own = k->residual + i * NX;
         for (int c = 0; c < MHE_FREE; c++) {
             real force = 0;
-            for (int j = 0; j < NX; j++) force += s->free[j * MHE_FREE + c] * later[j];
+            for (int j = 0; j < NX; j++) force += F[j * MHE_FREE + c] * later[j];
             for (int j = 0; j <= c; j++) force += root[j * MHE_FREE + c] * target[j];
             worst = mhe_max(mhe_squared_share(force, k->curvature[NX + i * MHE_FREE + c]), worst);
         }

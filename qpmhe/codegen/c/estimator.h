@@ -44,13 +44,8 @@ typedef $real mhe_real;
 #define MHE_V_ROWS $v_rows
 #define MHE_X_ROWS $x_rows
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
-#define MHE_WIDENED $widened   /* whether a loss is widened while the first window fills */
 #define MHE_OWN_LOSSES $own_losses /* users' functions: 1 of the prior, 2 of w, 4 of v */
 #define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
-#define MHE_CLOCK $clock /* whether time_budget is kept */
-#define MHE_OUTPUT_RESIDUAL $output_residual /* 1: outputs have angles; 2: a function for differences */
-#define MHE_STATE_RESIDUAL $state_residual /* the same of states */
-#define MHE_COVARIANCE $covariance /* whether the observer's covariance is computed */
 #define MHE_OBSERVER_PRIOR $observer_prior /* whether it weighs the prior */
 #define MHE_CONSTANT_GAIN $constant_gain /* whether the observer corrects with a constant gain */
 #define MHE_NEEDS_JACOBIANS $needs_jacobians /* whether it reads those of f and h */
@@ -60,14 +55,11 @@ typedef $real mhe_real;
 #define MHE_TURNS $turns  /* whether the set of states bounds angles */
 #define MHE_QUIET $quiet /* directions of x(t+1) - f without a disturbance */
 #define MHE_ROLLED $rolled /* whether some directions of x(t+1) - f have no disturbance in any trial */
-#define MHE_FREE $free /* the other directions, where there are such */
+#define MHE_FREE $free /* directions of x(t+1) - f that have a disturbance */
 #define MHE_HELD $held    /* states that are held where the window does not see them */
 
 /* Step lengths, tolerances and thresholds. */
 $limits
-
-/* Whether a root of its covariance gives one of the prior's weight. */
-#define MHE_PRIOR_ROOTS (MHE_DEVIATIONS && MHE_OBSERVER_PRIOR)
 
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
@@ -138,19 +130,6 @@ typedef struct {
 
 /* Matrices are stored by rows. Weights are inverse covariances. */
 
-#if MHE_COVARIANCE
-typedef struct {
-    mhe_real initial[MHE_NX * MHE_NX]; /* of the initial error */
-    mhe_real disturbance[MHE_NX * MHE_NX], noise[MHE_NY * MHE_NY];
-#if MHE_OBSERVER_PRIOR
-    /* What is added to the covariance that weighs the prior, and to its inverse. */
-    mhe_real added[MHE_NX * MHE_NX], least_weight[MHE_NX * MHE_NX];
-#endif
-    mhe_real least;           /* eigenvalue of the correlations that are inverted */
-    mhe_real noise_share;     /* least variance of an output's noise given the others', over its own */
-    mhe_real typical[MHE_NX]; /* variances where states may be known exactly, else 0 */
-} mhe_covariances;
-#endif
 $part_types
 typedef struct {
     mhe_real prior_weight[MHE_NX * MHE_NX];
@@ -160,9 +139,6 @@ typedef struct {
     mhe_loss prior_loss, disturbance_loss, noise_loss;
     mhe_real output_periods[MHE_NY], state_periods[MHE_NX]; /* of angles; 0 for no angle */
     mhe_real turn_middle[MHE_NX]; /* of an angle's bounds; infinite where there are none */
-#if MHE_COVARIANCE
-    mhe_covariances covariances; /* of the observer */
-#endif
 $part_fields    mhe_real discount;         /* factor on a stage's cost for each step of age */
     mhe_real sample_time;      /* of the rate; 0 where f is a map */
     mhe_real tolerance;        /* relative decrease of the cost that counts as converged */
@@ -170,16 +146,6 @@ $part_fields    mhe_real discount;         /* factor on a stage's cost for each 
     mhe_w_set disturbances;
     mhe_v_set noises;
     mhe_x_set states;
-#if MHE_ROLLED
-    /* x(i+1) - f = free e + shift, and e = free_inverse (x(i+1) - f). */
-    mhe_real free[MHE_SIZE(MHE_NX * MHE_FREE)], free_inverse[MHE_SIZE(MHE_FREE * MHE_NX)];
-    mhe_real shift[MHE_NX];
-#endif
-#if MHE_QUIET
-    /* x(i+1) = f + keep (x(i+1) - f) + shift; of the candidate, along the rows of `quiet` alone. */
-    mhe_real keep[MHE_NX * MHE_NX];
-    mhe_real candidate_keep[MHE_NX * MHE_NX], quiet[MHE_QUIET * MHE_NX];
-#endif
     /* The observer's metric: as a covariance, before it has settled or for good; and the weight in the
      * Lyapunov equation by which it settles. */
     mhe_real metric[MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)];
@@ -196,22 +162,14 @@ $part_fields    mhe_real discount;         /* factor on a stage's cost for each 
     int32_t start_at_best;     /* start at the shifted previous estimate where it is better */
     int32_t reinitialize;      /* observer restarted at the estimate of the window's start */
     int32_t smooth;            /* prior at the previous estimate of the window's first state */
-#if MHE_CLOCK
-    double time_budget;        /* seconds from the start of a step, after which no QP begins */
-    double (*clock)(void);     /* seconds from any start; a null pointer: no budget is kept */
-#endif
-} mhe_settings;
+$in_settings} mhe_settings;
 
 extern const mhe_settings mhe_default_settings;
 
 /* The cost of one stage to second order, in the increments of x(i) and x(i+1). */
 typedef struct {
     mhe_real f_jacobian[MHE_NX * MHE_NX], h_jacobian[MHE_NY * MHE_NX];
-#if !MHE_ROLLED
-    mhe_real hessian[MHE_NX * MHE_NX];  /* A' Q A + C' R C */
-    mhe_real coupling[MHE_NX * MHE_NX]; /* -A' Q: rows of x(i), columns of x(i+1) */
-#endif
-    mhe_real own[MHE_NX], following[MHE_NX];
+$in_terms    mhe_real own[MHE_NX], following[MHE_NX];
     /* What the rows of the weights Q and R are multiplied with where a loss is not quadratic. */
     mhe_real disturbance_scale[MHE_LOSS ? MHE_NX : 1], noise_scale[MHE_LOSS ? MHE_NY : 1];
 } mhe_terms;
@@ -241,10 +199,7 @@ typedef struct {
     /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V
      * and of X. */
     uint8_t dropped[MHE_ROWS];
-#if MHE_SENSORS
-    uint8_t rejected[MHE_SENSORS]; /* 1 for each sensor that the observer's gate rejected */
-#endif
-} mhe_estimate;
+$in_estimate} mhe_estimate;
 
 typedef struct {
     mhe_real x[(MHE_HORIZON + 1) * MHE_NX], w[MHE_HORIZON * MHE_NX], v[MHE_HORIZON * MHE_NY];
@@ -268,77 +223,28 @@ typedef struct {
     mhe_side sides[2];
 } mhe_rows;
 
-#if MHE_ROLLED
-/* Rows of a least-squares problem, and the reflections that turn them into `rank` rows, each with zeros
- * before its column `lead`; the first `free` of these are of disturbances. Columns are padded. */
-#define MHE_COLUMNS ((MHE_FREE + MHE_NX + 3) / 4 * 4)
-#define MHE_EQUATIONS (MHE_FREE + 2 * MHE_NX + MHE_NY + MHE_STAGE_ROWS)
-typedef struct {
-    mhe_real rows[MHE_EQUATIONS * MHE_COLUMNS];
-    mhe_real mirrors[MHE_COLUMNS * MHE_EQUATIONS], share[MHE_COLUMNS];
-    mhe_real root[MHE_SIZE(MHE_STAGE_ROWS)];
-    int32_t lead[MHE_COLUMNS], other[MHE_COLUMNS], source[MHE_SIZE(MHE_STAGE_ROWS)];
-    int32_t count, rank, free, inequalities;
-} mhe_block;
-#endif
-
+$in_types
 /* The prior of the present window: its mean, its weight, and one to judge distances by. */
 typedef struct {
     const mhe_real *mean, *weight, *distance_weight;
     mhe_real own_weight[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
     mhe_real own_distance[MHE_OBSERVER_PRIOR ? MHE_NX * MHE_NX : 1];
     const mhe_real *first; /* the first state of the trajectory around which the QP is */
-#if MHE_PRIOR_ROOTS
-    /* R with R'R the weights, where R alone has all digits; else none. */
-    const mhe_real *root, *distance_root;
-    mhe_real own_root[MHE_NX * MHE_NX], own_distance_root[MHE_NX * MHE_NX];
-#endif
-#if MHE_HELD
-    /* Of the present window: the weight of held parameters, and how their trusted values follow. */
-    mhe_real held[MHE_HELD * MHE_HELD], follow[MHE_HELD * MHE_HELD];
-#endif
-} mhe_prior;
+$in_prior} mhe_prior;
 
 typedef struct {
     mhe_trial trials[4], bent;
-#if MHE_WIDENED
-    mhe_trial kept;                   /* the best trial by the cost itself */
-    mhe_real w_widening, v_widening;  /* of the losses; 1 of the cost itself */
-    mhe_real followed[(MHE_HORIZON + 1) * MHE_NX]; /* where the next step starts */
-#endif
     mhe_terms terms[MHE_HORIZON];
     const mhe_terms *at[MHE_HORIZON]; /* the terms of the present QP */
     mhe_real factors[MHE_HORIZON + 1]; /* discounts: of the prior, then of each stage */
     mhe_prior prior;
     mhe_real damping, seen[MHE_NX];   /* of the present QP; and what the data say about its d(0) */
-#if MHE_ROLLED
-    mhe_block blocks[MHE_HORIZON + 1];
-    mhe_block start;                  /* of the first state alone */
-    int32_t order[MHE_NX];            /* of its columns */
-    mhe_real sides_of[(MHE_HORIZON + 1) * MHE_EQUATIONS]; /* right-hand sides of the blocks' rows */
-    mhe_real targets[MHE_HORIZON * (MHE_FREE + MHE_NY)], drift[(MHE_HORIZON + 1) * MHE_NX];
-    mhe_real free_root[MHE_SIZE(MHE_FREE * MHE_FREE)], noise_root[MHE_NY * MHE_NY];
-    mhe_real free_roots[MHE_HORIZON * MHE_SIZE(MHE_FREE * MHE_FREE)];
-    mhe_real noise_roots[MHE_HORIZON * MHE_NY * MHE_NY];
-    mhe_real prior_root[MHE_NX * MHE_NX], prior_gradient[MHE_NX], first_target[MHE_NX];
-    mhe_real curvature[MHE_NX + MHE_HORIZON * MHE_FREE];
-    const mhe_real *limits_w;         /* disturbances about which the limits are */
-    const mhe_trial *around;          /* the trial that the QP is around */
-#else
-    mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
-    mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
-    mhe_real prior_diagonal[MHE_NX];  /* of the first state's weight, without the data */
-    int32_t has_ridge;                /* on the diagonal of the panels */
-#endif
     mhe_real gradient[(MHE_HORIZON + 1) * MHE_NX], step[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real residual[(MHE_HORIZON + 1) * MHE_NX], direction[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real product[(MHE_HORIZON + 1) * MHE_NX];
     mhe_rows rows;
     uint8_t left_out[MHE_ROWS]; /* sides that no trial must keep */
-#if MHE_CLOCK
-    double (*clock)(void), deadline; /* of the present step */
-#endif
-} mhe_workspace;
+$in_workspace} mhe_workspace;
 
 /* A sample, and the conditions for it alone: 0 and null pointers stand for the usual ones. Fill it
  * with zeros first: `mhe_sample sample = {0};`. */
@@ -361,10 +267,7 @@ typedef struct {
     mhe_real *costs, *candidate_costs;
     int32_t *status, *qps, *iterations;
     mhe_real *observer_states;     /* MHE_NX each */
-#if MHE_SENSORS
-    uint8_t *rejected;             /* MHE_SENSORS each */
-#endif
-} mhe_log;
+$in_log} mhe_log;
 
 /* Forget all samples and start at x0, or at the nearest point of X. The settings are not copied:
  * they must stay where they are as long as the estimator is in use. */
@@ -400,11 +303,7 @@ void mhe_run(mhe_estimator *estimators, int64_t members, mhe_workspace *workspac
 /* Compute what QPs need of the stages, where an estimator that was saved had no QPs. */
 void mhe_recompute(mhe_estimator *estimator);
 
-#if MHE_LAPACK
-/* Call this first: dpotrf, dtrsm, dsyrk and dgemm, by Fortran's convention with 32-bit integers. */
-void mhe_set_lapack(void *const *functions);
-#endif
-
+$in_functions
 /* Apply other settings to all samples of the window and from now on, run the observer again from
  * the start of the window, and estimate the same state again. Where the settings change, conditions
  * of single samples are forgotten; `changes` are its bits. Deviations and scales of

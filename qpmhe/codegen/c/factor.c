@@ -4,11 +4,74 @@
  * it the block that couples d(k) with d(k+1). What lies left of the diagonal is not read for
  * its value. */
 
+@mhe_terms
+    mhe_real hessian[MHE_NX * MHE_NX];  /* A' Q A + C' R C */
+    mhe_real coupling[MHE_NX * MHE_NX]; /* -A' Q: rows of x(i), columns of x(i+1) */
+@mhe_workspace
+    mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
+    mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
+    mhe_real prior_diagonal[MHE_NX];  /* of the first state's weight, without the data */
+    int32_t has_ridge;                /* on the diagonal of the panels */
+@
 #define WIDTH MHE_PANEL_WIDTH
 
 /* The ridge of a Hessian that is singular up to rounding, as shares of its diagonal and of the weights'
  * that losses have not touched: above rounding, and far below what a useful step depends on. */
 #define RIDGE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-4)
+
+/* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v), following = Q w;
+ * A and C are in place. Q and R are of the form that touches the cost. */
+static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
+                          const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
+{
+    (void)work;
+    const real *A = t->f_jacobian, *C = t->h_jacobian;
+    const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
+    mhe_scale_weights(s, work, stage, Q, w, v, t);
+    mhe_times(NX, Q, w, t->following);
+    for (int i = 0; i < NX; i++)
+        t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
+    real *H = t->hessian, *QA = t->coupling;
+    if (MHE_LOSS || !mhe_dense_terms(Q, w, t)) {
+        for (int i = 0; i < NX * NX; i++) H[i] = QA[i] = 0;
+        for (int i = 0; i < NX; i++)
+            for (int k = 0; k < NX; k++) {
+                const real q = mhe_scaled(Q[i * NX + k], t->disturbance_scale, i);
+                if (q == 0) continue; /* weights are diagonal more often than not */
+                for (int j = 0; j < NX; j++) QA[i * NX + j] += q * A[k * NX + j];
+            }
+        for (int k = 0; k < NX; k++)
+            for (int i = 0; i < NX; i++) {
+                const real a = A[k * NX + i];
+                if (a == 0) continue;
+                for (int j = i & ~3; j < NX; j++) H[i * NX + j] += a * QA[k * NX + j];
+            }
+        for (int j = 0; j < NX; j++) t->own[j] = 0;
+        for (int k = 0; k < NX; k++)
+            for (int j = 0; j < NX; j++) t->own[j] -= w[k] * QA[k * NX + j];
+        for (int i = 0; i < NX; i++)
+            for (int k = 0; k <= i; k++) {
+                const real other = QA[k * NX + i];
+                QA[k * NX + i] = -QA[i * NX + k];
+                QA[i * NX + k] = -other;
+            }
+    }
+    for (int k = 0; k < NY; k++) {
+        real RC[NX]; /* row k of it */
+        for (int j = 0; j < NX; j++) RC[j] = 0;
+        for (int l = 0; l < NY; l++) {
+            const real r = mhe_scaled(R[k * NY + l], t->noise_scale, k);
+            if (r == 0) continue;
+            for (int j = 0; j < NX; j++) RC[j] += r * C[l * NX + j];
+        }
+        for (int i = 0; i < NX; i++) {
+            const real c = C[k * NX + i];
+            if (c == 0) continue;
+            for (int j = i & ~3; j < NX; j++) H[i * NX + j] += c * RC[j];
+        }
+        for (int j = 0; j < NX; j++) t->own[j] -= v[k] * RC[j];
+    }
+}
 
 /* A QP around a trial knows it by its terms. */
 static void mhe_set_around(mhe_workspace *k, const mhe_trial *around)
@@ -21,6 +84,13 @@ static int mhe_set_ridge(mhe_workspace *k, int has_ridge)
 {
     k->has_ridge = has_ridge;
     return 1;
+}
+
+/* All directions have disturbances. */
+static real mhe_free_direction(const mhe_settings *s, int row, int column)
+{
+    (void)s;
+    return row == column;
 }
 
 /* Add damping to the panels. */
@@ -97,73 +167,6 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         }
     }
 }
-
-#if MHE_LAPACK
-/* Overwrite the panels by the rows of L', with H = L L'; whether H was positive definite. By
- * columns, as LAPACK reads them, a panel is the lower half of a block above its coupling. */
-static int mhe_factorise(mhe_workspace *k, int count)
-{
-    const int n = NX, width = WIDTH;
-    const real one = 1, minus = -1;
-    for (int i = 0; i <= count; i++) {
-        real *panel = k->panels + i * NX * WIDTH, *inverse = k->inverse_pivots + i * NX;
-        int info = 0;
-        mhe_lapack.dpotrf("L", &n, panel, &width, &info);
-        if (info) return 0;
-        for (int r = 0; r < NX; r++) {
-            const real pivot = panel[r * WIDTH + r];
-            if (!(pivot > 0) || !isfinite(pivot)) return 0; /* some LAPACKs let NaN through */
-            inverse[r] = 1 / pivot;
-        }
-        if (i == count) break;
-        mhe_lapack.dtrsm("R", "L", "T", "N", &n, &n, &one, panel, &width, panel + NX, &width);
-        mhe_lapack.dsyrk("L", "N", &n, &n, &minus, panel + NX, &width, &one,
-                         panel + NX * WIDTH, &width);
-    }
-    return 1;
-}
-#else
-/* Columns of a panel that are updated at once: as many as fit in a processor's registers, and
- * a fixed number, so that a compiler can keep them there. */
-#define CHUNK (WIDTH <= 48 ? WIDTH : 32)
-
-/* Overwrite the panels by the rows of D L', with H = L D L'; whether H was positive definite.
- * No square roots: their latency would be half of the time at small sizes. */
-static int mhe_factorise(mhe_workspace *k, int count)
-{
-    for (int i = 0; i <= count; i++) {
-        real *restrict panel = k->panels + i * NX * WIDTH;
-        real *restrict inverse = k->inverse_pivots + i * NX;
-        for (int r = 0; r < NX; r++) {
-            real *row = panel + r * WIDTH;
-            for (int b = r / CHUNK * CHUNK; b < WIDTH; b += CHUNK) {
-                real sums[CHUNK];
-                for (int c = 0; c < CHUNK; c++) sums[c] = row[b + c];
-                for (int j = 0; j < r; j++) {
-                    const real *above = panel + j * WIDTH + b, factor = panel[j * WIDTH + r] * inverse[j];
-                    for (int c = 0; c < CHUNK; c++) sums[c] -= factor * above[c];
-                }
-                for (int c = 0; c < CHUNK; c++) row[b + c] = sums[c];
-            }
-            const real pivot = row[r];
-            if (!(pivot > 0) || !isfinite(pivot)) return 0;
-            inverse[r] = 1 / pivot;
-        }
-        if (i == count) break;
-        real *restrict next = panel + NX * WIDTH;
-        for (int r = 0; r < NX; r++) {
-            real sums[NX];
-            for (int c = 0; c < NX; c++) sums[c] = 0;
-            for (int j = 0; j < NX; j++) {
-                const real *row = panel + j * WIDTH + NX, factor = row[r] * inverse[j];
-                for (int c = 0; c < NX; c++) sums[c] += factor * row[c];
-            }
-            for (int c = 0; c < NX; c++) next[r * WIDTH + c] -= sums[c];
-        }
-    }
-    return 1;
-}
-#endif
 
 /* b := H^-1 b; whether the result is finite. */
 static int mhe_solve(const mhe_workspace *k, int count, real *restrict b)

@@ -1,4 +1,20 @@
-/* A search with losses that are widened while the first window fills. */
+/* Losses that are widened while the first window fills, and the search with them. */
+
+@mhe_workspace
+    mhe_trial kept;                   /* the best trial by the cost itself */
+    mhe_real w_widening, v_widening;  /* of the losses; 1 of the cost itself */
+    mhe_real followed[(MHE_HORIZON + 1) * MHE_NX]; /* where the next step starts */
+@
+/* By what the losses of w and of v are widened now. Without a workspace: not at all. */
+static real mhe_w_widening(const mhe_workspace *k)
+{
+    return k ? k->w_widening : 1;
+}
+
+static real mhe_v_widening(const mhe_workspace *k)
+{
+    return k ? k->v_widening : 1;
+}
 
 /* The cost of a trial, from its residuals: of a surrogate, or the cost itself again. */
 static void mhe_weigh(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)

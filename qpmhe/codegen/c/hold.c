@@ -3,6 +3,10 @@
  * prior's covariance, `spread` the covariance of the disturbances; `pick` leads from the columns of
  * `root` to held parameters, of which `components` are the states. */
 
+@mhe_prior
+    /* Of the present window: the weight of held parameters, and how their trusted values follow. */
+    mhe_real held[MHE_HELD * MHE_HELD], follow[MHE_HELD * MHE_HELD];
+@
 /* What the data of the window say about its first state, in deviations of the prior. */
 static void mhe_window_information(mhe_estimator *e, real *M)
 {

@@ -1,4 +1,56 @@
-/* The prior's weight from a root of the observer's covariance. */
+/* The prior's weight from a root of the observer's covariance, and its cost by one where it has one. */
+
+@mhe_prior
+    /* R with R'R the weights, where R alone has all digits; else none. */
+    const mhe_real *root, *distance_root;
+    mhe_real own_root[MHE_NX * MHE_NX], own_distance_root[MHE_NX * MHE_NX];
+@
+/* a' W a; |R a|^2 where W has a root R: no digits cancel then. */
+static real mhe_rooted_form(const real *root, const real *W, const real *a)
+{
+    real seen[NX];
+    if (!root) return mhe_form(NX, W, a);
+    mhe_times(NX, root, a, seen);
+    return mhe_dot(NX, seen, seen);
+}
+
+/* The squared distance of an offset from the prior. */
+static real mhe_prior_distance(const mhe_prior *prior, const real *offset)
+{
+    return mhe_rooted_form(prior->distance_root, prior->distance_weight, offset);
+}
+
+/* out = W a for the prior's weight. */
+static void mhe_prior_force(const mhe_prior *prior, const real *a, real *out)
+{
+    if (prior->root) {
+        real seen[NX];
+        mhe_times(NX, prior->root, a, seen);
+        for (int j = 0; j < NX; j++) out[j] = 0;
+        mhe_add_product(NX, NX, 1, prior->root, seen, out);
+        return;
+    }
+    mhe_times(NX, prior->weight, a, out);
+}
+
+/* Gamma of an offset from the prior; quadratic where the observer weighs it. */
+static real mhe_prior_cost(const mhe_settings *s, const mhe_workspace *k, const real *offset)
+{
+    if (k->prior.root) return mhe_rooted_form(k->prior.root, k->prior.weight, offset);
+    return mhe_lost(&s->prior_loss, 1, NX, k->prior.weight, offset);
+}
+
+/* The root of the prior's weight, where it has one. */
+static const real *mhe_root_of_prior(const mhe_prior *prior) { return prior->root; }
+
+/* Join a root of the prior's weight, times a factor, to that of what is added to it. */
+static void mhe_join_prior_root(const real *root, real factor, real *prior_root)
+{
+    real scaled[NX * NX], joined[NX * NX];
+    for (int j = 0; j < NX * NX; j++) scaled[j] = sqrt(factor) * root[j];
+    mhe_join_roots(scaled, prior_root, joined);
+    memcpy(prior_root, joined, sizeof joined);
+}
 
 /* out = U'^-1 for an upper triangular U. */
 static void mhe_invert_root(const real *U, real *out)
@@ -54,10 +106,6 @@ static int mhe_root_is_better(const mhe_covariances *o, const real *root, const 
     const real singular = sizeof(real) == 8 ? (real)1e-26 : (real)1e-10;
     return takes_rows ? pivot > singular : pivot * o->least * shrunk * shrunk > EPSILON;
 }
-
-/* The weight with the variances of some states increased. */
-static void mhe_weight_plus(const mhe_covariances *o, const real *covariance, const real *plus,
-                            real factor, real *out);
 
 /* The prior's weight by a root of the covariance, where that is better; `count`: states that are
  * known exactly, with these variances. */

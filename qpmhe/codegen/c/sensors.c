@@ -1,5 +1,10 @@
 /* How often in a row each sensor has failed. */
 
+@mhe_estimate
+    uint8_t rejected[MHE_SENSORS]; /* 1 for each sensor that the observer's gate rejected */
+@mhe_log
+    uint8_t *rejected;             /* MHE_SENSORS each */
+@
 /* Behind stage i the sensors' counts are those before it, or zero. */
 static void mhe_keep_rejections(mhe_estimator *e, int i)
 {

@@ -21,3 +21,49 @@ static void mhe_fill_dropped(const mhe_workspace *k, int rows_dropped, mhe_estim
 {
     (void)k; (void)rows_dropped; (void)out;
 }
+
+static int mhe_try_curved(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real target,
+                          int useless)
+{
+    (void)e; (void)k; (void)o; (void)target; (void)useless;
+    return 0;
+}
+
+static void mhe_try_along(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real target)
+{
+    (void)e; (void)k; (void)o; (void)target;
+}
+
+static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
+{
+    (void)e; (void)k; (void)o; (void)before;
+}
+
+static void mhe_recall_places(const mhe_estimator *e, mhe_workspace *k)
+{
+    (void)e; (void)k;
+}
+
+static void mhe_keep_places(mhe_estimator *e, const mhe_workspace *k)
+{
+    (void)e; (void)k;
+}
+
+/* Solve the QP whose limits and terms are in place; the increments are in k->step. */
+static int mhe_solve_rows(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, const real *offset,
+                          int nearest, int again)
+{
+    (void)o; (void)again;
+    return mhe_solve_free(e, k, offset, nearest) ? SOLVED : FAILED;
+}
+
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
+                           const real *v)
+{
+    (void)e; (void)k; (void)x; (void)w; (void)v;
+}
+
+static void mhe_clip_trial(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)
+{
+    (void)e; (void)k; (void)trial;
+}

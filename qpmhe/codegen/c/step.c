@@ -7,8 +7,7 @@ static void mhe_watch(mhe_estimator *e, const mhe_workspace *k, mhe_outcome *o)
     for (int j = 0; j < NX; j++)
         offset[j] = o->best->x[e->length * NX + j] - o->candidate->x[e->length * NX + j];
     mhe_wrap_state(e->settings, o->best->x + e->length * NX, offset);
-    const int far = mhe_rooted_form(k->prior.distance_root, k->prior.distance_weight, offset) >
-                    MHE_FAR * MHE_FAR;
+    const int far = mhe_prior_distance(&k->prior, offset) > MHE_FAR * MHE_FAR;
     const int counted[] = {far, o->rows_dropped};
     for (int i = 0; i < 2; i++)
         e->watched[i] = counted[i] ? e->watched[i] + (e->watched[i] < INT32_MAX) : 0;
@@ -141,10 +140,10 @@ void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u
  * another X through the newest. */
 static void mhe_keep(mhe_estimator *to, const mhe_estimator *from, int overwritten)
 {
-#if MHE_X_SET
-    const int newest = (overwritten + MHE_HORIZON - 1) % MHE_HORIZON;
-    to->stages[newest] = from->stages[newest];
-#endif
+    if (MHE_X_SET) {
+        const int newest = (overwritten + MHE_HORIZON - 1) % MHE_HORIZON;
+        to->stages[newest] = from->stages[newest];
+    }
     memcpy(to, from, offsetof(mhe_estimator, stages));
     if (from->settings->reinitialize)
         memcpy(to->stages, from->stages, sizeof to->stages);
