@@ -178,6 +178,31 @@ def test_estimators_of_the_campaign_have_no_faults(engine, seed):
     assert counts["steps"] >= 40
 
 
+@pytest.mark.parametrize(("event", "seed"), [
+    ("restored", 94), ("restarted", 64), ("restored", 104), ("restarted", 68),
+])
+def test_the_campaign_restores_and_restarts(event, seed):
+    counts, faults, words = run(seed, samples=40)
+    assert faults == [], words
+    assert counts[event] > 0
+
+
+def above(mhe, estimate):
+    estimate.restored_cost = 0.5 * estimate.cost
+
+
+def outside(mhe, estimate):
+    estimate.candidate = estimate.candidate + 1e-9
+
+
+@pytest.mark.parametrize(("seed", "spoil", "words"), [
+    (94, above, "cost above its limit"), (64, outside, "restarted elsewhere"),
+])
+def test_the_campaign_notices_wrong_restored_costs_and_restarts(monkeypatch, seed, spoil, words):
+    monkeypatch.setattr(*wrong_update(spoil))
+    assert any(words in kind for kind, _ in Run(seed, samples=40).go().faults)
+
+
 def handing_out(window, estimate):
     estimate.candidate = window.z[window.start : window.end + 1]
 

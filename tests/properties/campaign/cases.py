@@ -17,6 +17,8 @@ OBSERVERS = {
     "luenberger": 0.25, "extended": 0.25, "unscented": 0.1, "steady": 0.08, "injection": 0.07,
     "zero": 0.05, "gate": 0.12, "huber": 0.08,
 }
+# Options that the step in C does not have.
+NOT_IN_C = ("infeasible", "restart")
 # Observers without a covariance.
 PLAIN = ("luenberger", "injection", "zero")
 
@@ -268,6 +270,14 @@ class Case:
             (0.15, "max_solver_iterations", int(r.integers(1, 8))),
             (0.3 * python, "backend", str(r.choice(BACKENDS))),
         ) if r.random() < share}
+        later = np.random.default_rng([self.seed, 2])  # what older seeds have drawn stays as it was
+        drawn = {name: value for share, name, value in (
+            (0.35, "infeasible", "restore"), (0.3, "restart", True),
+        ) if later.random() < share and (python or name not in NOT_IN_C)}
+        if "candidate" in options:
+            drawn.pop("restart", None)
+        options |= drawn
+        self.tags += drawn
         if options.get("backend") in ("banded", "quadprog"):
             options.pop("max_solver_iterations", None)
         if self.k:

@@ -229,20 +229,29 @@ class Judge:
     def _faults(self, estimate, window, mean):
         found: list[tuple[str, Any]] = []
         case, x, candidate = self.case, estimate.trajectory, estimate.candidate
-        status, improved = estimate.status, Status.IMPROVED in estimate.status
-        if not estimate.cost <= estimate.candidate_cost:
-            found.append(("cost above the candidate's", (estimate.cost, estimate.candidate_cost)))
+        status, restored = estimate.status, Status.RESTORED in estimate.status
+        moved, limit = Status.CANDIDATE not in status, estimate.candidate_cost
+        if restored:
+            limit = estimate.restored_cost
+            self.count("restored")
+        if not estimate.cost <= limit:
+            found.append(("cost above its limit", (estimate.cost, limit, status)))
+        if restored != (not math.isnan(estimate.restored_cost)) or (restored and (
+            case.options.get("infeasible") != "restore" or estimate.dropped
+            or Status.CANDIDATE_OUTSIDE not in status
+        )):
+            found.append(("restored in secret, or without a reason", status))
         if estimate.cost < 0.0 or estimate.candidate_cost < 0.0:
             found.append(("negative cost", (estimate.cost, estimate.candidate_cost)))
         if not (np.isfinite(x).all() and np.isfinite(estimate.state).all()):
             return [*found, ("an estimate that is not finite", status)]
         if len(window) != len(x) - 1:
             return [*found, ("length of the window", (len(window), len(x) - 1))]
-        if improved == (Status.CANDIDATE in status):
-            found.append(("improved and the candidate, or neither", status))
-        if not improved and not np.array_equal(x, candidate):
+        if (Status.IMPROVED in status) + restored + (Status.CANDIDATE in status) != 1:
+            found.append(("improved, restored and the candidate, or none of them", status))
+        if not moved and not np.array_equal(x, candidate):
             found.append(("not the candidate", status))
-        if case.G is not None and not improved:
+        if case.G is not None and not moved:
             return found  # its J is that of its roll-out
         mean = candidate[0] if mean is None else mean
         own = judged(case, x, window, mean, not case.from_observer)
@@ -262,10 +271,10 @@ class Judge:
         slack = BOUND * (own.slack + of_candidate.slack)
         if (
             math.isfinite(estimate.candidate_cost) and not case.from_observer
-            and case.G is None and of_candidate.J + slack < own.J
+            and case.G is None and not restored and of_candidate.J + slack < own.J
         ):
             found.append(("own J above the candidate's", (own.J, of_candidate.J)))
-        if improved:
+        if moved:
             found += self._of_sets(estimate, window, own, of_candidate)
             found += self._of_noises(estimate, window, own)
         if case.kind in ("luenberger", "injection", "zero"):
@@ -405,8 +414,11 @@ class Judge:
                     (estimate.trajectory, own.v), (estimate.candidate, of_candidate.v),
                 )
             )
-            if now > 1e-6 * (1.0 + abs(before)) + FEASIBLE * self.case.row_scale and before <= 0.0:
-                return [("a constraint is missed that the candidate keeps", (i, now, before))]
+            allowed = 1e-6 * (1.0 + abs(before)) + FEASIBLE * self.case.row_scale
+            kept = before <= 0.0
+            if now > allowed and (kept or Status.ROWS_DROPPED not in estimate.status):
+                which = " that the candidate keeps" if kept else ""
+                return [(f"a constraint is missed{which}", (i, now, before, estimate.status))]
         return []
 
     def _of_observer(self, estimate, window):

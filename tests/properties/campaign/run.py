@@ -11,7 +11,7 @@ from collections import Counter
 import numpy as np
 
 import qpmhe
-from qpmhe import QpmheError
+from qpmhe import QpmheError, Status
 
 from .cases import SETS, Case
 from .engines import Beside
@@ -65,7 +65,7 @@ class Run:
         self.usual = Sample(
             case.model.parameters.copy(), np.zeros(0), case.iQ, case.iR, dict(case.sets)
         )
-        self.window, self.time, self.last = [], 0, None
+        self._forget()
         self.truth = case.origin.copy()
         case.tags += ["hostile data"] * self.hostile
 
@@ -73,6 +73,11 @@ class Run:
         self.counts[f"fault: {kind}"] += 1
         if self.counts[f"fault: {kind}"] == 1:
             self.faults.append((kind, f"at {getattr(self, 'time', 0)}: {detail}"))
+
+    def _forget(self):
+        """Nothing has been measured."""
+        self.window, self.time, self.last = [], 0, None
+        self.states, self.restarted = {}, 0  # the last estimates, by the time of their state
 
     def go(self):
         """Take all samples; the steps' number."""
@@ -220,12 +225,29 @@ class Run:
         window = self.window[1 - len(estimate.trajectory) :]
         for fault in self.judge.faults(estimate, window, mean):
             self.fault(*fault)
+        if Status.RESTARTED in estimate.status:
+            self._of_restart(estimate)
         self.last = estimate.trajectory[1].copy()
+        self.states[self.time] = estimate.state.copy()
+        self.states.pop(self.time - 31, None)
         handed = [getattr(estimate, name) for name in (
             "trajectory", "candidate", "observer_state", "filtered", "disturbances", "noises",
             "state",
         )]
         scribble([*handed, self.mhe.state, self.mhe.observer_state, self.mhe.initial_state])
+
+    def _of_restart(self, estimate):
+        """The observer starts at the estimate of a horizon before, once in a horizon at most."""
+        case, horizon = self.case, self.case.options["horizon"]
+        self.counts["restarted"] += 1
+        if "restart" not in case.options:
+            self.fault("restarted against the option", estimate.status)
+        if self.time - 1 - self.restarted < horizon:
+            self.fault("restarted too early", (self.time, self.restarted))
+        self.restarted, projected = self.time, case.given["x"] is not None
+        start = self.states.get(self.time - horizon)
+        if not projected and (start is None or not np.array_equal(start, estimate.candidate[0])):
+            self.fault("restarted elsewhere", (start, estimate.candidate[0]))
 
     def _compare(self, estimate, y, inputs, given):
         if self.twin:
@@ -253,7 +275,8 @@ class Run:
             estimate, act, name != "set"  # done again, it would free the settings that C points to
         ))
         self.counts["compared"] += 1
-        if not 0.0 <= other.cost <= other.candidate_cost:
+        restored = Status.RESTORED in other.status
+        if not 0.0 <= other.cost <= (other.restored_cost if restored else other.candidate_cost):
             self.fault("cost of the Python step", (other.cost, other.candidate_cost))
         if difference:
             name = "" if name == "update" else f" after {name}"
@@ -330,7 +353,7 @@ class Run:
             self._snapshot(int(r.integers(4)))
         elif chance < 0.073:
             self._all("reset", lambda one, change: one.reset())
-            self.window, self.time, self.last = [], 0, None
+            self._forget()
 
     def _asked(self, name, function):
         try:
