@@ -15,6 +15,7 @@ _BRANCH = re.compile(r"^( *)if \(", re.M)
 _SIMPLER = (
     (re.compile(r"^ +\*?\w+ \|= 0;\n", re.M), ""),
     (re.compile(r" \|\| 0(?=\))|(?<=\()0 \|\| "), ""),
+    (re.compile(r" && !0\b|(?<![\w)])!0 && "), ""),
     (re.compile(r"\bif \([^()\n]* && 0\)"), "if (0)"),
 )
 # A statement may begin behind such a line, other than that of a condition or a loop.

@@ -403,7 +403,7 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
     constrained = layout.has_rows
     return (
         *(["sets"] if constrained else []), "trial", "damping", factor, *blocks,
-        _or_none("budget", layout.clock), "outcome", "trials",
+        "outcome", _or_none("budget", layout.clock), "trials",
         *((*rows, "outside") if constrained else ["sets_none"]), "optimizer",
         _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet), "improve",
     )

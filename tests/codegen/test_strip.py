@@ -137,6 +137,8 @@ COMPILERS = "_H$|__cplusplus|__GNUC__|__FAST_MATH__|__STDC_VERSION__|_WIN32|CASA
     ("    x = none(e) + 1;\n", "    x = 0 + 1;\n"),
     ("    if (a || none(e)) {\n        b();\n    }\n", "    if (a) {\n        b();\n    }\n"),
     ("    if (none(e)) return;\n    b();\n", "    b();\n"),
+    ("    x = !none(e) && b();\n", "    x = b();\n"),
+    ("    while (a && !none(e)) b();\n", "    while (a) b();\n"),
     ("    if (a == 1 && none(e))\n        c = b(2,\n              3);\n    b();\n", "    b();\n"),
     ("    if (one(e))\n        b();\n    b();\n", "    b();\n    b();\n"),
     # Branches that are decided, unless there is an alternative.

@@ -17,3 +17,11 @@ static int mhe_time_is_up(const mhe_workspace *k)
 {
     return k->clock && k->clock() > k->deadline;
 }
+
+/* Whether no time is left; it is an event then. */
+static int mhe_is_late(const mhe_workspace *k, mhe_outcome *o)
+{
+    if (!mhe_time_is_up(k)) return 0;
+    o->events |= MHE_TIME_UP;
+    return 1;
+}

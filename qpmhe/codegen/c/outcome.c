@@ -23,14 +23,6 @@ typedef struct {
 #define ENDS (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED | MHE_MODEL_FAILED | MHE_TIME_UP)
 #define OUTDATED (MHE_CONVERGED | MHE_NO_DECREASE | MHE_SOLVER_FAILED | MHE_CAP_REACHED)
 
-/* Whether no time is left; it is an event then. */
-static int mhe_is_late(const mhe_workspace *k, mhe_outcome *o)
-{
-    if (!mhe_time_is_up(k)) return 0;
-    o->events |= MHE_TIME_UP;
-    return 1;
-}
-
 /* Cost of the best trajectory as a trial. */
 static real mhe_best_cost(const mhe_outcome *o)
 {
