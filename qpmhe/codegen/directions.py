@@ -86,7 +86,7 @@ class Directions:
             if constraints.directions is not None:
                 shift = constraints.directions.offset
         if not basis.size:
-            basis = inverse = np.zeros(1)  # C has no arrays of length 0
+            basis = inverse = np.zeros((1, 1))  # C has no arrays of length 0
         return {"free": basis, "free_inverse": inverse, "shift": shift}
 
     def projections(self, system: System, cost: Cost) -> dict[str, Array]:
