@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 
 _SOLVER_FAILED = Status.SOLVER_FAILED.value
 _MESSAGE = "the factorisation failed: H is not positive definite, or not finite"
-
+# Numbers in the block before the trajectory: three costs.
+_COSTS = 3
 
 #: Flags of what may be worth a warning.
 WATCHED = (Status.ROWS_DROPPED | Status.OBSERVER_FAR).value
@@ -49,7 +50,7 @@ class CompiledEstimate(Estimate):
         self._sizes, self.dropped = sizes, dropped
         self._to_disturbances, self._rejected = to_disturbances, rejected
         n = sizes[0]
-        end = 2 + (numbers[0] + 1) * n
+        end = _COSTS + (numbers[0] + 1) * n
         self.state = block[end - n : end]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -74,32 +75,32 @@ class CompiledEstimate(Estimate):
 
     @property
     def restored_cost(self) -> float:  # type: ignore[override]
-        """NaN: the compiled step does not restore a candidate."""
-        return float("nan")
+        """J of the trajectory into which the candidate was restored; NaN if it was not."""
+        return float(self._block[2])
 
     @property
     def trajectory(self) -> Array:  # type: ignore[override]
         """Estimates of all states in the window."""
-        return self._rows(2, self._numbers[0] + 1, self._sizes[0])
+        return self._rows(_COSTS, self._numbers[0] + 1, self._sizes[0])
 
     @property
     def candidate(self) -> Array:  # type: ignore[override]
         """The observer's trajectory."""
         n, _, horizon = self._sizes
-        return self._rows(2 + (horizon + 1) * n, self._numbers[0] + 1, n)
+        return self._rows(_COSTS + (horizon + 1) * n, self._numbers[0] + 1, n)
 
     @property
     def disturbances(self) -> Array:
         """w(i) along the trajectory."""
         n, _, horizon = self._sizes
-        d = self._rows(2 + 2 * (horizon + 1) * n, self._numbers[0], n)
+        d = self._rows(_COSTS + 2 * (horizon + 1) * n, self._numbers[0], n)
         return d if self._to_disturbances is None else d @ self._to_disturbances.T
 
     @property
     def noises(self) -> Array:
         """v(i) along the trajectory, NaN where y is missing."""
         n, p, horizon = self._sizes
-        return self._rows(2 + 2 * (horizon + 1) * n + horizon * n, self._numbers[0], p)
+        return self._rows(_COSTS + 2 * (horizon + 1) * n + horizon * n, self._numbers[0], p)
 
     @property
     def status(self) -> Status:  # type: ignore[override]

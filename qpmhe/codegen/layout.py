@@ -90,6 +90,8 @@ class Layout:
     lapack: bool = False
     #: Whether there is a time budget, and a clock to keep it.
     clock: bool = False
+    #: Whether a candidate outside of the sets is restored into them at a higher cost.
+    restores: bool = False
     #: How outputs and states differ: 0 plainly, 1 by angles, 2 by functions.
     residuals: tuple[int, int] = (0, 0)
     #: Whether the set of states bounds angles.
@@ -110,7 +112,7 @@ class Layout:
     @classmethod
     def of(
         cls, directions: Directions, horizon: int, real: str = "double",
-        lapack: bool = False, clock: bool = False,
+        lapack: bool = False, clock: bool = False, restores: bool = False,
     ) -> Layout:
         """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
         system, observer, cost = directions.system, directions.observer, directions.cost
@@ -140,6 +142,7 @@ class Layout:
             sensors=len(observer.sensors), rejects=observer.rejects,
             observer_prior=cost.observer_prior is not None,
             lapack=lapack and system.n >= _LAPACK_STATES and directions.free is None, clock=clock,
+            restores=restores and any(there for there, _ in sets),
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
             free=directions.free, held=len(system.held),
@@ -235,9 +238,10 @@ class Layout:
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
         rejected = [("rejected", np.uint8, self.sensors)] if self.sensors else []
         return _struct([
-            ("cost", r), ("candidate_cost", r), ("trajectory", r, (count + 1, n)),
-            ("candidate", r, (count + 1, n)), ("disturbances", r, (count, n)),
-            ("noises", r, (count, p)), ("observer_state", r, n), ("filtered", r, n),
+            ("cost", r), ("candidate_cost", r), ("restored_cost", r),
+            ("trajectory", r, (count + 1, n)), ("candidate", r, (count + 1, n)),
+            ("disturbances", r, (count, n)), ("noises", r, (count, p)),
+            ("observer_state", r, n), ("filtered", r, n),
             ("time", np.int64), ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
             ("dropped", np.uint8, self.rows), *rejected,

@@ -48,11 +48,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"{name}, a function, has no C form ({residual.expression.reason}); take "
                 "qpmhe.angles, or engine='python'."
             )
-    if settings.infeasible == "restore":
-        return (
-            "engine='compiled' does not have infeasible='restore'; take infeasible='drop_rows', or "
-            "engine='python'."
-        )
     if settings.restart:
         return (
             "engine='compiled' does not have restart=True; leave it out, or take engine='python'."
@@ -207,7 +202,7 @@ def planned(
     directions = Directions(system, observer, cost)
     layout = Layout.of(
         directions, settings.horizon, real, lapack,
-        settings.time_budget is not None,
+        settings.time_budget is not None, settings.infeasible == "restore",
     )
     return layout, settings_record(
         layout, directions, system, directions.cost, settings, usual

@@ -193,7 +193,7 @@ class _Guide:
         found, outcome = self.found, Outcome(problem.candidate)
         self.violation, usual = 0.0, problem
         known = _magnitude(problem, problem.candidate)
-        if Status.IMPROVED in found.status:
+        if found.status & (Status.IMPROVED | Status.RESTORED):
             self.improved += 1
             if Status.ROWS_DROPPED in found.status:
                 problem = problem.without_violated()
@@ -203,6 +203,7 @@ class _Guide:
                 found.trajectory * self.nudge, roll_out=np.ndim(self.nudge) > 0
             )
             outcome.improved, outcome.dropped = True, found.dropped
+            outcome.events |= found.status & Status.RESTORED
             self.violation = outcome.trial.violation
         elif not (self.improved or np.ndim(self.nudge) or known > _CANCELLED * abs(found.cost)):
             best = self.optimizer.improve(problem, shifted).trial.cost
@@ -375,11 +376,11 @@ class _Rehearsal:
             size = abs(true) + self._python.guide.magnitudes[name]
             if not abs(got - true) <= _WEIGHT * abs(other - true) + ROUNDING * size:
                 return f"J of {what} is {got:.6g}, by CasADi's interpreter {true:.6g}"
-        if not found.cost <= found.candidate_cost:
-            return (
-                f"J of the estimate, {found.cost:.6g}, is above the candidate's "
-                f"{found.candidate_cost:.6g}"
-            )
+        limit, whose = found.candidate_cost, "the candidate"
+        if Status.RESTORED in found.status:
+            limit, whose = found.restored_cost, "the restored candidate"
+        if not found.cost <= limit:
+            return f"J of the estimate, {found.cost:.6g}, is above {limit:.6g}, that of {whose}"
         states = abs(np.vstack((expected.candidate, expected.trajectory))).max(axis=0)
         window = self._python.memory.window
         if window.projects and window.covariance is not None:

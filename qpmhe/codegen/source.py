@@ -404,8 +404,10 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
     return (
         *(["sets"] if constrained else []), "trial", "damping", factor, *blocks,
         "outcome", _or_none("budget", layout.clock), "trials",
-        *((*rows, "outside") if constrained else ["sets_none"]), "optimizer",
-        _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet), "improve",
+        *((*rows, _or_none("restoring", layout.restores), "outside") if constrained
+          else ["sets_none"]),
+        "optimizer", _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet),
+        "improve",
     )
 
 

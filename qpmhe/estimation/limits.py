@@ -87,7 +87,7 @@ def c_definitions(prefix: str, real: str) -> str:
         "NO_VARIANCE": NO_VARIANCE, "KNOWN": KNOWN, "SAME_COVARIANCE": SAME_COVARIANCE,
         "IN_RANGE": IN_RANGE, "GROWTH": GROWTH, "VAGUE": VAGUE, "DAMPING": DAMPING,
         "MOST_DAMPING": MOST_DAMPING, "MORE_DAMPING": MORE_DAMPING,
-        "LESS_DAMPING": LESS_DAMPING, "OLD_DAMPING": OLD_DAMPING,
+        "LESS_DAMPING": LESS_DAMPING, "OLD_DAMPING": OLD_DAMPING, "TOWARDS": TOWARDS,
     }
     if real == "float":
         values |= _SINGLE
@@ -96,6 +96,7 @@ def c_definitions(prefix: str, real: str) -> str:
     lines.append(f"#define {prefix}_MOST_GROWTH {MOST_GROWTH}")
     lines.append(f"#define {prefix}_LONGEST {LONGEST}")
     lines.append(f"#define {prefix}_NEAREST_POINTS {NEAREST_POINTS}")
+    lines.append(f"#define {prefix}_RESTORING {RESTORING}")
     for name, lengths in (("LENGTHS", LENGTHS), ("ALONG", ALONG)):
         listed = ", ".join(f"({real}){length!r}" for length in lengths)
         lines.append(f"#define {prefix}_{name} {{{listed}}}")

@@ -539,6 +539,8 @@ SMALL = {"disturbances": Box([-0.05, -0.08], [0.1, 0.06])}
 SINGULAR = {"prior": np.diag([1.0, 0.0, 0.5]), "disturbance": np.diag([0.02, 0.0, 0.0])}
 AGAIN, WARM, ALONE = {"candidate": "reinitialized"}, {"warm_start": True}, {"max_qps": 0}
 ONE, MANY, SMOOTH = {"max_qps": 1}, {"max_qps": None}, {"arrival": "smoothed"}
+RESTORE = {"infeasible": "restore", "solver_tolerance": 1e-12}
+BESIDE = {"disturbances": Box([0.2, -0.5, -0.5], [1.0, 0.5, 0.5])}
 DIAGONAL = {"projection_metric": "diagonal"}
 METRIC = by(lambda one: Luenberger([0.8, -0.3], metric=[[2.0, 1.0], [1.0, 1.0]]))
 LEAVING = by(lambda one: Luenberger([[0.6, 0.0], [0.3, -0.4], [0.1, 0.7]]))
@@ -659,6 +661,25 @@ FEATURES = {
             states=Box([0.0, -0.2, -2.0], [0.6, 0.4, 2.0]),
             disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
         ), conditions),
+    },
+    # Their candidates leave sets that hold no trajectory at a cost as low.
+    "restored": {
+        "restored": (lambda: _inputs(**BESIDE), gaps, conditions, RESTORE),
+        "restored reinitialized": (lambda: _inputs(**BESIDE), AGAIN, ONE, RESTORE),
+        "restored, fewer disturbances": (lambda: _fewer(
+            disturbances=Box([0.1, -0.05], [0.5, 0.3]), noises=Box([-0.4, -0.4], [0.4, 0.4])
+        ), MANY, RESTORE),
+        "restored, graduated": (
+            lambda: _inputs(disturbances=Box([0.2, -INF, -INF], [INF, INF, INF])),
+            losses(noise=partial(qpmhe.Cauchy, threshold=0.8)), {"horizon": 8}, WARM, RESTORE,
+        ),
+        "restored extended": (
+            lambda: _inputs(**BESIDE, noises=Box([-1.0, -1.0], [1.0, 1.0])), filtered(), MANY,
+            RESTORE,
+        ),
+        "restored noise-free": (
+            lambda: _inputs(disturbances=Box([0.1, 0.01, -0.5], [0.5, 0.01, 0.5])), gaps, RESTORE,
+        ),
     },
     "conditions": {
         # Bounds on one side and on both, and an observer that leaves them.

@@ -17,7 +17,8 @@
  *
  * Components of y that are not finite are missing. The observer is projected onto the set of states,
  * if there is one, after each step. After each update
- * estimate.cost <= estimate.candidate_cost: both are the true cost of the nonlinear problem.
+ * estimate.cost <= estimate.candidate_cost: both are the true cost of the nonlinear problem. With
+ * MHE_RESTORED in its status, estimate.cost <= estimate.restored_cost instead.
  *
  * For a sample with other conditions, such as another weight, call mhe_update_special. For other
  * settings at all samples, copy the settings, change the copy, and call mhe_set.$clock_text
@@ -188,6 +189,7 @@ $estimator_members
 
 typedef struct {
     mhe_real cost, candidate_cost;
+    mhe_real restored_cost; /* with MHE_RESTORED, the limit of cost in place of candidate_cost; else NaN */
     mhe_real trajectory[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real candidate[(MHE_HORIZON + 1) * MHE_NX];
     mhe_real disturbances[MHE_HORIZON * MHE_NX];

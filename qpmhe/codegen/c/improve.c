@@ -35,6 +35,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     mhe_set_prior(e, k);
     mhe_begin_further(e, k);
     memset(o, 0, sizeof *o);
+    o->restored_cost = NAN;
     o->damping = e->damping;
     mhe_set_widening(k, s, 0);
     mhe_recall_places(e, k);
@@ -55,5 +56,8 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     mhe_keep_places(e, k);
     e->damping = o->damping;
     if (s->uncapped && o->qps >= s->max_qps && !(o->events & ENDS)) o->events |= MHE_UNCONVERGED;
-    o->events |= o->best != o->candidate ? MHE_IMPROVED : MHE_CANDIDATE;
+    if (o->best == o->candidate)
+        o->events |= MHE_CANDIDATE;
+    else if (!(o->events & MHE_RESTORED)) /* better than no candidate, but in the sets */
+        o->events |= MHE_IMPROVED;
 }

@@ -11,6 +11,7 @@ typedef struct {
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
     int unsolved;   /* the last QPs that were not solved to the tolerance */
     int followed;   /* the next step starts from a surrogate's minimiser */
+    real restored_cost; /* of the trajectory into which the candidate was restored */
     real damping;   /* with which a search for a shorter step begins, at least */
     real present, growth; /* that of the present QP, and what it is multiplied with next */
     int has_seen;   /* its scale is known */

@@ -4,10 +4,12 @@
 static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
     const int limit = e->settings->max_qps, start = e->settings->start_at_best ? before : -1;
+    real nearest = INFINITY;
     o->outside = 1;
     mhe_search(e, k, o, start, limit);
     if (!isfinite(mhe_best_cost(o))) {
         int found = mhe_feasible_near(e, k, o, o->candidate);
+        if (found) nearest = o->spare->cost;
         if (!found && before >= 0) {
             mhe_shift(e, k, o, before);
             found = isfinite(o->spare->cost) || mhe_feasible_near(e, k, o, o->spare);
@@ -17,8 +19,11 @@ static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
             mhe_search(e, k, o, -1, limit - o->qps);
         }
     }
+    const int is_done =
+        mhe_best_cost(o) < o->candidate->cost || mhe_enter_sets(e, k, o, nearest, before);
     o->outside = 0;
-    if (o->best != o->candidate && o->best->cost < o->candidate->cost) return;
+    (void)nearest; /* where nothing is restored, nobody asks for it */
+    if (is_done) return;
     if (o->best != o->candidate) o->spare = o->best;
     o->best = o->candidate;
     if (mhe_is_late(k, o)) return;

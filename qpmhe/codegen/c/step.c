@@ -85,6 +85,7 @@ static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome
     }
     out->cost = best->cost;
     out->candidate_cost = o->candidate->cost;
+    out->restored_cost = o->restored_cost;
     out->time = e->time - 1;
     out->length = count;
     out->status = o->events;

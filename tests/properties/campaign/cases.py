@@ -18,7 +18,7 @@ OBSERVERS = {
     "zero": 0.05, "gate": 0.12, "huber": 0.08,
 }
 # Options that the step in C does not have.
-NOT_IN_C = ("infeasible", "restart")
+NOT_IN_C = ("restart",)
 # Observers without a covariance.
 PLAIN = ("luenberger", "injection", "zero")
 

@@ -1,0 +1,62 @@
+/* A candidate outside of the sets that is restored into them, whatever that costs. */
+
+/* Approach the sets from a trial, by QPs in the metric of the Hessian, with shorter steps where a full
+ * one does not lower the miss; the last trial on the way. */
+static mhe_trial *mhe_approach(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
+                               mhe_trial *around)
+{
+    const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
+    for (int i = 0; i < MHE_RESTORING && (around == o->candidate || !isfinite(around->cost)); i++) {
+        mhe_trial *ahead = around == o->spare ? o->other : o->spare;
+        int is_nearer = 0;
+        if (!mhe_linearize(e, k, o, around) || mhe_is_late(k, o)) break;
+        const int status = mhe_solve_qp(e, k, o, around, 1, 0);
+        o->nearest_points++;
+        if (status == FAILED) break;
+        for (int j = 0; j < count && !is_nearer; j++) {
+            const real length = j ? mhe_lengths[j] : 1;
+            mhe_step_from(e, k, around, length, ahead);
+            is_nearer = ahead->violation < (1 - MHE_TOWARDS * length) * around->violation;
+        }
+        if (!is_nearer) break;
+        around = ahead;
+    }
+    return around;
+}
+
+/* Improve the nearest feasible trajectory to the candidate; whether there is one. `nearest`: the cost of
+ * that which the search has started from, infinite if there is none. */
+static int mhe_enter_sets(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real nearest, int before)
+{
+    const int left = e->settings->max_qps - o->qps;
+    const real found = mhe_best_cost(o);
+    mhe_trial *trial = o->candidate;
+    if (!isfinite(nearest)) trial = mhe_approach(e, k, o, trial);
+    if (trial == o->candidate || !isfinite(trial->cost)) {
+        trial = 0;
+        if (!isfinite(nearest) && !isfinite(found) && before >= 0) {
+            mhe_shift(e, k, o, before);
+            trial = mhe_approach(e, k, o, o->spare);
+            if (!isfinite(trial->cost)) trial = 0;
+        }
+    }
+    if (trial) nearest = trial->cost;
+    if (!isfinite(nearest)) nearest = found;
+    if (!isfinite(nearest)) return 0;
+    o->restored_cost = nearest;
+    o->events |= MHE_RESTORED;
+    if (nearest <= found) {
+        if (trial == o->other) {
+            o->other = o->spare;
+            o->spare = trial;
+        }
+        if (trial) mhe_take(k, o);
+        o->events &= ~OUTDATED;
+        mhe_search(e, k, o, -1, left > 1 ? left : 1);
+    }
+    if (mhe_best_cost(o) < o->candidate->cost) {
+        o->restored_cost = NAN;
+        o->events &= ~MHE_RESTORED;
+    }
+    return 1;
+}
