@@ -2,6 +2,7 @@
 
 from .audit import Assumption
 from .certificate import Certificate, certify
+from .content import Content
 from .contraction import Synthesis, certify_detectability, certify_observer, synthesise_gain
 from .evidence import (
     CertificateError,
@@ -16,12 +17,13 @@ from .observer_bound import Band, ObserverBound
 from .properties import Detectability, ObserverStability
 from .regions import Region
 from .sizes import Sizes
+from .stored import load, save
 from .theorem import DecayingSums, TheoremConstants
 
 __all__ = [
-    "Assumption", "Band", "Certificate", "CertificateError", "DecayingSums", "Design",
+    "Assumption", "Band", "Certificate", "CertificateError", "Content", "DecayingSums", "Design",
     "Detectability", "Evidence", "MismatchError", "Monitor", "NotCertifiedError",
     "ObserverBound", "ObserverStability", "OutOfTimeError", "Reading", "Region", "Sizes",
     "Synthesis", "TheoremConstants", "certify", "certify_detectability",
-    "certify_observer", "design", "synthesise_gain",
+    "certify_observer", "design", "load", "save", "synthesise_gain",
 ]

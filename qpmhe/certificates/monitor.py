@@ -17,6 +17,7 @@ from ..estimation.estimator import MovingHorizonEstimator
 from ..terms.hold import Hold
 from ..terms.sum import further_terms
 from .certificate import Certificate
+from .content import Content
 from .evidence import MismatchError
 from .measured_cost import MeasuredCost
 from .observer_bound import CONTRADICTION, REINITIALIZED, ObserverBound, largest_ratio
@@ -90,8 +91,8 @@ class Monitor:
     ShapeError, OptionError, SetError, InvalidInputError
         If an argument does not fit, or there is no bound of the observer.
     MismatchError
-        If the certificate is for another system or gain than the estimator's, or the system has
-        changed since.
+        If the estimator's system or gain is another than was certified: see
+        `ObserverStability.difference`.
 
     Attributes
     ----------
@@ -137,14 +138,12 @@ class Monitor:
                 "certificate.bound(run, initial_error=...)."
             )
         self._system = estimator.system
-        own = certified.system if isinstance(certified, Certificate) else bound.stability.system
-        if own not in (None, self._system):
-            raise MismatchError(
-                "the bound is for another System object than the estimator's; certify the same "
-                "objects that the estimator uses."
-            )
         self._model = bound.stability.model
-        changed = "" if self._model is None else self._model.difference(self._system)
+        changed = bound.stability.difference(self._system)
+        if not changed and bound.stability.content is None and isinstance(certified, Certificate):
+            changed = Content.of_system(certified.system).difference(
+                Content.of_system(self._system), certified.system is self._system
+            )
         if changed:
             raise MismatchError(
                 f"the estimator's system is another than was certified: {changed}; certify the "

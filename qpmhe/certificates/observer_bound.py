@@ -32,6 +32,7 @@ from ..estimation.run import Run
 from ..model.sets import Box, ConvexSet
 from ..model.system import System
 from ..observers import Observer
+from .content import Content
 from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
 from .enclosures import evaluated
@@ -143,6 +144,14 @@ class ObserverBound:
     def evidence(self) -> Evidence:
         """The evidence for the bound."""
         return self.stability.evidence
+
+    @property
+    def content(self) -> Content | None:
+        """Digests of all that the bound is about; None if its constants were stated."""
+        own, sizes = self.stability.content, self.sizes
+        return None if own is None else own.on(
+            self.region, disturbance=sizes.disturbance, noise=sizes.noise
+        )
 
     @property
     def rate(self) -> float:
@@ -328,9 +337,9 @@ class ObserverBound:
         ShapeError, OptionError, SetError, InvalidInputError
             If an argument does not fit.
         MismatchError
-            If the run's estimator is known, and has another gain, or a model with other values of f
-            or h: at points of the region, from those that were certified, or at the run's states,
-            from those of the certified system.
+            If the run's estimator is known, and has another gain or another system: see
+            `ObserverStability.difference`. At the run's states, values of f and h are compared
+            with those of the certified system, too.
         """
         if not isinstance(run, Run):
             raise InvalidInputError(
@@ -520,9 +529,8 @@ def _check_model(
     """Refuse a run of another model: by certified values, and at the run's states by the system."""
     certified = stability.system
     for who, system in (("the system", certified), ("the run's system", used)):
-        changed = ""
-        if stability.model is not None and system is not None:
-            changed = stability.model.difference(system)
+        # Values of functions without an expression are compared at all states of the run below.
+        changed = "" if system is None else stability.difference(system, certified is not None)
         if changed:
             raise MismatchError(
                 f"{who} is another than was certified: {changed}; certify the system of the run."

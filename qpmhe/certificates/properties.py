@@ -10,6 +10,7 @@ import numpy as np
 from .._checks import Array, positive
 from ..model.sets import ConvexSet
 from ..model.system import System
+from .content import Content
 from .evidence import Evidence, MismatchError, json_ready
 from .model_values import ModelValues
 from .regions import Region, beyond, stated_region
@@ -29,6 +30,20 @@ class _Certified:
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
     system: System | None = field(default=None, init=False, repr=False)
     model: ModelValues | None = field(default=None, init=False, repr=False)
+    content: Content | None = field(default=None, init=False, repr=False)
+
+    def difference(self, system: System, by_values: bool = False) -> str:
+        """In what a system differs from the certified one, in words; blank if it does not.
+
+        Values of f and h at points of the region are compared, then the expressions and sets.
+        Where a function has no expression, another System object differs unless values are to do
+        (``by_values``).
+        """
+        found = "" if self.model is None else self.model.difference(system)
+        if not found and self.content is not None:
+            by_values = by_values or system is self.system
+            found = self.content.difference(Content.of_system(system), by_values)
+        return found
 
     @property
     def entry(self) -> Array | None:
@@ -41,7 +56,7 @@ class _Certified:
 
     def to_dict(self) -> dict[str, Any]:
         """All but region and model, in types that JSON knows; infinite numbers become None."""
-        left_out = ("region", "system", "model")
+        left_out = ("region", "system", "model", "content")
         content: dict[str, Any] = json_ready(
             {name: value for name, value in vars(self).items() if name not in left_out}
         )
@@ -86,6 +101,9 @@ class Detectability(_Certified):
         The certified system; None for constants made or changed by hand, or copied.
     model : ModelValues or None
         Values of f and h when it was certified; None for constants made or changed by hand.
+    content : Content or None
+        Digests of what was certified: expressions, sets and gain; None for constants made or
+        changed by hand.
     """
 
     eta: float
@@ -140,7 +158,7 @@ class ObserverStability(_Certified):
     room : (p,) array or None
         Below what each noise must be for angles among the outputs, so that no innovation wraps;
         infinite for other outputs, None without angles.
-    evidence, region, notes, cells, system, model
+    evidence, region, notes, cells, system, model, content
         As for `Detectability`.
     """
 
@@ -184,8 +202,11 @@ def sealed(result: Result, system: System, evidence: Evidence) -> Result:
         if isinstance(value, np.ndarray):
             vars(result)[name] = value = value.copy()
             value.setflags(write=False)
-    model = None if result.region is None else ModelValues.of(system, result.region)
-    vars(result).update(system=system, model=model, evidence=evidence)
+    model = content = None
+    if result.region is not None:
+        model = ModelValues.of(system, result.region)
+        content = Content.of(system, result.region, getattr(result, "gain", None))
+    vars(result).update(system=system, model=model, content=content, evidence=evidence)
     return result
 
 
@@ -205,12 +226,12 @@ def fitting(part: Result, system: System, region: Region, gain: Array | None) ->
             f"the {what} that was passed is for the gain {own.tolist()}; the observer's is "
             f"{theirs}. Certify this observer."
         )
-    if part.evidence is not Evidence.ASSUMED and part.system is not system:
+    changed = part.difference(system)
+    if changed and part.system is not system:
         raise MismatchError(
-            f"the {what} that was passed is for another System object. Certify this system, or "
+            f"the {what} that was passed is for another system: {changed}. Certify this system, or "
             f"state the constants: {type(part).__name__}.assumed(...)."
         )
-    changed = "" if part.model is None else part.model.difference(system)
     if changed:
         raise MismatchError(
             f"the system has changed since the {what} that was passed was certified: {changed}. "

@@ -144,6 +144,10 @@ def certify(
     report: Annotated[
         Path | None, typer.Option(help="Write all results to this JSON file.")
     ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the observer's bound to this JSON file, for "
+                                       "qpmhe.certificates.load.")
+    ] = None,
     input_box: Annotated[
         str | None, typer.Option(help="Bounds on the inputs, in the form of --box.")
     ] = None,
@@ -163,8 +167,8 @@ def certify(
     from .certify import certify as run
 
     certified = run(
-        Console(), model, box, horizon, report, input_box=input_box, seed=seed, seconds=seconds,
-        details=details, with_design=design,
+        Console(), model, box, horizon, report, out=out, input_box=input_box, seed=seed,
+        seconds=seconds, details=details, with_design=design,
     )
     if not certified:
         raise typer.Exit(1)

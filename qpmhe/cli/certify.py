@@ -18,6 +18,7 @@ from ..certificates.lyapunov import Design, design
 from ..certificates.regions import Region
 from ..certificates.report import Report, certify_model
 from ..certificates.sizes import intervals
+from ..certificates.stored import save
 from ..certificates.theorem import DecayingSums
 from ..errors import OptionError
 from ..models.loading import build, find
@@ -29,17 +30,18 @@ Rows = list[tuple[str, str]]
 
 def certify(
     console: Console, model: str, box: str | None = None, horizon: str | None = None,
-    report: Path | None = None, *, input_box: str | None = None, seed: int = 0,
-    seconds: float = 60.0, details: bool = False, with_design: bool = False,
+    report: Path | None = None, *, out: Path | None = None, input_box: str | None = None,
+    seed: int = 0, seconds: float = 60.0, details: bool = False, with_design: bool = False,
 ) -> bool:
     """Certify a model, and show the result."""
     horizons = _horizons(horizon)
-    if report is not None:  # before any work
-        if report.suffix != ".json":
+    for option, file in (("--report", report), ("--out", out)):  # before any work
+        if file is not None and file.suffix != ".json":
             raise OptionError(
-                f"--report is {str(report)!r}; expected a file name that ends with .json."
+                f"{option} is {str(file)!r}; expected a file name that ends with .json."
             )
-        make_folder(report.parent)
+        if file is not None:
+            make_folder(file.parent)
     source = find(model)
     (system, observer, cost), options = model_parts(source.name, build(source))
     scenario = options.get("scenario")
@@ -80,8 +82,15 @@ def certify(
             report.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
         except OSError as error:
             raise OptionError(f"cannot write --report {report}: {error.strerror}.") from error
-        console.print(f"wrote {escape(str(report))}", highlight=False, soft_wrap=True)
+        _wrote(console, report)
+    if out is not None and certificate.observer_bound is not None:
+        save(certificate.observer_bound, out)
+        _wrote(console, out)
     return certificate.holds
+
+
+def _wrote(console: Console, file: Path) -> None:
+    console.print(f"wrote {escape(str(file))}", highlight=False, soft_wrap=True)
 
 
 def _print(console: Console, text: str) -> None:

@@ -129,11 +129,14 @@ def test_parts_serve_on_the_region_and_on_a_smaller_one_alone(parts):
     certificate = certify(system, GAIN, COST, horizon=2, region=box(-0.2, 0.2), **given)
     assert certificate.evidence is Evidence.PROVED
     assert certificate.diameter == pytest.approx(0.4)
+    # The content counts, not the System object.
+    assert certify(cubic(), GAIN, COST, horizon=2, region=box(-0.2, 0.2), **given).holds
     detected, stability = given.values()
     for target, observer, side, used, words in (
         (system, GAIN, 0.99, stability, r"stability.*x\[0\] <= 0.3 .*0.99.*Certify it"),
         (system, GAIN, 0.99, detected, "detectability.*Certify it"),
-        (cubic(), GAIN, 0.3, stability, r"another System object.*assumed\("),
+        (scalar(lambda x: x**3 + 1e-12 * x), GAIN, 0.3, stability,
+         r"another system: f differs.*assumed\("),
         (system, qpmhe.Luenberger([[0.2]]), 0.3, stability, r"gain \[\[0.1\]\].*0.2"),
         (system, qpmhe.OutputInjection(lambda z, v: 0.1 * v), 0.3, stability, "is not constant"),
     ):

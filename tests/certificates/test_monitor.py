@@ -292,11 +292,12 @@ def test_what_the_theorem_does_not_cover_leaves_the_observers_bound(certificate)
 def test_a_monitor_is_for_one_estimator(certificate):
     bound, mhe = certificate.observer_bound, estimator(certificate)
     other = estimator(certificate, observer=qpmhe.Luenberger(2.0 * GAIN))
+    nine = box([-9.0, -9.0], [9.0, 9.0])
     for asked, error, words in (
         (lambda: bound.along(other.run(record()[1]), initial_error=START), MismatchError,
          r"\[\[0.4\], \[0.1\]\]; the estimator's is \[\[0.8\]"),
-        (lambda: followed(certificate, estimator(certificate, system=plant())), MismatchError,
-         "another System object"),
+        (lambda: followed(certificate, estimator(certificate, system=plant(states=nine))),
+         MismatchError, "the set X differs"),
         (lambda: Monitor(None, mhe, initial_error=START), InvalidInputError, "NoneType; expected"),
         (lambda: Monitor(certificate, mhe, initial_error=1.0).state_dict(), InvalidInputError,
          r"pass certificate\.observer_bound"),

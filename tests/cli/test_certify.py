@@ -161,3 +161,21 @@ def test_angles_are_certified_where_they_do_not_wrap():
         certificates.certify_observer(system, observer, place, sizes=(0.1, 1.2))
     with pytest.raises(certificates.CertificateError, match="the system has angles"):
         certificates.certify_detectability(system, place)
+
+
+def test_out_writes_the_bound_for_load(shown, tmp_path):
+    file = tmp_path / "kept" / "two.json"
+    done, text, _ = shown(box=SQUARE, out=file)
+    assert done
+    assert f"wrote {file}" in text
+    system, observer = find_parts(tmp_path)
+    found = certificates.load(file, system, observer)
+    assert text.splitlines()[0] == found.headline
+    with pytest.raises(OptionError, match=r"--out is .*json"):
+        shown(box=SQUARE, out=tmp_path / "two.toml")
+
+
+def find_parts(folder):
+    namespace = {}
+    exec(compile((folder / "two.py").read_text(), "two.py", "exec"), namespace)
+    return namespace["model"]()[:2]
