@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,13 @@ _PROJECTIONS = (None, "observer", "diagonal")
 _LEAST_SINGLE = 1e-6
 
 
+_SET_TYPE = Template("""typedef struct {
+    mhe_real lower[$n], upper[$n], scale[$n], deviation[$n];
+    mhe_real rows[$count * $n];
+    mhe_real row_lower[$count], row_upper[$count], row_scale[$count], row_deviation[$count];
+    uint8_t row_fixed[$count]; /* rows that are never dropped */
+} mhe_${letter}_set;
+""")
 # Parts with numbers of their own, in words, other than terms, observer and innovation.
 _PARTS = {
     "covariances": "the observer's covariances", "elimination": "directions that have disturbances",
@@ -180,6 +188,12 @@ class Layout:
             "stage_members": self.sizes.c_text(True),
             "estimator_members": self.sizes.c_text(False),
         }
+        values["set_members"] = "\n".join(
+            _SET_TYPE.substitute(
+                letter=one, count=f"MHE_SIZE(MHE_{one.upper()}_ROWS)",
+                n="MHE_NY" if one == "v" else "MHE_NX",
+            ) for one in "wvx"
+        )
         values["part_types"], values["part_fields"] = self._part_types(name)
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
@@ -252,9 +266,10 @@ class Layout:
         r, k = self.number, SET_NAMES.index(name)
         size, space = (self.nx, self.ny, self.nx)[k], max(self.sets[k][1], 1)
         return _struct([
-            ("lower", r, size), ("upper", r, size), ("scale", r, size), ("rows", r, space * size),
-            ("row_lower", r, space), ("row_upper", r, space), ("row_scale", r, space),
-            ("deviation", r, size), ("row_deviation", r, space), ("row_fixed", np.uint8, space),
+            *((name, r, size) for name in ("lower", "upper", "scale", "deviation")),
+            ("rows", r, space * size),
+            *((f"row_{name}", r, space) for name in ("lower", "upper", "scale", "deviation")),
+            ("row_fixed", np.uint8, space),
         ])
 
     def sample_type(self) -> np.dtype[Any]:

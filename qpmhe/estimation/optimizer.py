@@ -402,6 +402,15 @@ class Optimizer:
         if damping and not self._uncapped:
             outcome.events |= Status.CAP_REACHED
 
+    def _nearest_step(self, problem: Problem, outcome: Outcome, trial: Trial) -> Array | None:
+        """The step to the nearest point of the linearised sets; None where no QP gives one."""
+        qp = self._subproblem.nearest_point(problem, trial)
+        solution = None if qp is None else self._solve(qp, outcome)
+        if solution is None:
+            return None
+        outcome.nearest_points += 1
+        return solution.d
+
     def _feasible_near(self, problem: Problem, outcome: Outcome, trial: Trial) -> Trial:
         """A feasible trajectory near an infeasible one, by QPs in the metric of the Hessian.
 
@@ -413,14 +422,10 @@ class Optimizer:
                 return nearest
             if outcome.nearest_points >= NEAREST_POINTS * (1 + outcome.qps):
                 break
-            qp = self._subproblem.nearest_point(problem, nearest)
-            solution = None if qp is None else self._solve(qp, outcome)
-            if solution is None:
+            step = self._nearest_step(problem, outcome, nearest)
+            if step is None:
                 break
-            outcome.nearest_points += 1
-            if solution.d is None:
-                break
-            before, nearest = nearest, self._trial(problem, nearest, solution.d)
+            before, nearest = nearest, self._trial(problem, nearest, step)
             if not nearest.violation < NEARER * before.violation:
                 break
         return nearest if nearest.cost < math.inf else trial
@@ -433,15 +438,11 @@ class Optimizer:
         for _ in range(RESTORING):
             if trial.cost < math.inf:
                 break
-            qp = self._subproblem.nearest_point(problem, trial)
-            solution = None if qp is None else self._solve(qp, outcome)
-            if solution is None:
-                break
-            outcome.nearest_points += 1
-            if solution.d is None:
+            step = self._nearest_step(problem, outcome, trial)
+            if step is None:
                 break
             for length in (1.0, *LENGTHS[1:]):
-                ahead = self._trial(problem, trial, length * solution.d)
+                ahead = self._trial(problem, trial, length * step)
                 if ahead.violation < (1.0 - TOWARDS * length) * trial.violation:
                     break
             else:

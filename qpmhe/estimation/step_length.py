@@ -52,16 +52,8 @@ class StepComparison:
 
     Parameters
     ----------
-    system : System
-        The system.
-    cost : Cost
-        Its covariances are the units.
-    covariance : (n, n) array or None
-        The observer's covariance of the initial error, for a prior weight that is the observer's.
-    state : (n,) array
-        The initial state.
-    u : (m,) array
-        The usual input.
+    system, cost, covariance, state, u
+        As for `reached`.
     """
 
     def __init__(

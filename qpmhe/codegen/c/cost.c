@@ -41,3 +41,17 @@ static real mhe_stage_cost(const mhe_settings *s, const mhe_workspace *k, const 
                     w) +
            mhe_lost(&s->noise_loss, mhe_v_widening(k), NY, stage->noise_weight, v);
 }
+
+/* following = Q w, and what the QP's factorisation needs, as sums of products of A and C, which are in
+ * place, with Q and R: of the form that touches the cost. */
+static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
+                          const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
+{
+    const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
+    (void)work;
+    mhe_scale_weights(s, work, stage, Q, w, v, t);
+    mhe_times(NX, Q, w, t->following);
+    for (int i = 0; i < NX; i++)
+        t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
+    mhe_set_own_terms(Q, R, w, v, t);
+}

@@ -149,18 +149,12 @@ static void mhe_solve_transposed(int n, const real *U, real *side)
     }
 }
 
-/* own = -(A' Q w + C' R v), following = Q w; A and C are in place. Q and R are of the form that touches
- * the cost. */
-static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
-                          const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
+/* own = -(A' Q w + C' R v). */
+static void mhe_set_own_terms(const real *Q, const real *R, const real *w, const real *v,
+                              mhe_terms *t)
 {
-    (void)work;
     const real *A = t->f_jacobian, *C = t->h_jacobian;
-    const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
-    mhe_scale_weights(s, work, stage, Q, w, v, t);
-    mhe_times(NX, Q, w, t->following);
-    for (int i = 0; i < NX; i++)
-        t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
+    (void)Q; (void)w;
     for (int j = 0; j < NX; j++) t->own[j] = 0;
     for (int k = 0; k < NX; k++)
         for (int j = 0; j < NX; j++) t->own[j] -= t->following[k] * A[k * NX + j];

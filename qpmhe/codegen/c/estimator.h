@@ -89,24 +89,7 @@ enum {
 /* A convex set: lower <= s <= upper, row_lower <= rows s <= row_upper. A miss of an inequality
  * counts as a share of its scale, in the same unit: its width, or its standard deviation if that
  * is less. */
-typedef struct {
-    mhe_real lower[MHE_NX], upper[MHE_NX], scale[MHE_NX];
-    mhe_real rows[MHE_SIZE(MHE_W_ROWS) * MHE_NX];
-    mhe_real row_lower[MHE_SIZE(MHE_W_ROWS)], row_upper[MHE_SIZE(MHE_W_ROWS)];
-    mhe_real row_scale[MHE_SIZE(MHE_W_ROWS)];
-    mhe_real deviation[MHE_NX], row_deviation[MHE_SIZE(MHE_W_ROWS)];
-    uint8_t row_fixed[MHE_SIZE(MHE_W_ROWS)]; /* rows that are never dropped */
-} mhe_w_set;
-
-typedef struct {
-    mhe_real lower[MHE_NY], upper[MHE_NY], scale[MHE_NY];
-    mhe_real rows[MHE_SIZE(MHE_V_ROWS) * MHE_NY];
-    mhe_real row_lower[MHE_SIZE(MHE_V_ROWS)], row_upper[MHE_SIZE(MHE_V_ROWS)];
-    mhe_real row_scale[MHE_SIZE(MHE_V_ROWS)];
-    mhe_real deviation[MHE_NY], row_deviation[MHE_SIZE(MHE_V_ROWS)];
-    uint8_t row_fixed[MHE_SIZE(MHE_V_ROWS)];
-} mhe_v_set;
-
+$set_members
 enum {
     MHE_QUADRATIC = 0, MHE_HUBER = 1, MHE_POWER = 2,
     MHE_OWN_PRIOR = 3, MHE_OWN_DISTURBANCE = 4, MHE_OWN_NOISE = 5 /* the user's function */
@@ -119,15 +102,6 @@ typedef struct {
     mhe_real graduation;       /* by what it is widened at the first sample; 1 for none */
     int32_t kind, per_component;
 } mhe_loss;
-
-typedef struct {
-    mhe_real lower[MHE_NX], upper[MHE_NX], scale[MHE_NX];
-    mhe_real rows[MHE_SIZE(MHE_X_ROWS) * MHE_NX];
-    mhe_real row_lower[MHE_SIZE(MHE_X_ROWS)], row_upper[MHE_SIZE(MHE_X_ROWS)];
-    mhe_real row_scale[MHE_SIZE(MHE_X_ROWS)];
-    mhe_real deviation[MHE_NX], row_deviation[MHE_SIZE(MHE_X_ROWS)];
-    uint8_t row_fixed[MHE_SIZE(MHE_X_ROWS)];
-} mhe_x_set;
 
 /* Matrices are stored by rows. Weights are inverse covariances. */
 

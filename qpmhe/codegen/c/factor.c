@@ -19,18 +19,11 @@
  * that losses have not touched: above rounding, and far below what a useful step depends on. */
 #define RIDGE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-4)
 
-/* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v), following = Q w;
- * A and C are in place. Q and R are of the form that touches the cost. */
-static void mhe_set_terms(const mhe_settings *s, const mhe_workspace *work,
-                          const mhe_stage *stage, const real *w, const real *v, mhe_terms *t)
+/* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v). */
+static void mhe_set_own_terms(const real *Q, const real *R, const real *w, const real *v,
+                              mhe_terms *t)
 {
-    (void)work;
     const real *A = t->f_jacobian, *C = t->h_jacobian;
-    const real *Q = mhe_disturbance_weight(s, stage), *R = stage->noise_weight;
-    mhe_scale_weights(s, work, stage, Q, w, v, t);
-    mhe_times(NX, Q, w, t->following);
-    for (int i = 0; i < NX; i++)
-        t->following[i] = mhe_scaled(t->following[i], t->disturbance_scale, i);
     real *H = t->hessian, *QA = t->coupling;
     if (MHE_LOSS || !mhe_dense_terms(Q, w, t)) {
         for (int i = 0; i < NX * NX; i++) H[i] = QA[i] = 0;

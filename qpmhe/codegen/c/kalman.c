@@ -151,6 +151,15 @@ static void mhe_see_judged(const mhe_settings *s, const mhe_stage *stage, mhe_se
     (void)next;
 }
 
+/* The filter's estimate by this gain; z where it is not finite. */
+static void mhe_moved(const mhe_stage *stage, const mhe_seen *seen, const real *gain, real *out)
+{
+    mhe_gained(seen, gain, out);
+    for (int j = 0; j < NX; j++) out[j] += stage->z[j];
+    if (!isfinite(stage->cost) || !mhe_all_finite(NX, out))
+        memcpy(out, stage->z, sizeof stage->z);
+}
+
 /* L(z, v) of stage i; the least pivot of the covariance behind it, which is computed again by roots
  * where it has lost digits. */
 static real mhe_correct_with_pivot(mhe_estimator *e, int i, real *out)

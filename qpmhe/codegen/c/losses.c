@@ -1,14 +1,18 @@
 /* Losses of the terms of J that are not quadratic. */
 
+/* rho(q) or rho'(q) of a user's loss. */
+static real mhe_own_part(const mhe_loss *loss, real q, int is_slope)
+{
+    real value, slope;
+    mhe_own_loss(loss, q, &value, &slope);
+    return is_slope ? slope : value;
+}
+
 /* rho(q). */
 static real mhe_loss_value(const mhe_loss *loss, real q)
 {
     const real k = loss->parameter;
-    if (MHE_OWN_LOSSES && loss->kind >= MHE_OWN_PRIOR) {
-        real value, slope;
-        mhe_own_loss(loss, q, &value, &slope);
-        return value;
-    }
+    if (MHE_OWN_LOSSES && loss->kind >= MHE_OWN_PRIOR) return mhe_own_part(loss, q, 0);
     if (loss->kind == MHE_HUBER) return q <= k * k ? q : 2 * k * sqrt(q) - k * k;
     if (loss->kind == MHE_POWER) return pow(q, k / 2);
     return q;
@@ -18,11 +22,7 @@ static real mhe_loss_value(const mhe_loss *loss, real q)
 static real mhe_loss_slope(const mhe_loss *loss, real q)
 {
     const real k = loss->parameter;
-    if (MHE_OWN_LOSSES && loss->kind >= MHE_OWN_PRIOR) {
-        real value, slope;
-        mhe_own_loss(loss, q, &value, &slope);
-        return slope;
-    }
+    if (MHE_OWN_LOSSES && loss->kind >= MHE_OWN_PRIOR) return mhe_own_part(loss, q, 1);
     if (loss->kind == MHE_HUBER) return q <= k * k ? 1 : k / sqrt(q);
     /* The power's own slope may be infinite at 0. */
     if (loss->kind == MHE_POWER) return k / 2 * pow(mhe_max((real)1e-8, q), k / 2 - 1);

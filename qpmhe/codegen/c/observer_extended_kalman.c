@@ -119,10 +119,7 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out,
         mhe_update_root(&seen, outputs, states, 0, gain, left);
         if (covariance) mhe_square(left, covariance);
     }
-    mhe_gained(&seen, gain, out);
-    for (int j = 0; j < NX; j++) out[j] += stage->z[j];
-    if (!isfinite(stage->cost) || !mhe_all_finite(NX, out))
-        memcpy(out, stage->z, sizeof stage->z);
+    mhe_moved(stage, &seen, gain, out);
 }
 
 #if defined(__GNUC__)

@@ -190,10 +190,7 @@ static void mhe_filter(const mhe_settings *s, const mhe_stage *stage, real *out,
         mhe_add_product(POINTS, NX, NX, sigma.moves, sigma.moves, covariance);
         mhe_add_noise(&seen, gain, covariance);
     }
-    mhe_gained(&seen, gain, out);
-    for (int j = 0; j < NX; j++) out[j] += stage->z[j];
-    if (!isfinite(stage->cost) || !mhe_all_finite(NX, out))
-        memcpy(out, stage->z, sizeof stage->z);
+    mhe_moved(stage, &seen, gain, out);
 }
 
 #if defined(__GNUC__)

@@ -46,50 +46,35 @@ static mhe_stage *mhe_stage_of_state(mhe_estimator *e, int i)
     return mhe_stage_at(e, i < e->length ? i : i - 1);
 }
 
-/* The scales of all rows of stage i, and their deviations where these are larger. */
+/* The scales of some rows, and their deviations where these are larger. */
+static void mhe_copy_scales(int count, const real *scales, const real *deviations, real *scale,
+                            real *deviation)
+{
+    for (int j = 0; j < count; j++) {
+        scale[j] = scales[j];
+        deviation[j] = mhe_max(deviations[j], scale[j]);
+    }
+}
+
+#define COPY_SCALES(set, n, count, to, beside) do { \
+        mhe_copy_scales(n, (set)->scale, (set)->deviation, to, beside); \
+        mhe_copy_scales(count, (set)->row_scale, (set)->row_deviation, (to) + (n), (beside) + (n)); \
+    } while (0)
+
+/* The same of all rows of stage i. */
 static void mhe_stage_scales(mhe_estimator *e, int i, real *scale, real *deviation)
 {
     const mhe_settings *s = e->settings;
     const mhe_stage *stage = mhe_stage_of_state(e, i);
-    if (MHE_W_SET) {
-        const mhe_w_set *W = mhe_w_set_at(s, stage);
-        for (int j = 0; j < NX; j++) {
-            scale[j] = W->scale[j];
-            deviation[j] = mhe_max(W->deviation[j], scale[j]);
-        }
-        for (int j = 0; j < MHE_W_ROWS; j++) {
-            scale[NX + j] = W->row_scale[j];
-            deviation[NX + j] = mhe_max(W->row_deviation[j], scale[NX + j]);
-        }
-        scale += W_COUNT, deviation += W_COUNT;
-    }
-    if (MHE_V_SET) {
-        const mhe_v_set *V = mhe_v_set_at(s, stage);
-        for (int j = 0; j < NY; j++) {
-            scale[j] = V->scale[j];
-            deviation[j] = mhe_max(V->deviation[j], scale[j]);
-        }
-        for (int j = 0; j < MHE_V_ROWS; j++) {
-            scale[NY + j] = V->row_scale[j];
-            deviation[NY + j] = mhe_max(V->row_deviation[j], scale[NY + j]);
-        }
-        scale += V_COUNT, deviation += V_COUNT;
-    }
-    if (MHE_X_SET) {
-        const mhe_x_set *X = mhe_x_set_at(s, stage);
-        for (int j = 0; j < NX; j++) {
-            scale[j] = X->scale[j];
-            deviation[j] = mhe_max(X->deviation[j], scale[j]);
-        }
-        for (int j = 0; j < MHE_X_ROWS; j++) {
-            scale[NX + j] = X->row_scale[j];
-            deviation[NX + j] = mhe_max(X->row_deviation[j], scale[NX + j]);
-        }
-    }
-    (void)stage;
+    if (MHE_W_SET) COPY_SCALES(mhe_w_set_at(s, stage), NX, MHE_W_ROWS, scale, deviation);
+    scale += W_COUNT, deviation += W_COUNT;
+    if (MHE_V_SET) COPY_SCALES(mhe_v_set_at(s, stage), NY, MHE_V_ROWS, scale, deviation);
+    scale += V_COUNT, deviation += V_COUNT;
+    if (MHE_X_SET) COPY_SCALES(mhe_x_set_at(s, stage), NX, MHE_X_ROWS, scale, deviation);
+    (void)s; (void)stage;
 }
 
-/* The same for all rows of stage i, about a trajectory x with residuals w and v. */
+/* The distances of all rows of stage i, about a trajectory x with residuals w and v. */
 static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const real *w,
                                 const real *v, real *low, real *high)
 {
