@@ -132,7 +132,7 @@ def with_do_mpc(record: Record) -> Result:
     """The documented way; its w is a rate, and its parameter is constant in each window."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it misses ONNX, which is of no use here
-        import do_mpc  # type: ignore[import-untyped,import-not-found,unused-ignore]
+        import do_mpc  # type: ignore[import-untyped,import-not-found,unused-ignore]  # optional
 
         model = do_mpc.model.Model("continuous", "SX")
         x = model.set_variable("_x", "x", shape=(8, 1))

@@ -11,7 +11,7 @@ from .adapters.iosystem import to_iosystem
 from .adapters.jax import from_jax
 from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
-from .codegen import Compiled, compile  # noqa: A004
+from .codegen import Compiled, compile
 from .codegen.compiler import check_any_cached
 from .codegen.source import MAIN
 from .costs import (

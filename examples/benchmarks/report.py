@@ -277,7 +277,7 @@ def _label(row: dict[str, Any]) -> str:
     elif row["ratio"] is None:
         note = "other J" if row["same_cost"] is False else ""
     else:
-        note = f"{row['ratio']:.3g} ×"  # noqa: RUF001
+        note = f"{row['ratio']:.3g} ×"
     return f"{_time(row['median_us'])}  {note}"
 
 

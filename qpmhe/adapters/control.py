@@ -154,7 +154,7 @@ def _affine(of_state: Array, of_input: Array, m: int) -> tuple[Trusted, Trusted]
 
     if m == 0:
         return Trusted(lambda x: value(x)), Trusted(slope)
-    return Trusted(lambda x, u: value(x, u)), Trusted(lambda x, u: slope(x))  # noqa: ARG005
+    return Trusted(lambda x, u: value(x, u)), Trusted(lambda x, _: slope(x))
 
 
 def _nonlinear(

@@ -17,7 +17,7 @@ from qpmhe_solvers import backends
 from .._version import __version__
 from ..errors import QpmheError
 from .compare import compare, study
-from .compile import compile  # noqa: A004
+from .compile import compile
 from .doctor import doctor
 from .estimate import estimate
 from .report import export, report

@@ -14,7 +14,7 @@ from ..records.record_model import load_record_model
 from .values import read_state
 
 
-def compile(  # noqa: A001 - the name of the command
+def compile(
     models: Annotated[
         list[str],
         typer.Argument(help="Models of the zoo, package.module:function or file.py:function."),

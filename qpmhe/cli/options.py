@@ -73,7 +73,7 @@ def reads_record(*left_out: str) -> Callable[[Callable[..., None]], Callable[...
             given["reading"] = {name: one for name, one in reading.items() if one is not None}
             command(**given)
 
-        # Typer reads the options from here.
+        # Typer reads the options from `__signature__`, which functions need not have.
         own = dict(signature(command, eval_str=True).parameters)
         del own["reading"]
         for name in chosen:

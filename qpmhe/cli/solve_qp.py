@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -50,7 +50,7 @@ def run(
     max_iterations: int | None = None, tolerance: float | None = None, every: bool = False,
 ) -> bool:
     """Solve each QP of the files with each backend, and print a table for each file."""
-    changes: dict[str, int | float] = {}
+    changes: dict[str, Any] = {}
     if max_iterations is not None:
         changes["max_iterations"] = max_iterations
     if tolerance is not None:
@@ -59,7 +59,7 @@ def run(
     for name in wanted:
         create(name)
     stored = [load(path) for path in qp_files(paths)]
-    options = [replace(one.options or SolverOptions(), **changes) for one in stored]  # type: ignore[arg-type]
+    options = [replace(one.options or SolverOptions(), **changes) for one in stored]
     tables: list[list[Replay]] = []
     for one, asked in zip(stored, options, strict=True):
         rows: list[Replay] = []

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from .._checks import flag
 from ..errors import InvalidInputError, OptionError
-from .ahead import Compiled, compile, engine_choice  # noqa: A004
+from .ahead import Compiled, compile, engine_choice
 
 if TYPE_CHECKING:
     from ..estimation.estimator import MovingHorizonEstimator

@@ -39,7 +39,7 @@ class Compiled:
     engine: str = "compiled"
 
 
-def compile(  # noqa: A001 - the name that users look for
+def compile(
     system: System | MovingHorizonEstimator, observer: Observer | None = None,
     cost: Cost | None = None, **options: Any,
 ) -> Compiled:
@@ -80,9 +80,8 @@ def compile(  # noqa: A001 - the name that users look for
     'compiled'
     """
     if not isinstance(system, MovingHorizonEstimator):
-        # It validates all arguments.
-        chosen = options | {"engine": "python"}
-        estimator = MovingHorizonEstimator(system, observer, cost, **chosen)  # type: ignore[arg-type]
+        chosen: dict[str, Any] = options | {"observer": observer, "cost": cost, "engine": "python"}
+        estimator = MovingHorizonEstimator(system, **chosen)  # it validates all arguments
     elif observer is None and cost is None and not options:
         estimator = system
     else:

@@ -73,7 +73,9 @@ class CompiledEngine:
         self._y, self._u = np.zeros(p), np.zeros(max(m, 1))
         self._inputs = self._u[:m]
         self._out = np.zeros(1, library.estimate_type)
-        reals = library.estimate_type.fields["time"][1] // 8  # type: ignore[index]
+        fields = library.estimate_type.fields
+        assert fields is not None
+        reals = fields["time"][1] // 8
         self._block = self._out.view(np.float64)[:reals]
         self._numbers = self._out.view(np.int32)[2 * reals + 2 : 2 * reals + 8]
         self._before = np.empty_like(self._memory)  # before the last step

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,11 @@ class CompiledWatch(ObserverWatch):
         text = self.warning((far, dropped))
         if text is not None:
             warnings.warn(text, ObserverWarning, stacklevel=level + 1)
+
+
+def _read(value: Callable[[CompiledEstimate], Any]) -> Any:
+    """An attribute of an estimate, read when it is asked for."""
+    return property(value)
 
 
 class CompiledEstimate(Estimate):
@@ -63,90 +69,47 @@ class CompiledEstimate(Estimate):
     def _rows(self, start: int, rows: int, width: int) -> Array:
         return self._block[start : start + rows * width].reshape(rows, width)
 
-    @property
-    def cost(self) -> float:  # type: ignore[override]
-        """True cost J of the estimate."""
-        return float(self._block[0])
+    cost = _read(lambda self: float(self._block[0]))
+    candidate_cost = _read(lambda self: float(self._block[1]))
+    restored_cost = _read(lambda self: float(self._block[2]))
+    trajectory = _read(lambda self: self._rows(_COSTS, self._numbers[0] + 1, self._sizes[0]))
+    status = _read(lambda self: Status(self._numbers[1]))
+    message = _read(lambda self: _MESSAGE if self._numbers[1] & _SOLVER_FAILED else "")
+    qps = _read(lambda self: self._numbers[2])
+    solver_iterations = _read(lambda self: self._numbers[3])
+    corrections = _read(lambda self: self._numbers[4])
+    nearest_points = _read(lambda self: self._numbers[5])
+    solve_time = math.nan  # C does not measure it
 
-    @property
-    def candidate_cost(self) -> float:  # type: ignore[override]
-        """True cost J of the candidate."""
-        return float(self._block[1])
-
-    @property
-    def restored_cost(self) -> float:  # type: ignore[override]
-        """J of the trajectory into which the candidate was restored; NaN if it was not."""
-        return float(self._block[2])
-
-    @property
-    def trajectory(self) -> Array:  # type: ignore[override]
-        """Estimates of all states in the window."""
-        return self._rows(_COSTS, self._numbers[0] + 1, self._sizes[0])
-
-    @property
-    def candidate(self) -> Array:  # type: ignore[override]
+    @_read
+    def candidate(self) -> Array:
         """The observer's trajectory."""
         n, _, horizon = self._sizes
         return self._rows(_COSTS + (horizon + 1) * n, self._numbers[0] + 1, n)
 
-    @property
+    @_read
     def disturbances(self) -> Array:
         """w(i) along the trajectory."""
         n, _, horizon = self._sizes
         d = self._rows(_COSTS + 2 * (horizon + 1) * n, self._numbers[0], n)
         return d if self._to_disturbances is None else d @ self._to_disturbances.T
 
-    @property
+    @_read
     def noises(self) -> Array:
         """v(i) along the trajectory, NaN where y is missing."""
         n, p, horizon = self._sizes
         return self._rows(_COSTS + 2 * (horizon + 1) * n + horizon * n, self._numbers[0], p)
 
-    @property
-    def status(self) -> Status:  # type: ignore[override]
-        """Outcome and events."""
-        return Status(self._numbers[1])
-
-    @property
-    def message(self) -> str:  # type: ignore[override]
-        """The QP solver's message where it failed."""
-        return _MESSAGE if self._numbers[1] & _SOLVER_FAILED else ""
-
-    @property
-    def qps(self) -> int:  # type: ignore[override]
-        """QPs solved."""
-        return self._numbers[2]
-
-    @property
-    def solver_iterations(self) -> int:  # type: ignore[override]
-        """Guesses of the active rows, and iterations of the interior-point method."""
-        return self._numbers[3]
-
-    @property
-    def corrections(self) -> int:  # type: ignore[override]
-        """Second-order corrections."""
-        return self._numbers[4]
-
-    @property
-    def nearest_points(self) -> int:  # type: ignore[override]
-        """QPs for a feasible trajectory near an infeasible candidate."""
-        return self._numbers[5]
-
-    @property
+    @_read
     def filtered(self) -> Array:
         """Estimate of x(t) that has used y(t)."""
         return self._block[self._block.size - self._sizes[0] :]
 
-    @property
-    def observer_state(self) -> Array:  # type: ignore[override]
+    @_read
+    def observer_state(self) -> Array:
         """z(t+1), the state from which the observer continues."""
         n = self._sizes[0]
         return self._block[-2 * n : self._block.size - n]
-
-    @property
-    def solve_time(self) -> float:  # type: ignore[override]
-        """NaN: the C step does not measure it."""
-        return math.nan
 
 
 def _restored(arguments: tuple[Any, ...], step_time: float) -> CompiledEstimate:

@@ -417,7 +417,7 @@ class Cost(ABC):
             return np.asarray(self.prior)
         return self.observer_prior.weight(covariance, self.least_correlation)
 
-    def check_weights(  # noqa: B027 - most costs take any weight
+    def check_weights(
         self, noise: Array | None, disturbance: Array | None
     ) -> None:
         """Raise a `WeightError` unless it can use ``noise`` and ``disturbance`` at a sample."""

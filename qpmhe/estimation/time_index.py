@@ -239,18 +239,16 @@ def _positions(index: Any, times: Any, name: str) -> NDArray[np.intp]:
 
 def _index(values: Any) -> Any:
     """The index of a Series or DataFrame, None for anything else."""
-    pandas = sys.modules.get("pandas")
-    if pandas is None or not isinstance(
-        values, (getattr(pandas, "Series", ()), getattr(pandas, "DataFrame", ()))
-    ):
-        return None
-    return values.index  # type: ignore[union-attr]
+    pandas: Any = sys.modules.get("pandas")
+    kinds = (getattr(pandas, "Series", ()), getattr(pandas, "DataFrame", ()))
+    is_of_pandas: bool = pandas is not None and isinstance(values, kinds)
+    return values.index if is_of_pandas else None
 
 
 def _has_times(index: Any) -> bool:
-    pandas = sys.modules.get("pandas")
+    pandas: Any = sys.modules.get("pandas")
     return index is not None and isinstance(
-        index, (pandas.DatetimeIndex, pandas.TimedeltaIndex)  # type: ignore[union-attr]
+        index, (pandas.DatetimeIndex, pandas.TimedeltaIndex)
     )
 
 

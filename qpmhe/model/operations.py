@@ -463,7 +463,7 @@ def _where(record: ExpressionRecord, condition: Any, *chosen: Any) -> Any:
 
 def _clipped(
     record: ExpressionRecord, a: Any, a_min: Any = None, a_max: Any = None, out: Any = None,
-    *, min: Any = None, max: Any = None,  # noqa: A002
+    *, min: Any = None, max: Any = None,
 ) -> Any:
     low, high = (min if a_min is None else a_min), (max if a_max is None else a_max)
     if low is not None:
@@ -516,7 +516,7 @@ def _interpolated(
 
 
 def _norm(
-    record: ExpressionRecord, x: Any, ord: Any = None, axis: Any = None,  # noqa: A002
+    record: ExpressionRecord, x: Any, ord: Any = None, axis: Any = None,
     keepdims: bool = False,
 ) -> Any:
     array = record.array(_objects(x))

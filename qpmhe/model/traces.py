@@ -271,4 +271,4 @@ def depends(trace: Traced) -> NDArray[np.bool_]:
 def of_both(function: BatchedFunction) -> Callable[[Array, Array], Any]:
     """The user's function as one of x and u."""
     called = function.function
-    return called if function.takes_input else lambda x, u: called(x)  # noqa: ARG005
+    return called if function.takes_input else lambda x, _: called(x)

@@ -54,7 +54,7 @@ def _output_jacobian(x: Array) -> Array:
     return slope
 
 
-def _current(t: int, x: Array) -> Array:  # noqa: ARG001
+def _current(t: int, _: Array) -> Array:
     return _CAPACITY * _PROFILE[t // _HOLD % _PROFILE.size, None]
 
 

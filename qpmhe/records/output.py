@@ -289,9 +289,9 @@ def standard_output_for_rows() -> Iterator[BinaryIO]:
         yield rows
 
 
-def _is_descriptor(text: object) -> bool:
+def _is_descriptor(text: Any) -> bool:
     try:
-        return bool(text.fileno() == _STANDARD_OUTPUT)  # type: ignore[attr-defined]
+        return bool(text.fileno() == _STANDARD_OUTPUT)
     except (AttributeError, OSError, ValueError):  # of a notebook, a test, or closed
         return False
 
@@ -317,9 +317,9 @@ def _duplicate(text: object) -> Iterator[BinaryIO]:
             rows.close()
 
 
-def _flush(text: object) -> None:
+def _flush(text: Any) -> None:
     with contextlib.suppress(OSError, ValueError):
-        text.flush()  # type: ignore[attr-defined]
+        text.flush()
     # The C library has a buffer of its own; where it is not found, that goes out at the end.
     with contextlib.suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).fflush(None)

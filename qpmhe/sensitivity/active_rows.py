@@ -210,8 +210,9 @@ class HeldRows:
     def named(self, first: int) -> tuple[tuple[ActiveRow, ...], tuple[ActiveRow, ...]]:
         """The active inequalities, and the weakly active ones."""
         every, inequalities = self._all, ~self._all["fixed"]
-        return tuple(
-            tuple(
+
+        def listed(chosen: NDArray[np.bool_]) -> tuple[ActiveRow, ...]:
+            return tuple(
                 ActiveRow(
                     str(every["set"][j]), int(every["number"][j]),
                     "upper" if every["direction"][j] > 0.0 else "lower",
@@ -219,8 +220,8 @@ class HeldRows:
                 )
                 for j in np.flatnonzero(chosen & inequalities)
             )
-            for chosen in (self._held, self._weak)
-        )  # type: ignore[return-value]
+
+        return listed(self._held), listed(self._weak)
 
 
 def _sides(problem: Problem, trial: Trial) -> Iterator[_Side]:

@@ -68,25 +68,25 @@ class Gradient:
         ))
 
     @cached_property
-    def prior(self) -> Array:  # noqa: D102 - above
+    def prior(self) -> Array:
         return self._by("prior")
 
     @cached_property
-    def measurements(self) -> Array:  # noqa: D102
+    def measurements(self) -> Array:
         return np.asarray(-self._force[..., self._at.n :])
 
     @cached_property
-    def inputs(self) -> Array:  # noqa: D102
+    def inputs(self) -> Array:
         curvature, states = self._at.curvature, self._adjoint[..., :-1, :]
         found = np.einsum("...kq,kqm->...km", self._force, curvature.by_input)
         return np.asarray(found + np.einsum("...kn,knm->...km", states, curvature.mixed))
 
     @cached_property
-    def parameters(self) -> Array:  # noqa: D102
+    def parameters(self) -> Array:
         return np.asarray(self.inputs[..., self._at.known :].sum(axis=-2))
 
     @cached_property
-    def prior_weight(self) -> Array:  # noqa: D102
+    def prior_weight(self) -> Array:
         return self._by("prior_weight")
 
     @cached_property
@@ -94,12 +94,12 @@ class Gradient:
         return self._by("stage_weights")
 
     @cached_property
-    def disturbance_weights(self) -> Array:  # noqa: D102
+    def disturbance_weights(self) -> Array:
         found: Array = self._weights[..., : -self._at.p, : -self._at.p]
         return found
 
     @cached_property
-    def noise_weights(self) -> Array:  # noqa: D102
+    def noise_weights(self) -> Array:
         found: Array = self._weights[..., -self._at.p :, -self._at.p :]
         reductions = self._at.reductions
         if reductions is None:
@@ -107,15 +107,15 @@ class Gradient:
         return np.asarray(np.swapaxes(reductions, -1, -2) @ found @ reductions)
 
     @cached_property
-    def disturbance_weight(self) -> Array:  # noqa: D102
+    def disturbance_weight(self) -> Array:
         return np.asarray(self.disturbance_weights[..., self._at.usual_w, :, :].sum(axis=-3))
 
     @cached_property
-    def noise_weight(self) -> Array:  # noqa: D102
+    def noise_weight(self) -> Array:
         return np.asarray(self.noise_weights[..., self._at.usual_v, :, :].sum(axis=-3))
 
     @cached_property
-    def discount(self) -> Array:  # noqa: D102
+    def discount(self) -> Array:
         at, adjoint = self._at, self._adjoint
         slopes = at.by_discount
         found = (adjoint * slopes[0]).sum(axis=(-2, -1))

@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -101,8 +101,8 @@ def export_qpbenchmark(
     if matrices not in get_args(Matrices):
         raise OptionError(f"matrices is {matrices!r}; expected 'sparse' or 'dense'.")
     single = isinstance(files_or_folder, (str, os.PathLike))
-    paths = [files_or_folder] if single else files_or_folder
-    stored = [load(path) for path in qp_files(paths)]  # type: ignore[arg-type]
+    paths: Any = [files_or_folder] if single else files_or_folder
+    stored = [load(path) for path in qp_files(paths)]
     skipped = {one.path: why for one in stored if (why := _unfit(one.qp))}
     chosen = [one for one in stored if one.path not in skipped]
     if not chosen:

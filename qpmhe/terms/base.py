@@ -225,7 +225,7 @@ class TermDerivative(ABC):
         """
         raise NotImplementedError
 
-    def change(  # noqa: B027 - some terms have no such data
+    def change(
         self, data: Mapping[str, Array], states: Array, residuals: Array
     ) -> None:
         """Add the change (..., K + 1, n), (..., K, q) of the first derivatives with the data."""

@@ -77,7 +77,7 @@ class Solver(ABC):
     def _solve(self, qp: QP, start: Array | None) -> RawSolution | Solution:
         """Solve qp. It may raise, and it may lie: `solve` contains all of it."""
 
-    def shift(self) -> None:  # noqa: B027 - most keep nothing
+    def shift(self) -> None:
         """Report that the trajectory moved by one stage since the last solve.
 
         Data kept for stage k + 1 now belong to stage k; the last stage is new. A solver that keeps
@@ -93,7 +93,7 @@ class Solver(ABC):
         if self._scaling is not None:
             self._scaling.forget()
 
-    def prepare(self, size: int) -> None:  # noqa: B027 - most have nothing to prepare
+    def prepare(self, size: int) -> None:
         """Do in advance what would delay the first QPs, such as imports.
 
         Parameters

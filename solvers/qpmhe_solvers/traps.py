@@ -92,7 +92,7 @@ def _raw(name: str, qp: QP, options: SolverOptions) -> tuple[object, Solution]:
         kept.append(inner(qp, start))
         return kept[-1]
 
-    solver._solve = spy  # type: ignore[method-assign]
+    solver._solve = spy  # type: ignore[method-assign]  # of this object alone
     solution = solver.solve(qp)
     return (kept[-1] if kept else None), solution
 

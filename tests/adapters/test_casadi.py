@@ -112,7 +112,9 @@ def falling(case):
             ca.jacobian(h, x)
         except RuntimeError:
             pytest.skip("this CasADi has no derivatives of QPs")
-        value = lambda x: min(max(x[0], x[1]), 1)  # noqa: E731
+
+        def value(x):
+            return min(max(x[0], x[1]), 1)
     else:  # raises
         root = ca.rootfinder(
             "root", "fast_newton", ca.Function("g", [z, q], [z**2 - 1 + q]), {"max_iter": 50}

@@ -12,7 +12,7 @@ from tests.adapters.twins import NONE, same
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
 
-from qpmhe import from_jax  # noqa: E402
+from qpmhe import from_jax  # noqa: E402 - behind what it needs
 
 HOME = jax if hasattr(jax, "enable_x64") else jax.experimental
 SWITCH = HOME.enable_x64

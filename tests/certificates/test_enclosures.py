@@ -147,7 +147,7 @@ def in_place(x):
     return 0.5 * x + 1.0
 
 
-def counted(x, calls=[]):  # noqa: B006
+def counted(x, calls=[]):  # noqa: B006 - the fault that is refused
     calls.append(0)
     return 0.5 * x + (1.0 if len(calls) % 5 == 0 else 0.0)
 

@@ -12,7 +12,7 @@ nbclient = pytest.importorskip("nbclient", reason="needs nbformat, nbclient and 
 pytest.importorskip("ipykernel", reason="needs nbformat, nbclient and ipykernel")
 pytest.importorskip("pandas", reason="the comparison needs pandas")
 
-from tests.test_docs import same  # noqa: E402
+from tests.test_docs import same  # noqa: E402 - behind what it needs
 
 ROOT = Path(__file__).parents[2]
 DOCS, EXAMPLES = ROOT / "docs", ROOT / "examples"

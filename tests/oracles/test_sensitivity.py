@@ -398,7 +398,7 @@ def test_memory_grows_with_the_window():
     # One factorisation of a banded matrix: no array has the square of the window's length.
     mhe = Case(samples=120, horizon=120, **SETS["noise-free"][0]).estimator(max_qps=1)
     tracemalloc.start()
-    mhe.sensitivity().adjoint(np.ones(2)).measurements  # noqa: B018
+    _ = mhe.sensitivity().adjoint(np.ones(2)).measurements
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 8 * (121 * 2) ** 2

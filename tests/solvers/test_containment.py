@@ -22,10 +22,13 @@ QP, DENSE = of_order_one(make(**CASES["all kinds"], seed=3)[0])
 BEST = create("quadprog", TIGHT).solve(QP)
 
 
+USUAL_OPTIONS = SolverOptions()
+
+
 class Scripted(Solver):
     """Returns what it is given, called if it can be, and remembers its starts."""
 
-    def __init__(self, found, options=SolverOptions()):  # noqa: B008 (frozen)
+    def __init__(self, found, options=USUAL_OPTIONS):
         super().__init__(options)
         self.found, self.starts = found, []
 

@@ -42,9 +42,10 @@ class Prompted(Solver):
 
 
 @contextmanager
-def recorded(folder, *statuses, capabilities={}, **arguments):  # noqa: B006 (only read)
+def recorded(folder, *statuses, capabilities=None, **arguments):
     """A recording of a backend that answers so."""
-    one = Backend("prompted", lambda options: Prompted(statuses, options), "-", **capabilities)
+    own = capabilities or {}
+    one = Backend("prompted", lambda options: Prompted(statuses, options), "-", **own)
     with registered(one), Recording(folder, one.name, **arguments) as recording:
         yield recording
 

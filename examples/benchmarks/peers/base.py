@@ -85,12 +85,12 @@ class Peer(ABC):
             If the tool is not installed or cannot do this problem.
         """
 
-    def restart(self) -> None:  # noqa: B027, most have nothing to do
+    def restart(self) -> None:
         """Get ready for another record."""
 
     @abstractmethod
     def update(self, window: WindowData) -> Array:
         """The trajectory (K + 1, n) of a window, or the state (n,) at its end."""
 
-    def close(self) -> None:  # noqa: B027, most have nothing to do
+    def close(self) -> None:
         """Give back files and processes."""

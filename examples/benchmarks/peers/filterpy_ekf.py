@@ -40,7 +40,7 @@ class FilterpyEkf(Peer):
         self._see = _Linearized(ca, x, seen)
         move = self._move
 
-        class Filter(ExtendedKalmanFilter):  # type: ignore[misc]
+        class Filter(ExtendedKalmanFilter):  # type: ignore[misc]  # it has no types
             """The nonlinear prediction, which filterpy leaves to a subclass."""
 
             def predict_x(self, u: Any = 0) -> None:

@@ -53,7 +53,7 @@ def configuration_words(row: Any) -> str:
 def number(value: Any, digits: int = 3) -> str:
     """Three significant digits, without an exponent where that is readable."""
     if missing(value):
-        return "–"  # noqa: RUF001
+        return "–"
     x = float(value)
     if math.isinf(x):
         return "∞" if x > 0 else "-∞"
@@ -68,7 +68,7 @@ def number(value: Any, digits: int = 3) -> str:
 
 def seconds(value: Any) -> str:
     """A duration in s, ms or us with three significant digits."""
-    return "–" if missing(value) else _with_unit(float(value), number)  # noqa: RUF001
+    return "–" if missing(value) else _with_unit(float(value), number)
 
 
 def time_tick(value: float) -> str:
@@ -87,7 +87,7 @@ def _with_unit(value: float, words: Callable[[float], str]) -> str:
 def percent(share: Any) -> str:
     """A share in per cent; only exactly 0 and 1 are written as 0 % and 100 %."""
     if missing(share):
-        return "–"  # noqa: RUF001
+        return "–"
     x = 100.0 * float(share)
     if 0 < abs(x) < 0.1:
         return "< 0.1 %" if x > 0 else "> -0.1 %"
