@@ -13,6 +13,8 @@ from .graph import CONDITIONS, Graph
 
 def expression_of(system: System, name: str) -> Traced:
     """F or h of a system as a CasADi function of one column of states and inputs."""
+    if system.origin.equations is not None:
+        return Traced(None, "it has algebraic states, which solve equations")
     tracing, model = system.tracing, system.symbolic if system.tracing is None else None
     if tracing is not None:
         found = tracing.watched(name)

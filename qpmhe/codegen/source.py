@@ -15,14 +15,9 @@ from numpy.typing import NDArray
 
 from .._version import __version__
 from ..errors import CompilationError
+from ..model.algebraic import CURVED, MOST_HALVINGS, MOST_ITERATIONS, ROUNDING, SMALL
 from ..model.expressions import CasadiModel, import_casadi
-from ..model.implicit_steps import (
-    COLLOCATIONS,
-    MOST_HALVINGS,
-    MOST_ITERATIONS,
-    ROUNDING,
-    SMALL,
-)
+from ..model.implicit_steps import COLLOCATIONS
 from .layout import SET_NAMES, TERMS, Layout
 from .single import in_single_precision
 
@@ -64,10 +59,10 @@ def prologue() -> str:
 
 def model_source(model: CasadiModel, single: bool = False) -> str:
     """The model in C: CasADi's code for f, h and their Jacobians, and the discretisation."""
-    if model.n > _MOST_STATES:
+    if model.width > _MOST_STATES:
         raise CompilationError(
-            f"the model has {model.n} states; compiled code keeps (n, n) arrays on the stack and "
-            f"allows at most {_MOST_STATES}. Take engine='python'."
+            f"the model has {model.width} states; compiled code keeps (n, n) arrays on the stack "
+            f"and allows at most {_MOST_STATES}. Take engine='python'."
         )
     _check_solvers(model)
     ca = import_casadi()
@@ -76,12 +71,12 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
     for which in ("f", "h"):
         function = getattr(model, which)
         name = f"mhe_casadi_{which}"
-        named = _named(ca, function, name, model.n, model.m)
+        named = _named(ca, function, name, model.width, model.m)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}", name, named))
         slopes, places = model.with_jacobian(which)
         name = f"mhe_casadi_{which}_jacobian"
-        named = _named(ca, slopes, name, model.n, model.m)
+        named = _named(ca, slopes, name, model.width, model.m)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}_jacobian", name, named))
         listed = ", ".join(str(place) for place in places) or "0"
@@ -129,7 +124,7 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         + '#pragma GCC diagnostic ignored "-Wconversion"\n' * single + "#endif",
         "#define casadi_real mhe_real", code,
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif\n",
-        *calls, template("model.c"), *_step_parts(model),
+        *calls, *_model_parts(model),
     ))
 
 
@@ -147,29 +142,44 @@ def _own_losses(model: CasadiModel) -> str:
     )
 
 
+def _filled(name: str, values: dict[str, Any]) -> str:
+    return Template(template(f"{name}.c")).substitute(values)
+
+
+def _model_parts(model: CasadiModel) -> list[str]:
+    """The parts of C that make f and h of CasADi's functions: see `_step_parts`."""
+    output = {"value": "mhe_h", "slope": "mhe_h_jacobian", "width": "NX"}
+    if model.guess:
+        output = {
+            "value": "mhe_output", "slope": "mhe_output_jacobian",
+            "width": f"(NX + {len(model.guess)})",
+        }
+    return [_filled("model", output), *_step_parts(model)]
+
+
 def _step_parts(model: CasadiModel) -> list[str]:
     """The parts of C that make a map of f: f itself, or substeps of a method."""
     how = model.how
     if how is None:
-        return [Template(template("step_map.c")).substitute(value="mhe_f", slope="mhe_f_jacobian")]
+        return [_filled("step_map", {"value": "mhe_f", "slope": "mhe_f_jacobian"})]
     single = how.steps == 1
     names = {
         "value": "mhe_f" if single else "mhe_substep",
         "slope": "mhe_f_jacobian" if single else "mhe_substep_jacobian",
     }
-    if how.is_implicit:
-        method = COLLOCATIONS[how.method]
-        text = Template(template("step_implicit.c")).substitute(
-            names, stages=len(method.A), iterations=MOST_ITERATIONS, halvings=MOST_HALVINGS,
-            rounding=repr(ROUNDING), small=repr(SMALL),
-            weights=", ".join(f"{{{', '.join(map(repr, row))}}}" for row in method.A.tolist()),
-            ends=", ".join(map(repr, method.d.tolist())),
-        )
-    else:
-        text = Template(template(f"step_{how.method}.c")).substitute(names)
-    if single:
-        return [text]
-    return [text, Template(template("substeps.c")).substitute(steps=how.steps)]
+    substeps = [] if single else [_filled("substeps", {"steps": how.steps})]
+    if not how.is_implicit:
+        return [_filled(f"step_{how.method}", names), *substeps]
+    method = COLLOCATIONS[how.method]
+    values = names | {
+        "iterations": MOST_ITERATIONS, "halvings": MOST_HALVINGS, "rounding": repr(ROUNDING),
+        "small": repr(SMALL), "curved": repr(CURVED),
+        "stages": len(method.A), "ends": ", ".join(map(repr, method.d.tolist())),
+        "weights": ", ".join(f"{{{', '.join(map(repr, row))}}}" for row in method.A.tolist()),
+        "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),
+    }
+    rate = _filled("algebraic", values) if model.guess else template("rate.c")
+    return [template("equations.c"), rate, _filled("step_implicit", values), *substeps]
 
 
 # Classes of CasADi that have no C code, in words. CasADi itself prints a warning for each call.

@@ -45,6 +45,10 @@ class Augmentation:
         #: Number of states z.
         self.n = n + moved.size
 
+    def beside(self, n: int) -> Augmentation:
+        """The same change of a model of n states."""
+        return Augmentation(n, self.m, self._constants, self._moved)
+
     def inputs(self, u: Any, s: Any) -> list[Any]:
         """The entries of v, of anything that has entries and can be added."""
         entries = [*(u[j] for j in range(self.m)), *self._constants.tolist()]

@@ -86,11 +86,22 @@ def _implicit(
     def of_many(function: Function) -> Function:
         return lambda x, u: function(x, *((u,) if u.shape[-1] else ()))
 
-    solved = ImplicitStep(of_many(rate), of_many(jacobian), how.method, how.steps)
+    return of_any_shape(ImplicitStep(of_many(rate), of_many(jacobian), how.method, how.steps))
+
+
+def of_any_shape(
+    solved: ImplicitStep, complete: Function | None = None
+) -> tuple[Function, Function]:
+    """The step and its Jacobian over (..., n).
+
+    ``complete`` puts algebraic states below those of (K, n), where there are any.
+    """
 
     def rows(dt: Any, x: Array, u: tuple[Array, ...]) -> tuple[Array, Array, Array]:
         states = x.reshape(-1, x.shape[-1])
         inputs = u[0].reshape(len(states), -1) if u else np.empty((len(states), 0))
+        if complete is not None:
+            states = complete(states, inputs)
         return states, inputs, np.broadcast_to(np.ravel(dt), len(states))
 
     def step(dt: Any, x: Array, *u: Array) -> Array:

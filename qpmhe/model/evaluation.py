@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .algebraic import AlgebraicStates
 from .expressions import CasadiModel, import_casadi
 from .implicit_steps import ImplicitStep
 
@@ -167,12 +168,14 @@ class ImplicitMachine:
 
     def __init__(self, model: CasadiModel, timed: bool) -> None:
         assert model.how is not None
-        parts = replace(model, dt=None, how=None)
+        parts = replace(model, n=model.width, guess=(), dt=None, how=None)
         self._model, self._timed = model, timed
         self._evaluator = evaluator = Evaluator(VirtualMachine(parts, False))
-        self._step = ImplicitStep(
-            partial(evaluator.one, "f"), partial(evaluator.one, "f_jacobian"), *model.how
-        )
+        functions = partial(evaluator.one, "f"), partial(evaluator.one, "f_jacobian")
+        self._algebraic: AlgebraicStates | None = None
+        if model.guess:
+            self._algebraic = AlgebraicStates(*functions, np.array(model.guess))
+        self._step = ImplicitStep(*functions, *model.how, self._algebraic)
 
     def __call__(self, count: int, names: tuple[str, ...]) -> Buffers:
         """Make buffers for so many states and these results."""
@@ -180,25 +183,30 @@ class ImplicitMachine:
         n, m = model.n, model.m
         states, inputs = np.zeros((count + along, n)), np.zeros((count, m + self._timed))
         results, usual = results_of(model, count, names), np.full(count, model.dt or 0.0)
-        one, x = self._evaluator.one, states[:count]
+        one, x, algebraic = self._evaluator.one, states[:count], self._algebraic
 
         def evaluate() -> None:
             u = inputs[:, :m]
             dt = inputs[:, m] if self._timed else usual
+            w = x if algebraic is None else algebraic.complete(x, u)
             if along:
                 residuals = results["residuals"]
-                np.subtract(states[1:], self._step.value(x, u, dt), out=residuals[:, :n])
-                np.subtract(results["y"], one("h", x, u), out=residuals[:, n:])
+                np.subtract(states[1:], self._step.value(w, u, dt), out=residuals[:, :n])
+                np.subtract(results["y"], one("h", w, u), out=residuals[:, n:])
                 return
             if "f_jacobian" in names:
-                following, results["f_jacobian"][...] = self._step.linear(x, u, dt)
+                following, results["f_jacobian"][...] = self._step.linear(w, u, dt)
             else:
-                following = self._step.value(x, u, dt) if "f" in names else x
+                following = self._step.value(w, u, dt) if "f" in names else x
             if "f" in names:
                 results["f"][...] = following.reshape(results["f"].shape)
-            for name in ("h", "h_jacobian"):
-                if name in names:
-                    results[name][...] = one(name, x, u).reshape(results[name].shape)
+            if "h" in names:
+                results["h"][...] = one("h", w, u).reshape(results["h"].shape)
+            if "h_jacobian" in names:
+                slope = one("h_jacobian", w, u)
+                if algebraic is not None:
+                    slope = algebraic.chained(slope, w, u)
+                results["h_jacobian"][...] = slope.reshape(results["h_jacobian"].shape)
 
         return states, inputs, results, evaluate
 

@@ -28,6 +28,8 @@ class CasadiModel:
 
     f is the rate of an ODE with sampling time ``dt`` and discretisation ``how``, or the
     discrete-time map itself, where these are None. u has no rows where there are no inputs.
+    With k algebraic states z, of which there is a ``guess`` for each, x is w = (x, z) in both
+    functions, and f also has the algebraic equations' residuals, below the rate.
     ``output_residual`` and ``state_residual`` are the user's functions of (a, b) for differences,
     where there are any; ``losses`` those of one number q to rho(q) and rho'(q), for prior, w and v;
     ``correction`` an observer's function of (z, v).
@@ -40,6 +42,7 @@ class CasadiModel:
     m: int
     dt: float | None = None
     how: Discretization | None = None
+    guess: tuple[float, ...] = ()
     output_residual: Any = None
     state_residual: Any = None
     losses: tuple[Any, Any, Any] = (None, None, None)
@@ -49,6 +52,11 @@ class CasadiModel:
         # A map that is taken for a rate, with a step of 0, would be the identity.
         if (self.dt is None) != (self.how is None):
             raise ValueError(f"dt is {self.dt} and {self.how}; expected both or none.")
+
+    @property
+    def width(self) -> int:
+        """Number of states and algebraic states, which f and h are functions of."""
+        return self.n + len(self.guess)
 
     @property
     def is_implicit(self) -> bool:
@@ -61,13 +69,13 @@ class CasadiModel:
         Also where each nonzero is in the dense Jacobian, counted by rows.
         """
         ca, function = import_casadi(), getattr(self, which)
-        x, u = _symbols(ca, function, self.n, self.m)
+        x, u = _symbols(ca, function, self.width, self.m)
         value = function(x, u)
         slopes = ca.jacobian(value, x)
         rows, columns = slopes.sparsity().get_triplet()
         nonzeros = ca.sparsity_cast(slopes, ca.Sparsity.dense(slopes.nnz(), 1))
         made = ca.Function(f"{which}_jacobian", [x, u], [value, nonzeros])
-        return made, [row * self.n + column for row, column in zip(rows, columns, strict=True)]
+        return made, [row * self.width + column for row, column in zip(rows, columns, strict=True)]
 
     def step(self) -> Any:
         """The discrete-time map as a casadi.Function of (x, u, dt), unless it is implicit."""

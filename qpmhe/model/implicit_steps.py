@@ -1,33 +1,37 @@
-"""Implicit steps of an ODE: collocation, solved by Newton's method to rounding.
+"""Implicit steps of an ODE or a DAE: collocation, solved by Newton's method to rounding.
 
-One substep of length h from x has stages Z_i, the increments at its nodes:
+One substep of length h from x has stages Z_i, the increments at its nodes, and, with algebraic
+states, z_i:
 
-    Z_i = h sum_j A_ij f_c(x + Z_j, u),        x⁺ = x + sum_i d_i Z_i.
+    Z_i = h sum_j A_ij f_c(x + Z_j, z_j, u),    0 = g(x + Z_i, z_i, u),    x⁺ = x + sum_i d_i Z_i.
 
-The start is Z = 0, so that the step is a function of x, u and h alone. The implicit function
-theorem gives its derivative, from the Jacobians at the converged stages: exact, whatever the
-iteration did.
+The start is Z = 0 and the algebraic states at x, so that the step is a function of x, u and h
+alone. The implicit function theorem gives its derivative, from the Jacobians at the converged
+stages: exact, whatever the iteration did.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-# Of states (K, n) and inputs (K, m): rates (K, n), or their Jacobians (K, n, n).
-Batched = Callable[[Array, Array], Array]
+from .algebraic import (
+    MOST_HALVINGS,
+    MOST_ITERATIONS,
+    ROUNDING,
+    SMALL,
+    AlgebraicStates,
+    Batched,
+    Eliminated,
+    algebraic_sizes,
+    eliminated,
+    inverse,
+    solved,
+)
 
-#: Iterations of Newton's method, and halvings of one of its steps.
-MOST_ITERATIONS, MOST_HALVINGS = 50, 12
-#: Corrections below this share of the stages' sizes may end the iteration.
-SMALL = 1e-7
-#: Corrections below this share are rounding.
-ROUNDING = 4e-16
+Array = NDArray[np.float64]
 
 
 class Collocation(NamedTuple):
@@ -73,117 +77,130 @@ class ImplicitStep:
     Parameters
     ----------
     rate, jacobian : callable
-        The rate f_c and its derivative by x, over states (K, n) and inputs (K, m).
+        The rate f_c and its derivative by x, over states (K, n) and inputs (K, m); with algebraic
+        states the joint function of w = (x, z), see `qpmhe.model.algebraic`.
     method : str
         A name of `COLLOCATIONS`.
     steps : int
         Number of substeps.
+    algebraic : AlgebraicStates, optional
+        The algebraic states, where there are any.
     """
 
-    def __init__(self, rate: Batched, jacobian: Batched, method: str, steps: int) -> None:
+    def __init__(
+        self, rate: Batched, jacobian: Batched, method: str, steps: int,
+        algebraic: AlgebraicStates | None = None,
+    ) -> None:
         self._rate, self._jacobian, self._steps = rate, jacobian, steps
-        self._method = COLLOCATIONS[method]
+        self._method, self._algebraic = COLLOCATIONS[method], algebraic
 
-    def value(self, x: Array, u: Array, dt: Array) -> Array:
-        """The next states (K, n), from states (K, n), inputs (K, m) and lengths (K,)."""
-        h = dt / self._steps
-        for _ in range(self._steps):
-            x = x + np.einsum("i,kin->kn", self._method.d, self._stages(x, u, h))
-        return x
+    def value(self, w: Array, u: Array, dt: Array) -> Array:
+        """The next states (K, n), from w = (x, z) (K, n + k), inputs (K, m) and lengths (K,)."""
+        h, n = dt / self._steps, w.shape[1] - self._k
+        for k in range(self._steps):
+            w = w if k == 0 else self._completed(w, u)
+            w = w[:, :n] + np.einsum("i,kin->kn", self._method.d, self._stages(w, u, h)[..., :n])
+        return w
 
-    def linear(self, x: Array, u: Array, dt: Array) -> tuple[Array, Array]:
+    def linear(self, w: Array, u: Array, dt: Array) -> tuple[Array, Array]:
         """The next states (K, n) and their derivatives by x (K, n, n)."""
-        (count, n), h, method = x.shape, dt / self._steps, self._method
-        s, identity = len(method.A), np.eye(x.shape[1])
+        h, method, count, n = dt / self._steps, self._method, len(w), w.shape[1] - self._k
+        s, identity = len(method.A), np.eye(n)
         slopes = np.broadcast_to(identity, (count, n, n))
-        for _ in range(self._steps):
-            Z = self._stages(x, u, h)
-            J = self._slopes(x, u, Z)
+        for k in range(self._steps):
+            w = w if k == 0 else self._completed(w, u)
+            x, W = w[:, :n], self._stages(w, u, h)
+            with np.errstate(all="ignore"):
+                J = eliminated(np.zeros_like(W), self._slopes(x, u, W), n).jacobian
             # (I - h A J) dZ/dx = h A J (1, ..., 1).
             right = h[:, None, None, None] * np.einsum("ij,kjab->kiab", method.A, J)
-            dZ = _solved(_newton_matrix(method.A, h, J), right.reshape(count, s * n, n))
+            matrix = _newton_matrix(method.A, h, J)
+            dZ = solved(matrix, right.reshape(count, s * n, n), inverse(matrix))
             own = identity + np.einsum("i,kiab->kab", method.d, dZ.reshape(count, s, n, n))
             slopes = own @ slopes
-            x = x + np.einsum("i,kin->kn", method.d, Z)
-        return x, slopes
+            w = x + np.einsum("i,kin->kn", method.d, W[..., :n])
+        return w, slopes
 
-    def _slopes(self, x: Array, u: Array, Z: Array) -> Array:
-        """The Jacobians (K, s, n, n) at the stages."""
-        count, s, n = Z.shape
-        states = (x[:, None] + Z).reshape(count * s, n)
-        return self._jacobian(states, np.repeat(u, s, axis=0)).reshape(count, s, n, n)
+    @property
+    def _k(self) -> int:
+        return 0 if self._algebraic is None else self._algebraic.guess.size
 
-    def _residual(self, x: Array, u: Array, h: Array, Z: Array) -> Array:
-        """Z - h A f_c(x + Z), (K, s, n)."""
-        count, s, n = Z.shape
-        states = (x[:, None] + Z).reshape(count * s, n)
-        rates = self._rate(states, np.repeat(u, s, axis=0)).reshape(count, s, n)
-        found: Array = Z - h[:, None, None] * np.einsum("ij,kjn->kin", self._method.A, rates)
-        return found
+    def _completed(self, x: Array, u: Array) -> Array:
+        return x if self._algebraic is None else self._algebraic.complete(x, u)
 
-    def _stages(self, x: Array, u: Array, h: Array) -> Array:
-        """The stages (K, s, n) of one substep; NaN where the iteration does not converge."""
-        count, n = x.shape
-        s = len(self._method.A)
-        Z = np.zeros((count, s, n))
+    def _at_stages(self, function: Batched, x: Array, u: Array, W: Array) -> Array:
+        """The rates (K, s, n + k) at the stages, or their Jacobians (K, s, n + k, n + k)."""
+        count, s, size = W.shape
+        states = W.copy()
+        states[..., : x.shape[1]] += x[:, None]
+        found = function(states.reshape(count * s, size), np.repeat(u, s, axis=0))
+        return found.reshape(count, s, *found.shape[1:])
+
+    def _slopes(self, x: Array, u: Array, W: Array) -> Array:
+        return self._at_stages(self._jacobian, x, u, W)
+
+    def _stages(self, w: Array, u: Array, h: Array) -> Array:
+        """The stages (K, s, n + k) of one substep; NaN where the iteration does not converge."""
+        x, W = w[:, : w.shape[1] - self._k], np.repeat(w[:, None], len(self._method.A), axis=1)
+        known = np.isfinite(w).all(axis=1)
+        W[..., : x.shape[1]] = 0.0
+        W[~known] = np.nan
         with np.errstate(all="ignore"):
-            self._iterate(x, u, h, Z, np.arange(count))
-        return Z
+            self._iterate(x, u, h, W, np.flatnonzero(known))
+        return W
 
-    def _iterate(self, x: Array, u: Array, h: Array, Z: Array, at: NDArray[np.intp]) -> None:
-        """Newton's iteration from Z = 0 for all these states, in place.
+    def _iterate(self, x: Array, u: Array, h: Array, W: Array, at: NDArray[np.intp]) -> None:
+        """Newton's iteration for all these states, in place.
 
         Steps are whole ones, which converge from far on stiff kinetics where a test of descent
-        would refuse them; a step that leads out of the rate's domain is halved.
+        would refuse them; a step that leads out of the functions' domain is halved.
         """
-        last = np.full(len(at), np.inf)
-        residual = self._residual(x[at], u[at], h[at], Z[at])
-        for _ in range(MOST_ITERATIONS):
-            J = self._slopes(x[at], u[at], Z[at])
-            step = -_times(_inverse(_newton_matrix(self._method.A, h[at], J)), residual)
+        if not at.size:
+            return
+        n, A, last = x.shape[1], self._method.A, np.full(len(at), np.inf)
+        side = np.ones((len(x), 1))
+        values = self._at_stages(self._rate, x[at], u[at], W[at])
+        for iteration in range(MOST_ITERATIONS):
+            found = eliminated(values, self._slopes(x[at], u[at], W[at]), n)
+            Z, J = W[at, :, :n], found.jacobian
+            residual = Z - h[at, None, None] * np.einsum("ij,kjn->kin", A, found.rate)
+            step = -_times(inverse(_newton_matrix(A, h[at], J)), residual)
             # What rounding of the states and of their flows amounts to in each equation.
-            size = np.abs(x[at]) + np.abs(Z[at] + step).max(axis=1)
+            size = np.abs(x[at]) + np.abs(Z + step).max(axis=1)
             size += h[at, None] * (np.abs(J).max(axis=1) @ size[..., None])[..., 0]
-            length = _length(step, size)
+            length = _length(step, size[:, None])
+            if W.shape[2] > n:
+                step, others = _with_algebraic(found, step, W[at, :, n:], size)
+                length = np.maximum(length, others)
             done = (length <= ROUNDING) | ((length <= SMALL) & (length > 0.5 * last))
-            lost, factor = ~np.isfinite(length), np.ones(len(at))
+            if iteration == 0:
+                side[at] = found.side[:, :1]
+            # Another solution for z is no stage of this step.
+            lost = ~np.isfinite(length) | (done & (found.side != side[at]).any(axis=1))
+            factor = np.ones(len(at))
             for _ in range(MOST_HALVINGS):
-                trial = Z[at] + factor[:, None, None] * step
-                residual = self._residual(x[at], u[at], h[at], trial)
-                outside = ~(np.isfinite(residual).all(axis=(1, 2)) | done | lost)
+                trial = W[at] + factor[:, None, None] * step
+                values = self._at_stages(self._rate, x[at], u[at], trial)
+                outside = ~(np.isfinite(values).all(axis=(1, 2)) | done | lost)
                 if not outside.any():
                     break
                 factor[outside] *= 0.5
             trial[lost | outside] = np.nan
-            Z[at] = trial
+            W[at] = trial
             left = ~(done | lost | outside)
             if not left.any():
                 return
-            at, residual, last = at[left], residual[left], length[left]
-        Z[at] = np.nan
+            at, values, last = at[left], values[left], length[left]
+        W[at] = np.nan
 
 
-def _inverse(matrix: Array) -> Array:
-    """The inverses (K, sn, sn); NaN of those that are singular or not finite."""
-    found = np.full_like(matrix, np.nan)
-    good = np.isfinite(matrix).all(axis=(1, 2))
-    try:
-        found[good] = np.linalg.inv(matrix[good])
-    except np.linalg.LinAlgError:
-        for k in np.flatnonzero(good):
-            try:
-                found[k] = np.linalg.inv(matrix[k])
-            except np.linalg.LinAlgError:
-                continue
-    return found
-
-
-def _solved(matrix: Array, right: Array) -> Array:
-    """The solutions (K, sn, n); an inverse alone loses digits where the matrix is stiff."""
-    inverse = _inverse(matrix)
-    found: Array = inverse @ right
-    found += inverse @ (right - matrix @ found)
-    return found
+def _with_algebraic(
+    found: Eliminated, step: Array, z: Array, size: Array
+) -> tuple[Array, Array]:
+    """The correction (K, s, n + k) of Z and z, and the largest share (K,) of that of z."""
+    move = found.step + (found.slope @ step[..., None])[..., 0]
+    sizes = algebraic_sizes(found, np.repeat(size[:, None], z.shape[1], axis=1), np.abs(z + move))
+    return np.concatenate((step, move), axis=2), _length(move, sizes)
 
 
 def _newton_matrix(A: Array, h: Array, J: Array) -> Array:
@@ -201,8 +218,8 @@ def _times(matrix: Array, stages: Array) -> Array:
 
 
 def _length(step: Array, size: Array) -> Array:
-    """The largest share (K,) that a correction (K, s, n) has of the sizes (K, n)."""
-    shares = np.abs(step) / size[:, None]
-    shares[(step == 0.0) & (size[:, None] == 0.0)] = 0.0  # a state that stays 0
+    """The largest share (K,) that a correction (K, s, n) has of sizes that broadcast to it."""
+    shares = np.abs(step) / size
+    shares[(step == 0.0) & (size == 0.0)] = 0.0  # a state that stays 0
     found: Array = shares.max(axis=(1, 2))
     return found

@@ -26,6 +26,7 @@ from .traces import Pinned, warn_of
 if TYPE_CHECKING:
     from .augmentation import Augmentation
     from .constraints import ConstraintFunctions
+    from .dae import Equations
     from .system import System
     from .system_arguments import SystemOptions
 
@@ -171,6 +172,8 @@ class Origin:
         The rate, which is traced in the place of f.
     rate_jacobian : Jacobian, optional
         The Jacobian of the rate, where the user gave it.
+    equations : Equations, optional
+        The functions of a DAE: ``rate`` then is the joint function of states and algebraic states.
     sources : dict, optional
         Functions of x and u, named ``f`` and ``h``, which are traced in the place of f and h.
     kernel : ModelKernel, optional
@@ -202,6 +205,7 @@ class Origin:
     how: Discretization | None = None
     rate: BatchedFunction | None = None
     rate_jacobian: Jacobian | None = None
+    equations: Equations | None = None
     sources: dict[str, Callable[[Array, Array], Any]] | None = None
     kernel: ModelKernel | None = None
     jacobians: str = "given"

@@ -51,11 +51,11 @@ def made_from_ode(
 
     def timed(system: System) -> System:
         return cls.made(
-            Trusted(_timed_by_input(step, m)), Trusted(_without_last(system.h.batch, m)),
+            Trusted(timed_by_input(step, m)), Trusted(without_last(system.h.batch, m)),
             Origin(is_timed=True), n=n, p=p, m=m + 1,
-            f_jacobian=step_jacobian and Trusted(_timed_by_input(step_jacobian, m)),
+            f_jacobian=step_jacobian and Trusted(timed_by_input(step_jacobian, m)),
             h_jacobian=h_jacobian and Trusted(
-                _without_last(system.evaluation.functions.h_jacobian.batch, m)
+                without_last(system.evaluation.functions.h_jacobian.batch, m)
             ),
             **timed_options(options),
         )
@@ -102,14 +102,16 @@ def _of_inputs(function: Function, m: int, x: Array, *u: Array) -> Any:
     return function(x, u[0] if m else np.empty((len(x), 0)))
 
 
-def _timed_by_input(step: Function, m: int) -> Function:
+def timed_by_input(step: Function, m: int) -> Function:
+    """A step of (dt, x, u) as a function of x and an input that ends with dt."""
     def evaluate(x: Array, u: Array) -> Any:
         return step(u[..., m:], x, u[..., :m]) if m else step(u, x)
 
     return evaluate
 
 
-def _without_last(function: Function, m: int) -> Function:
+def without_last(function: Function, m: int) -> Function:
+    """A function of x and u as one of an input that has one more entry."""
     def evaluate(x: Array, u: Array) -> Any:
         return function(x, u[..., :m]) if x.ndim > 1 else function(x[None], u[None, :m])[0]
 

@@ -16,9 +16,11 @@ from qpmhe_solvers.values import shown
 from .._checks import dimension
 from ..errors import InvalidInputError, ModelError
 from .constraints import Constraint, ConstraintFunctions, checked_constraints
+from .dae import made_from_dae
 from .derivatives import Jacobian
 from .discretize import checked_discretization
 from .functions import BatchedFunction, Trusted
+from .implicit_steps import COLLOCATIONS
 from .model import Model, ModelCache, Origin, check_at
 from .ode import made_from_ode
 from .points import FEW, USUAL, Points, points
@@ -207,6 +209,7 @@ class System:
             own["tracing"] = ModelTrace(
                 origin.rate or functions.f, functions.h, n, p, m, self.states,
                 origin.dt if known else None, origin.how if known else None, origin.sources,
+                origin.equations,
             )
         own["evaluation"] = Model(self, functions, functions, scales)
         own["_models"] = ModelCache()
@@ -300,6 +303,8 @@ class System:
         ModelError
             If f, h, their Jacobians or a constraint are not finite there, or of a wrong shape.
         """
+        if self.origin.equations is not None:
+            self.origin.equations.check(x, u[: self.m - self.origin.is_timed])
         model = self.evaluation.at(x, u)
         found = self if model is self.evaluation else self.evaluated_by(model)
         if self.constraints is not None:
@@ -492,6 +497,104 @@ class System:
             rate_jacobian=rate_jacobian,
             h_jacobian=h_jacobian, options=options,
         )
+
+    @classmethod
+    def from_dae(
+        cls,
+        rate: Function | Trusted,
+        algebraic: Function | Trusted,
+        h: Function | Trusted,
+        *,
+        dt: float,
+        n: int,
+        k: int,
+        p: int,
+        m: int = 0,
+        algebraic_guess: ArrayLike,
+        method: str = "radau",
+        steps: int = 1,
+        **options: Unpack[SystemOptions],
+    ) -> System:
+        r"""Discretise a differential-algebraic equation of index 1; u is held over the step.
+
+        .. math::
+            \dot x = f_c(x, z, u), \qquad 0 = g(x, z, u), \qquad y = h(x, z, u)
+
+        The algebraic states z are functions z(x, u), wherever :math:`\partial g / \partial z` is
+        regular. An estimator estimates x; `algebraic_states` gives the z of a state. The
+        disturbance w acts in discrete time: it is added to x once a step. Where u jumps, z jumps
+        with it: y(t) is that of u(t), the input held from t on.
+
+        Newton's method solves for z from ``algebraic_guess``, and for stages and z of a step
+        together; both go on until rounding stops them, so that nothing depends on what was solved
+        before. Where it fails, the model fails at this state.
+
+        Parameters
+        ----------
+        rate, algebraic, h : callable
+            f_c(x, z, u) (n,), in units of x per unit of time, g(x, z, u) (k,) and h(x, z, u) (p,),
+            or functions of x and z alone. Functions that cannot be traced have derivatives by
+            differences.
+        dt : float
+            Sampling time, in the time unit of the rate.
+        n, k, p, m : int
+            Numbers of states, algebraic states, outputs and inputs; m is 0 without inputs.
+        algebraic_guess : (k,) array_like
+            Where z is looked for, in its units; it picks one of several solutions. Its magnitudes
+            are those of z for derivatives by differences.
+        method : {"radau", "midpoint"}
+            As for `from_ode`.
+        steps : int
+            Number of substeps of equal length in each sample.
+        **options
+            As for `System`.
+
+        Raises
+        ------
+        OptionError, ShapeError
+            If dt is not positive, the method unknown, steps no integer from 1 on, or the guess
+            does not have k entries.
+        ModelError, SetError
+            As for `System`; also if :math:`\partial g / \partial z` is singular, structurally or at
+            all points that are tried (index 2), or at the guess (a fold). An estimator raises one
+            if no z is found at its initial state.
+
+        Examples
+        --------
+        A pendulum that a spring holds, whose force f solves an equation:
+
+        >>> import numpy as np, qpmhe
+        >>> system = qpmhe.System.from_dae(
+        ...     lambda x, z: np.stack([x[1], z[0] - np.sin(x[0])]),
+        ...     lambda x, z: z + 0.1 * z**3 + x[:1], lambda x, z: x[0] + z[0],
+        ...     dt=0.1, n=2, k=1, p=1, algebraic_guess=[0.0])
+        >>> system.algebraic_states(np.array([1.1, 0.0]))
+        array([-1.])
+        """
+        return made_from_dae(
+            cls, rate, algebraic, h, dt=dt, n=n, k=k, p=p, m=m,
+            how=checked_discretization(method, steps, tuple(COLLOCATIONS)),
+            guess=algebraic_guess, options=options,
+        )
+
+    def algebraic_states(self, x: ArrayLike, u: ArrayLike | None = None) -> Array:
+        """The algebraic states z (..., k) at states x (..., n) and inputs u (..., m); NaN for none.
+
+        Parameters
+        ----------
+        x, u : array_like
+            States, such as those of an estimate, and inputs, which may be left out if m is 0.
+
+        Raises
+        ------
+        InvalidInputError
+            If the system has none (see `from_dae`), or u is missing.
+        ShapeError
+            If the last dimension is not n or m.
+        """
+        if self.origin.equations is None:
+            raise InvalidInputError("the system has no algebraic states; see System.from_dae.")
+        return self.origin.equations.algebraic_states(x, u, self.n, self.m)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Made again from the user's functions: the closures inside cannot be pickled.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,12 @@ from .discretize import Discretization
 from .evaluation import Evaluator, machine
 from .expressions import CasadiModel, import_casadi
 from .functions import BatchedFunction, Trusted
-from .points import ALL, USUAL, Points, points
+from .points import ALL, USUAL, Magnitude, Points, points
 from .sets import ConvexSet
 from .tracing import Traced, difference, expressed
+
+if TYPE_CHECKING:
+    from .dae import Equations
 
 Array = NDArray[np.float64]
 
@@ -42,7 +45,7 @@ class Pinned:
 
     def __init__(
         self, found: dict[str, Traced], n: int, p: int, m: int, dt: float | None,
-        how: Discretization | None,
+        how: Discretization | None, guess: tuple[float, ...] = (),
     ) -> None:
         self.found, self.m = found, m
         self._evaluators: dict[bool, Evaluator] = {}
@@ -50,12 +53,12 @@ class Pinned:
         self._partial: CasadiModel | None = None
         if any(one.function for one in found.values()):
             ca = import_casadi()
-            x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
+            x, u = ca.SX.sym("x", n + len(guess)), ca.SX.sym("u", m)
             f, h = (
                 found[name].function or ca.Function(name, [x, u], [ca.DM.zeros(size)])
-                for name, size in (("f", n), ("h", p))
+                for name, size in (("f", n + len(guess)), ("h", p))
             )
-            self._partial = CasadiModel(f, h, n, p, m, dt, how)
+            self._partial = CasadiModel(f, h, n, p, m, dt, how, guess)
         self.model = self._partial if all(one.function for one in found.values()) else None
 
     def evaluator(self, timed: bool = False) -> Evaluator:
@@ -87,13 +90,20 @@ class ModelTrace:
         Functions of x and u, named ``f`` and ``h``, to be traced in place of those above, which
         they are to agree with: f then is the step where there is a step length, and its source
         the rate.
+    equations : Equations, optional
+        The functions of a DAE, which then are traced as functions of w = (x, z), f with the
+        algebraic residuals below the rate.
     """
 
     def __init__(
         self, f: BatchedFunction, h: BatchedFunction, n: int, p: int, m: int,
         states: ConvexSet | None, dt: float | None = None, how: Discretization | None = None,
         sources: dict[str, Callable[[Array, Array], Any]] | None = None,
+        equations: Equations | None = None,
     ) -> None:
+        self._equations, self._width = equations, n
+        if equations is not None:
+            f, h, self._width = equations.joint, equations.output, equations.joint.shape[0]
         self._sources = sources
         self._batched = {"f": f, "h": h}
         self._functions = {name: of_both(one) for name, one in self._batched.items()}
@@ -107,7 +117,7 @@ class ModelTrace:
         """The traces as they were found last."""
         with self._lock:
             if self._now is None:
-                self._trace(points(ALL, self._n, self._m, self._states))
+                self._trace(self._points(ALL))
             assert self._now is not None
             return self._now
 
@@ -126,22 +136,32 @@ class ModelTrace:
         """
         if self._sources is not None:
             return expressed(self._sources[name], (self._n, self._m), name)
-        return expressed(self._functions[name], (self._n, self._m), name, watched=True)
+        return expressed(self._functions[name], (self._width, self._m), name, watched=True)
+
+    def _points(self, magnitudes: Sequence[Magnitude], scales: Array | float = 1.0) -> Points:
+        """Where traces and functions are compared."""
+        if self._equations is not None:
+            return self._equations.points(magnitudes, self._m, self._states, scales)
+        return points(magnitudes, self._n, self._m, self._states, scales)
 
     def _pin(self, found: dict[str, Traced]) -> None:
-        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.how)
+        guess = () if self._equations is None else tuple(self._equations.guess.tolist())
+        if guess and found["f"].function is None and found["h"].function is not None:
+            reason = f"it needs the algebraic equations, which are not: {found['f'].reason}"
+            found = {**found, "h": Traced(None, reason)}
+        self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.how, guess)
 
     def _traced(self, name: str, where: Points) -> Traced:
         function = self._functions[name]
         source = function if self._sources is None else self._sources[name]
-        found = expressed(source, (self._n, self._m), name)
+        found = expressed(source, (self._width, self._m), name)
         if found.function is None:
             return found
         fault = self._difference(name, found, where)
         if fault:
             warn_of(f"{name} cannot be traced: {fault}")
             return Traced(None, fault)
-        size, count = self._n if name == "f" else self._p, found.function.n_instructions()
+        size, count = self._width if name == "f" else self._p, found.function.n_instructions()
         if found.function.numel_out() != size:
             return Traced(None, f"it returns shape {found.shape} of symbols; expected ({size},)")
         if count > _MOST_OPERATIONS:
@@ -167,14 +187,14 @@ class ModelTrace:
         Functions that have changed since they were traced are traced again, once.
         """
         units = 1.0 if scales is None else scales
-        where = points(USUAL, self._n, self._m, self._states, units)
+        where = self._points(USUAL, units)
         with self._lock:
             if self._now is None:
-                self._trace([*points(ALL, self._n, self._m, self._states), *where])
+                self._trace([*self._points(ALL), *where])
                 return self.now
             for name, one in self.now.found.items():
                 if one.function and self._difference(name, one, where):
-                    all_points = [*points(ALL, self._n, self._m, self._states), *where]
+                    all_points = [*self._points(ALL), *where]
                     again = self._traced(name, all_points)
                     self._pin({**self.now.found, name: again})
             return self.now
@@ -229,6 +249,8 @@ class ModelTrace:
 
     def wrong(self, pinned: Pinned, where: Points) -> tuple[str, str] | None:
         """Which function differs from its trace at these points, and how; None if none does."""
+        if self._equations is not None:
+            where = self._equations.at_guess(where)
         for name, one in pinned.found.items():
             if one.function is None:
                 continue

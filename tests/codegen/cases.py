@@ -294,6 +294,40 @@ def _kinetics(method, steps=1):
     return Case(system, observer, cost, np.array([0.9, 0.004, 0.25]), tuple(samples), options)
 
 
+def _swing(method="radau", steps=1):
+    """A generator at a bus with a load, whose angle and voltage are algebraic states."""
+
+    def flows(x, z):
+        angle, voltage = x[..., 0] - z[..., 0], z[..., 1]
+        return (
+            3.6 * voltage * np.sin(angle), 2.0 * voltage * np.sin(z[..., 0]),
+            3.6 * voltage * np.cos(angle) + 2.0 * voltage * np.cos(z[..., 0]) - 5.3 * voltage**2,
+        )
+
+    def rate(x, z, u):
+        return np.stack([x[..., 1], 4.0 * (u[..., 0] - flows(x, z)[0] - 0.3 * x[..., 1])], -1)
+
+    def balance(x, z):
+        generated, sent, reactive = flows(x, z)
+        return np.stack([generated - sent - 0.3 * z[..., 1], reactive - 0.2], -1)
+
+    system = qpmhe.System.from_dae(
+        rate, balance, lambda x, z, u: np.stack([z[..., 1], z[..., 0] + 0.1 * u[..., 0]], -1),
+        dt=0.1, n=2, k=2, p=2, m=1, algebraic_guess=[0.0, 1.0], method=method, steps=steps,
+    )
+    cost = QuadraticCost.from_covariances(
+        prior=np.diag([0.1, 0.2]) ** 2, disturbance=np.diag([0.01, 0.05]) ** 2,
+        noise=0.01**2 * np.eye(2),
+    )
+    model, generator, x, samples = system.model(), np.random.default_rng(3), np.zeros(2), []
+    for u in 0.8 + generator.uniform(-0.1, 0.1, (14, 1)):
+        y = model.functions.h(x, u) + 0.01 * generator.standard_normal(2)
+        samples.append({"y": y, "u": u})
+        x = model.functions.f(x, u)
+    observer, options = Luenberger([[0.1, 0.3], [0.2, 1.5]]), {"horizon": 4, "max_qps": 2}
+    return Case(system, observer, cost, np.array([0.1, 0.1]), tuple(samples), options)
+
+
 def _rate(x):
     return ca.sin(ca.vertcat(x[1:], x[0])) - 1.4 * x
 
@@ -735,6 +769,11 @@ FEATURES = {
         "euler substeps": (lambda: _plain(
             _rate, lambda x: [x[0]], 3, 1, dt=0.3, method="euler", substeps=2
         ),),
+    },
+    "algebraic": {
+        "algebraic": (_swing, with_conditions),
+        "algebraic substeps": (lambda: _swing(steps=2), filtered(), gaps, AGAIN, WARM),
+        "algebraic midpoint": (lambda: _swing("midpoint", 3), filtered(UKF), gaps),
     },
     "failing": {
         "power failing": (lambda: _failing(1.8), losses(**dict.fromkeys(TERMS, power(1.5)))),

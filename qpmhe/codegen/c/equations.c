@@ -1,0 +1,47 @@
+/* Linear equations by LU factors with row pivots. Matrices are stored by rows. */
+
+/* The factors of M, in place; whether M is regular. */
+static int mhe_factor_equations(int size, real *M, int *pivot)
+{
+    for (int c = 0; c < size; c++) {
+        int best = c;
+        for (int r = c + 1; r < size; r++)
+            if (fabs(M[r * size + c]) > fabs(M[best * size + c])) best = r;
+        pivot[c] = best;
+        if (!(fabs(M[best * size + c]) > 0) || !isfinite(M[best * size + c])) return 0;
+        if (best != c)
+            for (int j = 0; j < size; j++) {
+                const real held = M[c * size + j];
+                M[c * size + j] = M[best * size + j];
+                M[best * size + j] = held;
+            }
+        for (int r = c + 1; r < size; r++) {
+            const real share = M[r * size + c] /= M[c * size + c];
+            if (share != 0)
+                for (int j = c + 1; j < size; j++) M[r * size + j] -= share * M[c * size + j];
+        }
+    }
+    return 1;
+}
+
+/* The solution of M z = z of some columns, with the factors of M, in place. */
+static void mhe_solve_equations(int size, const real *M, const int *pivot, int columns, real *z)
+{
+    for (int c = 0; c < size; c++)
+        if (pivot[c] != c)
+            for (int j = 0; j < columns; j++) {
+                const real held = z[c * columns + j];
+                z[c * columns + j] = z[pivot[c] * columns + j];
+                z[pivot[c] * columns + j] = held;
+            }
+    for (int c = 0; c < size; c++)
+        for (int r = c + 1; r < size; r++)
+            for (int j = 0; j < columns; j++)
+                z[r * columns + j] -= M[r * size + c] * z[c * columns + j];
+    for (int c = size - 1; c >= 0; c--) {
+        for (int j = 0; j < columns; j++) z[c * columns + j] /= M[c * size + c];
+        for (int r = 0; r < c; r++)
+            for (int j = 0; j < columns; j++)
+                z[r * columns + j] -= M[r * size + c] * z[c * columns + j];
+    }
+}

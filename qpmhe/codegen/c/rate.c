@@ -1,0 +1,32 @@
+/* The rate of a model without algebraic states, at a stage of a step. */
+
+#define NW NX
+
+typedef struct {
+    real rate[NX], jacobian[NX * NX];
+    int side;
+} mhe_reduced;
+
+static int mhe_complete(const real *x, const real *u, real *w)
+{
+    (void)u;
+    for (int j = 0; j < NX; j++) w[j] = x[j];
+    return 1;
+}
+
+static int mhe_reduce(const real *w, const real *u, mhe_reduced *r)
+{
+    real nonzeros[SIZE(MHE_F_NONZEROS)];
+    mhe_call_f_jacobian(w, u, r->rate, nonzeros);
+    mhe_spread(NX * NX, MHE_F_NONZEROS, mhe_f_place, nonzeros, r->jacobian);
+    r->side = 1;
+    for (int i = 0; i < NX; i++)
+        if (!isfinite(r->rate[i])) return 0;
+    return 1;
+}
+
+static real mhe_move_algebraic(const mhe_reduced *r, const real *w, const real *sizes, real *step)
+{
+    (void)r; (void)w; (void)sizes; (void)step;
+    return 0;
+}

@@ -1,0 +1,516 @@
+"""Systems with algebraic states: steps, derivatives, start values, the estimator, bad input."""
+
+import pickle
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import qpmhe
+from qpmhe import Box, ExtendedKalman, Luenberger, MovingHorizonEstimator, QuadraticCost, System
+from qpmhe.codegen.compiler import find_compiler
+from qpmhe.errors import ModelError, OptionError, ShapeError
+from qpmhe.model.implicit_steps import COLLOCATIONS
+
+NONE = np.zeros(0)
+ENGINES = ["python", pytest.param("compiled", marks=pytest.mark.skipif(
+    not find_compiler(), reason="there is no C compiler"))]
+
+
+# A swing model: the angle and the voltage of a bus with a load belong to each state.
+
+def flows(x, z):
+    angle, voltage = x[..., 0] - z[..., 0], z[..., 1]
+    return (
+        3.6 * voltage * np.sin(angle), 2.0 * voltage * np.sin(z[..., 0]),
+        3.6 * voltage * np.cos(angle) + 2.0 * voltage * np.cos(z[..., 0]) - 5.3 * voltage**2,
+    )
+
+
+def swing(x, z, u):
+    return np.stack([x[..., 1], 4.0 * (u[..., 0] - flows(x, z)[0] - 0.3 * x[..., 1])], -1)
+
+
+def balance(x, z):
+    generated, sent, reactive = flows(x, z)
+    return np.stack([generated - sent - 0.3 * z[..., 1], reactive - 0.2], -1)
+
+
+def voltage(x, z, u):
+    return np.stack([z[..., 1], z[..., 0] + 0.1 * u[..., 0]], -1)
+
+
+SIZES = {"n": 2, "k": 2, "p": 2, "m": 1}
+X, U = np.array([0.3, 0.4]), np.array([0.8])
+
+
+def swing_system(**options):
+    return System.from_dae(
+        swing, balance, voltage,
+        **SIZES | {"dt": 0.1, "algebraic_guess": [0.0, 1.0]} | options,
+    )
+
+
+# A cubic equation, whose one solution is known, so that an ODE is the same model.
+
+def force(x, z):
+    return z + 0.1 * z**3 + x[..., :1] + 0.5 * x[..., 1:] - 0.2
+
+
+def pulled(x, z, u):
+    return np.stack([x[..., 1], z[..., 0] + u[..., 0] - np.sin(x[..., 0])], -1)
+
+
+def solved_force(x):
+    """Cardano's formula."""
+    right = -(x[..., 0] + 0.5 * x[..., 1] - 0.2) / 0.1
+    root = np.sqrt(0.25 * right**2 + 1000.0 / 27.0)
+    return np.cbrt(0.5 * right + root) + np.cbrt(0.5 * right - root)
+
+
+def cubic_system(**options):
+    return System.from_dae(
+        pulled, force, lambda x, z: x[..., :1] + 0.3 * z,
+        **{"dt": 0.3, "n": 2, "k": 1, "p": 1, "m": 1, "algebraic_guess": [0.0]} | options,
+    )
+
+
+def reduced_system(**options):
+    def rate(x, u):
+        return np.stack([x[..., 1], solved_force(x) + u[..., 0] - np.sin(x[..., 0])], -1)
+
+    return System.from_ode(
+        rate, lambda x: x[..., :1] + 0.3 * solved_force(x)[..., None],
+        **{"dt": 0.3, "n": 2, "p": 1, "m": 1, "method": "radau"} | options,
+    )
+
+
+def robertson(x, z):
+    one, two, three = 0.04 * x[..., 0], 1e4 * x[..., 1] * z[..., 0], 3e7 * x[..., 1] ** 2
+    return np.stack([two - one, one - two - three], -1)
+
+
+def conserved(x, z):
+    return x[..., :1] + x[..., 1:] + z - 1.0
+
+
+def robertson_system(**options):
+    return System.from_dae(
+        robertson, conserved, lambda x, z: z, n=2, k=1, p=1, algebraic_guess=[0.1], **options
+    )
+
+
+def untraced(function):
+    """The same function, called state by state: a branch on a value stops the trace."""
+    def called(x, z, *u):
+        assert float(x[0]) < 1e300
+        return function(x, z, *u)
+
+    return (lambda x, z: called(x, z)) if function.__code__.co_argcount == 2 else (
+        lambda x, z, u: called(x, z, u)
+    )
+
+
+def evaluated(system, x, u=NONE):
+    """F, h and their Jacobians at one state, as an estimator evaluates them."""
+    model, states, inputs = system.model(), np.array([x]), np.array([u])
+    f, h = model.step(states, inputs)[0], model.output(states, inputs)[0]
+    return f, h, *(one[0] for one in model.linear(states, inputs))
+
+
+@pytest.mark.parametrize("method", COLLOCATIONS)
+def test_the_error_falls_with_the_order(method):
+    def rate(t, x):
+        return pulled(x, solved_force(x)[..., None], U)
+
+    exact = solve_ivp(rate, (0.0, 2.0), X, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    counts = (4, 8, 16)
+    errors = [
+        np.abs(evaluated(cubic_system(dt=2.0, method=method, steps=one), X, U)[0] - exact).max()
+        for one in counts
+    ]
+    slopes = -np.diff(np.log(errors)) / np.diff(np.log(counts))
+    assert slopes.min() > COLLOCATIONS[method].order - 0.4, slopes
+
+
+@pytest.mark.parametrize("method", COLLOCATIONS)
+def test_the_ode_without_the_algebraic_state_has_the_same_step(method):
+    """All stages solve the equations, so that both are the same method."""
+    options, x = {"method": method, "steps": 2}, np.array([0.7, -0.4])
+    for mine, other in zip(
+        evaluated(cubic_system(**options), x, U), evaluated(reduced_system(**options), x, U),
+        strict=True,
+    ):
+        np.testing.assert_allclose(mine, other, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(("x", "dt", "steps"), [
+    ([0.9664597373, 3.0746e-05], 1.0, 4), ([0.7, 1e-5], 40.0, 2),
+])
+def test_robertson_as_a_dae(x, dt, steps):
+    """Against SciPy's Radau at 1e-12, per component."""
+    def rate(t, x):
+        return robertson(x, 1.0 - x[..., :1] - x[..., 1:])
+
+    expected = solve_ivp(
+        rate, (0.0, dt), x, method="Radau", rtol=1e-12, atol=1e-16, max_step=dt / 100
+    ).y[:, -1]
+    f, h, _, _ = evaluated(robertson_system(dt=dt, steps=steps), x)
+    np.testing.assert_allclose(f, expected, rtol=2e-7)
+    np.testing.assert_allclose(h, [1.0 - x[0] - x[1]], rtol=1e-14)
+
+
+def test_the_step_against_idas():
+    ca = pytest.importorskip("casadi")
+    x, z, u = ca.MX.sym("x", 2), ca.MX.sym("z", 2), ca.MX.sym("u")
+    angle = x[0] - z[0]
+    generated, sent = 3.6 * z[1] * ca.sin(angle), 2.0 * z[1] * ca.sin(z[0])
+    reactive = 3.6 * z[1] * ca.cos(angle) + 2.0 * z[1] * ca.cos(z[0]) - 5.3 * z[1] ** 2
+    integrator = ca.integrator("step", "idas", {
+        "x": x, "z": z, "p": u,
+        "ode": ca.vertcat(x[1], 4.0 * (u - generated - 0.3 * x[1])),
+        "alg": ca.vertcat(generated - sent - 0.3 * z[1], reactive - 0.2),
+    }, 0.0, 0.1, {"reltol": 1e-11, "abstol": 1e-12})
+    expected = integrator(x0=X, z0=[0.0, 1.0], p=U)
+    system = swing_system(steps=4)
+    f = evaluated(system, X, U)[0]
+    np.testing.assert_allclose(f, expected["xf"].full().ravel(), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        system.algebraic_states(f, U), expected["zf"].full().ravel(), rtol=0, atol=1e-8
+    )
+
+
+def in_complex_numbers(functions, guess, x, u, dt):
+    """x+ and y by one step of Radau IIA, all unknowns at once, and their complex-step slopes."""
+    rate, algebraic, output = functions
+    method, n, k = COLLOCATIONS["radau"], x.size, guess.size
+    s = len(method.A)
+
+    def residual(x, unknowns):
+        W = unknowns[: s * (n + k)].reshape(s, n + k)
+        z = unknowns[s * (n + k) :]
+        states, others = x + W[:, :n], W[:, n:]
+        us = np.tile(u, (s, 1))
+        rates = np.array([rate(*one) for one in zip(states, others, us, strict=True)])
+        rest = np.array([algebraic(*one) for one in zip(states, others, us, strict=True)])
+        return np.concatenate((
+            (W[:, :n] - dt * method.A @ rates).ravel(), rest.ravel(), algebraic(x, z, u)
+        ))
+
+    def slope(x, at):
+        step = 1e-30
+        return np.stack([
+            residual(x, at + 1j * step * one).imag / step for one in np.eye(at.size)
+        ], -1)
+
+    at = np.concatenate((np.tile(np.concatenate((np.zeros(n), guess)), s), guess))
+    for _ in range(30):
+        at = at - np.linalg.solve(slope(x, at), residual(x, at).real)
+    J, columns = slope(x, at), []
+    for j in range(n):
+        moved, there = x + 1e-30j * np.eye(n)[j], at.astype(complex)
+        for _ in range(4):
+            there = there - np.linalg.solve(J, residual(moved, there))
+        W, z = there[: s * (n + k)].reshape(s, n + k), there[s * (n + k) :]
+        columns.append((moved + method.d @ W[:, :n], output(moved, z, u)))
+    first, second = zip(*columns, strict=True)
+    return (
+        first[0].real, second[0].real,
+        np.stack([one.imag / 1e-30 for one in first], -1),
+        np.stack([np.asarray(one).imag / 1e-30 for one in second], -1),
+    )
+
+
+def _without_input(function):
+    return lambda x, z, u: function(x, z)
+
+
+@pytest.mark.parametrize(("functions", "guess", "x", "u", "dt"), [
+    ((swing, _without_input(balance), voltage), [0.0, 1.0], X, U, 0.1),
+    ((swing, _without_input(balance), voltage), [0.0, 1.0], X, U, 2.0),
+    ((_without_input(robertson), _without_input(conserved), lambda x, z, u: z), [0.1],
+     [0.9, 3e-5], [0.0], 1.0),
+], ids=["swing", "swing, long", "robertson"])
+def test_values_and_derivatives_against_the_complex_step(functions, guess, x, u, dt):
+    x, u, guess = np.array(x), np.array(u), np.array(guess)
+    system = System.from_dae(
+        *functions, dt=dt, n=x.size, k=guess.size, p=len(functions[2](x, guess, u)), m=1,
+        algebraic_guess=guess,
+    )
+    expected = in_complex_numbers(functions, guess, x, u, dt)
+    for mine, theirs in zip(evaluated(system, x, u), expected, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("kind", ["traced", "called"])
+def test_start_values_and_what_was_solved_before_change_nothing(kind):
+    change = untraced if kind == "called" else lambda one: one
+    found = []
+    for guess in ([0.0, 1.0], [0.3, 0.8], [-0.4, 1.4]):
+        system = System.from_dae(
+            change(swing), change(balance), change(voltage), dt=0.1, **SIZES, algebraic_guess=guess
+        )
+        model = system.model()
+        first = np.concatenate((model.functions.f(X, U), model.functions.h(X, U)))
+        for x in np.random.default_rng(0).normal(size=(5, 2)):
+            model.functions.f(x, U)
+        again = np.concatenate((model.functions.f(X, U), model.functions.h(X, U)))
+        np.testing.assert_array_equal(first, again)
+        found.append(first)
+    for one in found[1:]:
+        np.testing.assert_allclose(one, found[0], rtol=0, atol=1e-13)
+
+
+def test_called_functions_have_the_step_of_traced_ones():
+    traced = swing_system(steps=2).model()
+    called = System.from_dae(
+        untraced(swing), untraced(balance), untraced(voltage), dt=0.1, steps=2, **SIZES,
+        algebraic_guess=[0.0, 1.0],
+    )
+    assert "not traced" in called.explain()
+    x, u = 0.3 * np.random.default_rng(0).normal(size=(5, 2)), np.full((5, 1), 0.7)
+    other = called.model()
+    np.testing.assert_allclose(other.step(x, u), traced.step(x, u), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(other.output(x, u), traced.output(x, u), rtol=0, atol=1e-13)
+    for mine, theirs in zip(other.linear(x, u), traced.linear(x, u), strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-8)
+
+
+def test_an_output_that_alone_is_traced_is_called_with_the_equations():
+    system = System.from_dae(
+        swing, untraced(balance), voltage, dt=0.1, **SIZES, algebraic_guess=[0.0, 1.0]
+    )
+    assert "h: not traced: it needs the algebraic equations" in system.explain()
+    for mine, theirs in zip(
+        evaluated(system, X, U), evaluated(swing_system(), X, U), strict=True
+    ):
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_units_scale_the_step(unit):
+    a, b, c = unit, 1.0 / unit, unit**0.5  # of x, z and g
+
+    def rate(x, z, u):
+        return a * swing(x / a, z / b, u)
+
+    scaled = System.from_dae(
+        rate, lambda x, z: c * balance(x / a, z / b), lambda x, z, u: voltage(x / a, z / b, u),
+        dt=0.1, **SIZES, algebraic_guess=[0.0, b], scales=[a, a],
+    )
+    plain, found = evaluated(swing_system(), X, U), evaluated(scaled, a * X, U)
+    for mine, theirs, size in zip(found, plain, (a, 1.0, 1.0, 1.0 / a), strict=True):
+        np.testing.assert_allclose(mine / size, theirs, rtol=1e-11)
+
+
+def test_steps_of_other_lengths_and_pickles():
+    system = swing_system(dt=0.5, steps=2)
+    short = swing_system(dt=0.2, steps=2).model()
+    np.testing.assert_array_equal(
+        system.model().timed.functions.f(X, np.append(U, 0.2)), short.functions.f(X, U)
+    )
+    np.testing.assert_allclose(
+        system.timed.f(X, np.append(U, 0.2)), short.functions.f(X, U), rtol=0, atol=1e-13
+    )
+    again = pickle.loads(pickle.dumps(system))
+    assert (again.steps, again.method) == (2, "radau")
+    np.testing.assert_array_equal(again.f(X, U), system.f(X, U))
+
+
+def test_algebraic_states_over_leading_dimensions():
+    system = swing_system()
+    z = system.algebraic_states(X, U)
+    assert np.abs(balance(X, z)).max() < 1e-14
+    many = system.algebraic_states(np.tile(X, (3, 4, 1)), U)
+    np.testing.assert_allclose(many, np.broadcast_to(z, (3, 4, 2)), rtol=0, atol=1e-15)
+    z = root_system().algebraic_states([[4.0], [-1.0]], [0.0])  # x = 0 is a fold
+    np.testing.assert_array_equal(z, [[2.0], [np.nan]])
+    with pytest.raises(ShapeError, match=r"x has shape \(3,\)"):
+        system.algebraic_states([1.0, 2.0, 3.0], U)
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="u is missing"):
+        system.algebraic_states(X)
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="no algebraic states"):
+        reduced_system().algebraic_states(X)
+
+
+def test_parameters_go_through_the_step():
+    """The damping as an unknown parameter; the step of the augmented system is the system's own."""
+    def rate(x, z, u):
+        return np.stack([x[..., 1], 4.0 * (u[..., 0] - flows(x, z)[0] - u[..., 1] * x[..., 1])], -1)
+
+    made = System.from_dae(
+        rate, balance, lambda x, z: z, dt=0.1, **SIZES | {"m": 2}, algebraic_guess=[0.0, 1.0]
+    )
+    augmented = qpmhe.augment_parameters(made, nominal=[0.3])
+    assert (augmented.n, augmented.m) == (3, 1)
+    assert "f: traced" in augmented.explain()
+    f, h, slope, _ = evaluated(augmented, np.append(X, 0.4), U)
+    expected = evaluated(made, X, np.append(U, 0.4))
+    np.testing.assert_allclose(f, np.append(expected[0], 0.4), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(h, expected[1], rtol=0, atol=1e-14)
+    moved = [evaluated(made, X, np.append(U, 0.4 + d))[0] for d in (1e-6, -1e-6)]
+    np.testing.assert_allclose(slope[:2, 2], (moved[0] - moved[1]) / 2e-6, rtol=1e-7, atol=1e-12)
+
+
+# The estimator.
+
+
+def weights(n, p, filtered=False):
+    covariances = {
+        "prior": 0.1 * np.eye(n), "disturbance": 0.01 * np.eye(n), "noise": 0.01 * np.eye(p)
+    }
+    if not filtered:
+        return Luenberger(0.3 * np.eye(n, p)), QuadraticCost.from_covariances(**covariances)
+    del covariances["prior"]
+    return ExtendedKalman(prior=0.1 * np.eye(n), **covariances), (
+        QuadraticCost.from_covariances(**covariances)
+    )
+
+
+@cache
+def record(samples=25):
+    model, generator, x, found = reduced_system().model(), np.random.default_rng(1), X, []
+    U = 0.2 * generator.normal(size=(samples, 1))
+    for u in U:
+        found.append(model.functions.h(x, u) + 0.1 * generator.normal(size=1))
+        x = model.functions.f(x, u) + 0.05 * generator.normal(size=2)
+    return np.array(found), U
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_estimates_equal_those_of_the_ode_without_the_algebraic_state(engine):
+    Y, U = record()
+    observer, cost = weights(2, 1, True)
+    options = {
+        "horizon": 5, "max_qps": None, "initial_state": [0.0, 0.0],
+        "states": Box([-2.0, -3.0], [2.0, 3.0]),
+    }
+    states = options.pop("states")
+    mine, other = (
+        MovingHorizonEstimator(make(states=states), observer, cost, engine=one, **options).run(Y, U)
+        for make, one in ((cubic_system, engine), (reduced_system, "python"))
+    )
+    np.testing.assert_allclose(mine.states, other.states, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(mine.costs, other.costs, rtol=1e-8)
+    assert (mine.costs <= mine.candidate_costs + 1e-12).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_snapshots_continue_bit_by_bit(engine):
+    Y, U = record()
+    observer, cost = weights(2, 1)
+    one, other = (
+        MovingHorizonEstimator(
+            cubic_system(), observer, cost, horizon=4, initial_state=start, engine=engine
+        ) for start in ([0.0, 0.0], [1.0, -1.0])
+    )
+    for y, u in zip(Y[:12], U, strict=False):
+        one.update(y, u)
+    other.load_state_dict(one.state_dict())
+    for y, u in zip(Y[12:], U[12:], strict=True):
+        np.testing.assert_array_equal(one.update(y, u).state, other.update(y, u).state)
+
+
+def root_system():
+    def rate(x, z):
+        return -z - 0.1 * x
+
+    return System.from_dae(
+        rate, lambda x, z, u: z * z - x + u, lambda x, z: x + z,
+        dt=0.1, n=1, k=1, p=1, m=1, algebraic_guess=[1.0],
+    )
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_equations_without_a_solution_are_a_failed_stage(engine):
+    """A large input takes the state beyond the fold at x = u."""
+    observer, cost = weights(1, 1)
+    mhe = MovingHorizonEstimator(
+        root_system(), observer, cost, horizon=4, initial_state=[4.0], engine=engine
+    )
+    for _ in range(5):
+        mhe.update([5.8], [0.0])
+    failed = mhe.update([5.8], [50.0])
+    assert qpmhe.Status.MODEL_FAILED in failed.status
+    assert np.isfinite(failed.state).all()
+    for _ in range(6):
+        last = mhe.update([5.0], [0.0])
+    assert qpmhe.Status.MODEL_FAILED not in last.status
+    assert np.isfinite(last.state).all()
+
+
+def test_batches():
+    Y, U = record()
+    observer, cost = weights(2, 1)
+    starts = np.random.default_rng(0).normal(size=(3, 2))
+    batch = qpmhe.BatchEstimator(
+        cubic_system(), observer, cost, horizon=4, initial_states=starts, members=3,
+        engine="python"
+    )
+    single = MovingHorizonEstimator(
+        cubic_system(), observer, cost, horizon=4, initial_state=starts[1], engine="python"
+    )
+    for y, u in zip(Y[:8], U, strict=False):
+        found = batch.update(np.tile(y, (3, 1)), np.tile(u, (3, 1)))
+        expected = single.update(y, u).state
+    np.testing.assert_allclose(found.states[1], expected, rtol=0, atol=1e-12)
+
+
+def test_certificates_refuse_algebraic_states():
+    from qpmhe.certificates.reading import expression_of
+
+    for name in ("f", "h"):
+        assert "algebraic states" in expression_of(cubic_system(), name).reason
+
+
+# Bad input.
+
+
+def made(algebraic=force, k=1, guess=(0.0,), **options):
+    return System.from_dae(
+        options.pop("rate", lambda x, z: x), algebraic, options.pop("h", lambda x, z: x[..., :1]),
+        **{"dt": 0.1, "n": 2, "k": k, "p": 1, "algebraic_guess": list(guess)} | options,
+    )
+
+
+@pytest.mark.parametrize(("arguments", "error", "words"), [
+    ({"guess": [0.0, 1.0]}, ShapeError, r"algebraic_guess has shape \(2,\); expected \(1,\)"),
+    ({"guess": [np.nan]}, qpmhe.errors.InvalidInputError, "algebraic_guess"),
+    ({"method": "rk4"}, OptionError, "method is 'rk4'; expected .*radau"),
+    ({"steps": 0}, OptionError, "steps is 0"),
+    ({"algebraic": lambda x, z: z[..., :1] * np.ones(2)}, ModelError,
+     r"algebraic returned shape \(2,\)"),
+    ({"rate": lambda x, z: z}, ModelError, r"rate returned shape \(1,\)"),
+    ({"rate": lambda x: x}, ModelError, r"rate\(x\) cannot be called as rate\(x, z\)"),
+    ({"rate": lambda x, z, u: x}, ModelError, "since m is 0"),
+    ({"m": 1}, ModelError, "m is 1, but neither rate nor algebraic nor h takes an input"),
+    ({"algebraic": 3.0}, ModelError, "algebraic is 3.0; expected a function"),
+    ({"algebraic": lambda x, z: x[..., :1]}, ModelError,
+     "equation 0 depends on no algebraic state.*structurally singular.*index 2"),
+    ({"algebraic": lambda x, z: np.stack([z[..., 0] - x[..., 0], 2.0 * z[..., 0]], -1), "k": 2,
+      "guess": [0.0, 0.0]}, ModelError, r"equation 1 depends on algebraic states \[0\] alone"),
+    ({"algebraic": lambda x, z: np.stack([
+        z[..., 0] - z[..., 1] - x[..., 0], 1e6 * (z[..., 1] - z[..., 0]) + x[..., 1]], -1),
+      "k": 2, "guess": [0.0, 0.0]}, ModelError, "singular at all points.*equation . depends"),
+    ({"algebraic": lambda x, z: z**2 - x[..., :1]}, ModelError,
+     r"singular at algebraic_guess = \[0.0\].*a fold"),
+])
+def test_bad_input_fails_at_construction(arguments, error, words):
+    with pytest.raises(error, match="(?s)" + words):
+        made(**arguments)
+
+
+@pytest.mark.parametrize(("algebraic", "guess", "words"), [
+    (lambda x, z: z**2 + 1.0 + x[..., :1] ** 2, [1.0],
+     "no solution at x = .*equation 0 has the largest residual"),
+    (lambda x, z: np.stack([z[..., 0] - 1.0, np.exp(z[..., 1]) + z[..., 0]], -1), [1.0, 0.0],
+     "equation 1 has the largest residual"),
+    (lambda x, z: np.sqrt(z - 5.0) - 1.0, [1.0], "no finite value.*equation 0 is nan"),
+])
+def test_an_initial_state_without_algebraic_states_is_an_error(algebraic, guess, words):
+    with np.errstate(all="ignore"):
+        system = made(algebraic, len(guess), guess)
+    observer, cost = weights(2, 1)
+    with pytest.raises(ModelError, match="(?s)" + words), np.errstate(all="ignore"):
+        MovingHorizonEstimator(system, observer, cost, horizon=3, initial_state=[0.5, 0.2])
