@@ -51,6 +51,8 @@ def record_of(memory: Any, layout: Layout, directions: Directions) -> MemoryReco
     far, dropped = memory["watched"].tolist()
     record.watched, record.last_good = (far, dropped), memory["last_good"].copy()
     record.damping = float(memory["damping"])
+    if layout.restarts:
+        record.restarted = int(memory["restarted"])
     if memory["has_trajectory"]:
         record.trajectory = memory["trajectory"][: length + 1].copy()
     if memory["has_smoothed"]:
@@ -90,6 +92,8 @@ def write(memory: Any, sizes: MemorySizes, record: MemoryRecord, own: dict[str, 
             memory[f"{field.name}_end"] = array[length]
     memory["watched"], memory["last_good"] = record.watched, record.last_good
     memory["damping"] = record.damping
+    if "restarts" in sizes.features:
+        memory["restarted"] = record.restarted
     memory["has_trajectory"] = record.trajectory is not None
     if record.trajectory is not None:
         memory["trajectory"][: length + 1] = record.trajectory

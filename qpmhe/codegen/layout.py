@@ -18,6 +18,7 @@ from ..estimation.conditions import USUAL, Conditions
 from ..estimation.estimate import DroppedRow, Status
 from ..estimation.limits import c_definitions
 from ..estimation.settings import Settings
+from ..estimation.window import larger
 from ..memory.fields import MemorySizes
 from ..model.residuals import Residual
 from ..model.sets import ConvexSet
@@ -60,7 +61,7 @@ _SET_TYPE = Template("""typedef struct {
 # Parts with numbers of their own, in words, other than terms, observer and innovation.
 _PARTS = {
     "covariances": "the observer's covariances", "elimination": "directions that have disturbances",
-    "quiet": "directions that have none",
+    "quiet": "directions that have none", "restart": "the test by which an observer is restarted",
 }
 
 
@@ -100,6 +101,8 @@ class Layout:
     clock: bool = False
     #: Whether a candidate outside of the sets is restored into them at a higher cost.
     restores: bool = False
+    #: Whether an observer that has run away is restarted from an estimate.
+    restarts: bool = False
     #: How outputs and states differ: 0 plainly, 1 by angles, 2 by functions.
     residuals: tuple[int, int] = (0, 0)
     #: Whether the set of states bounds angles.
@@ -121,6 +124,7 @@ class Layout:
     def of(
         cls, directions: Directions, horizon: int, real: str = "double",
         lapack: bool = False, clock: bool = False, restores: bool = False,
+        restarts: bool = False,
     ) -> Layout:
         """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
         system, observer, cost = directions.system, directions.observer, directions.cost
@@ -150,7 +154,7 @@ class Layout:
             sensors=len(observer.sensors), rejects=observer.rejects,
             observer_prior=cost.observer_prior is not None,
             lapack=lapack and system.n >= _LAPACK_STATES and directions.free is None, clock=clock,
-            restores=restores and any(there for there, _ in sets),
+            restores=restores and any(there for there, _ in sets), restarts=restarts,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
             free=directions.free, held=len(system.held),
@@ -160,7 +164,9 @@ class Layout:
                     (k, one.dtype.kind == "i", one.size if one.ndim else 0)
                     for k, one in data.items()
                 ))
-                for name, data in _numbers(directions, system, cost, terms, real, USUAL).items()
+                for name, data in _numbers(
+                    directions, system, cost, terms, real, USUAL, restarts * horizon
+                ).items()
             ),
         )
 
@@ -350,7 +356,7 @@ class Layout:
         return MemorySizes.of(
             self.nx, self.ny, self.nu, self.horizon, sensors=self.sensors, held=self.held,
             rows=self.rows, covariance=self.covariance, **sets,
-            roots=self.deviations > 0,
+            roots=self.deviations > 0, restarts=self.restarts,
         )
 
 
@@ -365,9 +371,12 @@ def observer_form(system: System, observer: Observer, cost: Cost) -> ObserverFor
 
 def _numbers(
     directions: Directions, system: System, cost: Cost, terms: tuple[TermForm, ...], real: str,
-    usual: Conditions,
+    usual: Conditions, judged: int,
 ) -> dict[str, Mapping[str, NDArray[Any]]]:
-    """The numbers of the parts of C that have some, by the parts' names."""
+    """The numbers of the parts of C that have some, by the parts' names.
+
+    So many samples judge whether an observer is restarted; none where it never is.
+    """
     form = observer_form(directions.system, directions.observer, directions.cost)
     found: dict[str, Mapping[str, NDArray[Any]]] = {}
     if form.prior is not None:
@@ -383,6 +392,9 @@ def _numbers(
         found["observer"] = form.data
     if form.innovation is not None:
         found["innovation"] = form.innovation.c_data(system.p)
+    if judged:
+        counts = range(judged * system.p + 1)
+        found["restart"] = {"larger": np.array([larger(count) for count in counts])}
     return found
 
 
@@ -481,7 +493,8 @@ def _filled(
         part["rows"][: one.matrix.size] = one.matrix.ravel()
         part["row_lower"][:rows], part["row_upper"][:rows] = one.row_lower, one.row_upper
     terms = directions.terms_of(system, cost) if layout.terms else ()
-    numbers = _numbers(directions, system, cost, terms, layout.real, usual)
+    judged = layout.restarts * layout.horizon
+    numbers = _numbers(directions, system, cost, terms, layout.real, usual, judged)
     for name, data in numbers.items():
         for field, values in data.items():
             _fill(record[name], field, values)

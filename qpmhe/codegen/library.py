@@ -48,10 +48,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"{name}, a function, has no C form ({residual.expression.reason}); take "
                 "qpmhe.angles, or engine='python'."
             )
-    if settings.restart:
-        return (
-            "engine='compiled' does not have restart=True; leave it out, or take engine='python'."
-        )
     if system.extensions:
         return (
             f"engine='compiled' does not have {' and '.join(system.extensions)}; take "
@@ -202,7 +198,7 @@ def planned(
     directions = Directions(system, observer, cost)
     layout = Layout.of(
         directions, settings.horizon, real, lapack,
-        settings.time_budget is not None, settings.infeasible == "restore",
+        settings.time_budget is not None, settings.infeasible == "restore", settings.restart,
     )
     return layout, settings_record(
         layout, directions, system, directions.cost, settings, usual

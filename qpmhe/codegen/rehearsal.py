@@ -95,7 +95,8 @@ def estimator_fault(
     )
     other = replace(
         usual, max_qps=2, warm_start=not settings.warm_start,
-        candidate="observer" if settings.candidate == "reinitialized" else "reinitialized",
+        candidate="observer" if settings.restart or settings.candidate == "reinitialized"
+        else "reinitialized",
     )
     aging = copy(cost)
     aging.discount = 1.0 if cost.discount < 1.0 else 0.95

@@ -417,7 +417,7 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
         *((*rows, _or_none("restoring", layout.restores), "outside") if constrained
           else ["sets_none"]),
         "optimizer", _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet),
-        "improve",
+        "improve", _or_none("restarting", layout.restarts),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from functools import cache
 from typing import Any
 
@@ -178,6 +179,7 @@ class Window(ObserverSteps):
         """
         count, before, first = np.count_nonzero(self.observed), self.prediction_error, self.start
         mark, events, failure = self.mark(True), self.events, self.failure
+        newest = copy(self._sample), self._filled, self._nearest
         self.z[first] = self.history[first]
         if self.covariance is not None:
             self.covariance[first], self.is_vague[first] = self._first_covariance, False
@@ -186,13 +188,19 @@ class Window(ObserverSteps):
         if self.memory is not None:
             self.memory[first] = self._first_memory
         self.enter_states(first, self.time - self.length)
-        self.replay(self.length)
-        if before > larger(count) * self.prediction_error:
+        factor, after = larger(int(count)), 0.0
+        for k in range(first, self.end):
+            if not before > factor * after:
+                break
+            self._compute_stage(k, self.time - (self.end - k))
+            after += self._prediction_error(k)
+        if before > factor * after:
             self.events |= _RESTARTED
             self.restarted = self.time
             return True
         self.roll_back(mark)
         self.events, self.failure = events, failure
+        self._sample, self._filled, self._nearest = newest  # which `filtered` reads
         return False
 
     @property
@@ -202,6 +210,13 @@ class Window(ObserverSteps):
             return math.inf
         v, weights = self.residuals[:, self._n :], self.weights[:, self._n :, self._n :]
         return float(np.einsum("ki,kij,kj->", v, weights, v))
+
+    def _prediction_error(self, k: int) -> float:
+        """The same of stage k."""
+        view = self._stage_views[k]
+        if not math.isfinite(self.cost[k]):
+            return math.inf
+        return float(view.error.dot(view.noise_weight.dot(view.error)))
 
     @property
     def _observers_ready(self) -> bool:

@@ -106,6 +106,18 @@ def outliers(one):
     return samples_with(one, own)
 
 
+def far(one):
+    """The case from a start that is far off, with a constant gain that is much smaller."""
+    gain, start = one.observer.constant_gain, np.asarray(one.start) + 3.0
+    observer = one.observer if gain is None else Luenberger(0.01 * gain)
+    return replace(one, start=start, observer=observer)
+
+
+def jumping(one):
+    """The case with states that jump beyond what the observer takes for likely, as measured."""
+    return samples_with(one, lambda t, y: {"y": y + 8.0 * (t >= 8)})
+
+
 def looser(one):
     """The case whose engines agree to fewer digits, as rounding decides."""
     return replace(one, tolerance=1e-7)
@@ -574,6 +586,7 @@ SINGULAR = {"prior": np.diag([1.0, 0.0, 0.5]), "disturbance": np.diag([0.02, 0.0
 AGAIN, WARM, ALONE = {"candidate": "reinitialized"}, {"warm_start": True}, {"max_qps": 0}
 ONE, MANY, SMOOTH = {"max_qps": 1}, {"max_qps": None}, {"arrival": "smoothed"}
 RESTORE = {"infeasible": "restore", "solver_tolerance": 1e-12}
+RESTART = {"restart": True, "horizon": 4}
 BESIDE = {"disturbances": Box([0.2, -0.5, -0.5], [1.0, 0.5, 0.5])}
 DIAGONAL = {"projection_metric": "diagonal"}
 METRIC = by(lambda one: Luenberger([0.8, -0.3], metric=[[2.0, 1.0], [1.0, 1.0]]))
@@ -713,6 +726,20 @@ FEATURES = {
         ),
         "restored noise-free": (
             lambda: _inputs(disturbances=Box([0.1, 0.01, -0.5], [0.5, 0.01, 0.5])), gaps, RESTORE,
+        ),
+    },
+    # Their observers are slow, or too sure of themselves, and start far off.
+    "restarted": {
+        "restarted": ("inputs", far, conditions, RESTART),
+        "restarted extended": (
+            "inputs", filtered(scale=1e-4, disturbance=1e-9 * np.eye(3)), far, gaps,
+            conditions, RESTART,
+        ),
+        "restarted in states": (
+            lambda: _reaction_in(WEDGE, (-1.0, 4.0)), far, conditions, RESTART,
+        ),
+        "restarted unscented gated": (
+            "inputs", filtered(UKF, scale=1e-2, innovation=Gate(reopen=1000)), jumping, RESTART,
         ),
     },
     "conditions": {

@@ -123,6 +123,7 @@ def test_the_same_runs(name):
         same(getattr(found, array), getattr(expected, array), one.tolerance, array)
     restored = (found.flags & Status.RESTORED.value) > 0
     assert restored.any() == ("restored" in name)
+    assert (found.flags & Status.RESTARTED.value).any() == ("restarted" in name)
     assert (found.costs <= found.candidate_costs)[~restored].all()
 
 

@@ -494,8 +494,6 @@ class Problem:
         units = units or self.own_units
         if self.k:
             options["parameters"] = self.nominal * units.inputs[self.m :]
-        if (self.options | options).get("engine") == "compiled":  # which has none
-            options |= {"restart": False}
         return qpmhe.MovingHorizonEstimator(
             *self.parts(units), initial_state=self.start * units.states, **self.options | options,
         )

@@ -37,3 +37,11 @@ static void mhe_start_observer(mhe_estimator *e)
     memcpy(e->last_good_covariance, initial, sizeof e->covariance_end);
     memcpy(e->covariance_end, initial, sizeof e->covariance_end);
 }
+
+/* At the window's first state. */
+static void mhe_start_observer_again(mhe_estimator *e)
+{
+    memcpy(mhe_next_covariance(e, -1), e->settings->covariances.initial, sizeof e->covariance_end);
+    mhe_forget_root(e, -1);
+    mhe_forget_rejections(e, -1);
+}

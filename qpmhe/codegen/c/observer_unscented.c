@@ -82,6 +82,7 @@ static void mhe_sigma_outputs(const mhe_settings *s, const mhe_stage *stage,
         for (int i = 0; i < seen->count; i++)
             rows[k * seen->count + i] = change[seen->at[i]] * sigma->roots[k % NX];
     }
+    (void)s; /* outputs without angles */
 }
 
 /* The columns of the gain of least mean square error as rows, from deviations of the outputs and of

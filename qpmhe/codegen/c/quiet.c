@@ -12,6 +12,7 @@ static void mhe_follow(const mhe_settings *s, const real *predicted, const real 
     mhe_wrap_state(s, next, ahead);
     for (int j = 0; j < NX; j++)
         next[j] = predicted[j] + mhe_dot(NX, keep + j * NX, ahead) + (shift ? shift[j] : 0);
+    (void)s; /* states without angles */
 }
 
 /* A trial's next state, as the model and its disturbances make it; of the candidate along the directions

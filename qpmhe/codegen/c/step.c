@@ -63,6 +63,7 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
         mhe_put_first_inside(e); /* that estimate was made before its sample brought an X */
         events = (events & MHE_DERIVATIVE_NEARBY) | mhe_replay(e, 0);
     }
+    mhe_challenge(e, k, &events);
     mhe_estimate_now(e, k, o, events, before);
     memcpy(e->history_end, o->best->x + e->length * NX, sizeof e->history_end);
 }
@@ -137,8 +138,8 @@ void mhe_update(mhe_estimator *e, mhe_workspace *k, const real *y, const real *u
 }
 
 /* Copy what a step changes: the stage that the new sample overwrites, and all that is not a stage.
- * Only an observer that is re-initialised goes through the other stages again, and one that comes into
- * another X through the newest. */
+ * Only an observer that is re-initialised, or may be restarted, goes through the other stages again, and
+ * one that comes into another X through the newest. */
 static void mhe_keep(mhe_estimator *to, const mhe_estimator *from, int overwritten)
 {
     if (MHE_X_SET) {
@@ -146,7 +147,7 @@ static void mhe_keep(mhe_estimator *to, const mhe_estimator *from, int overwritt
         to->stages[newest] = from->stages[newest];
     }
     memcpy(to, from, offsetof(mhe_estimator, stages));
-    if (from->settings->reinitialize)
+    if (from->settings->reinitialize || mhe_is_due(from))
         memcpy(to->stages, from->stages, sizeof to->stages);
     else
         to->stages[overwritten] = from->stages[overwritten];

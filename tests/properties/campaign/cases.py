@@ -17,8 +17,6 @@ OBSERVERS = {
     "luenberger": 0.25, "extended": 0.25, "unscented": 0.1, "steady": 0.08, "injection": 0.07,
     "zero": 0.05, "gate": 0.12, "huber": 0.08,
 }
-# Options that the step in C does not have.
-NOT_IN_C = ("restart",)
 # Observers without a covariance.
 PLAIN = ("luenberger", "injection", "zero")
 
@@ -273,7 +271,7 @@ class Case:
         later = np.random.default_rng([self.seed, 2])  # what older seeds have drawn stays as it was
         drawn = {name: value for share, name, value in (
             (0.35, "infeasible", "restore"), (0.3, "restart", True),
-        ) if later.random() < share and (python or name not in NOT_IN_C)}
+        ) if later.random() < share}
         if "candidate" in options:
             drawn.pop("restart", None)
         options |= drawn
