@@ -682,6 +682,27 @@ class System:
             )
         return self.origin.make_timed(self)
 
+    def discretized(self, method: str, steps: int) -> System | None:
+        """The same model in continuous time by another discretisation; None if there is none.
+
+        Parameters
+        ----------
+        method, steps
+            As for `from_ode`.
+        """
+        if self.dt is None or self.origin.recipe is None:
+            return None
+        maker, arguments = self.origin.recipe
+        inner = next((name for name in ("f", "system") if isinstance(
+            arguments.get(name), System)), None)  # of parameters or noisy inputs among its states
+        if inner is not None:
+            found = arguments[inner].discretized(method, steps)
+            return None if found is None else maker(**arguments | {inner: found})
+        if "method" not in arguments:
+            return None
+        made: System = maker(**arguments | {"method": method, "steps": steps})
+        return made
+
     @property
     def symbolic(self) -> Any:
         """The model as CasADi functions, for C code generation; None if it has no such form.
