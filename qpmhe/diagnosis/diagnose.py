@@ -122,6 +122,7 @@ def diagnose(
     them, and if no coloured noise or lag of a sensor explains the record as well. The ten
     measurements after a gap of ten samples or more are no evidence.
 
+    * an integration step that is too long for the disturbance's size;
     * R or Q, of all or of one component, too small or too large by a factor;
     * a biased sensor, throughout or for a time, one in another unit; two that are swapped;
     * a dead sensor, one that is saturated, and outliers;

@@ -20,6 +20,7 @@ from .fault_kinds import LEAST_GAIN, SCALED, Fault
 from .faults import search
 from .findings import Finding, Names, listed, number, percent
 from .sensor_memory import MemoryBank
+from .steps import finer
 from .stuck import stuck
 
 # The search takes at most so many samples: of a longer record, those least like the model.
@@ -124,7 +125,9 @@ class Examination:
         """Filters of the record without and with its faults; what is stuck is no measurement."""
         run, source, part = self.run, self.source, slice(self.first, len(self.run))
         steps = None if source.steps is None else source.steps[part]
-        self.bank = FilterBank(source.system, steps, self.first)
+        # The system, by shorter steps where its own are too long, and the finding that they are.
+        self.system, self.coarse = source.system, list[Finding]()
+        self.bank = FilterBank(self.system, steps, self.first)
         start = run.states[self.first]
         start = start if np.isfinite(start).all() else run.states[0]
         y = source.measurements.copy()
@@ -146,6 +149,10 @@ class Examination:
         self.clipped[~np.isfinite(source.measurements).any(axis=0)] = 0.0
         self.base = base = replace(base, measurements=y[part])
         self.null = null = self.bank.run([base])
+        found = finer(self.bank, base, null, steps, self.names)
+        if found is not None:
+            self.system, self.bank, self.null = found.system, found.bank, found.filtered
+            self.coarse, null = [found.finding], self.null
         self.normalised = null.normalised
         bank, base, null, begin = self._searched()
         self.faults, self.best, self.unexplained = self._verified(bank, base, null)
@@ -221,7 +228,7 @@ class Examination:
     def _part(self, part: slice) -> tuple[FilterBank, Hypothesis, Filtered, int]:
         first, steps = self.first + part.start, self.source.steps
         bank = FilterBank(
-            self.source.system, None if steps is None else steps[self.first :][part], first
+            self.system, None if steps is None else steps[self.first :][part], first
         )
         base = replace(
             self.base, measurements=self.base.measurements[part], inputs=self.base.inputs[part],
@@ -233,7 +240,7 @@ class Examination:
         """The user's own estimate, and where the model moves it until the filter begins."""
         found = [self.run.states[0], self.run.states[0]]
         steps = self.source.steps
-        before = FilterBank(self.source.system, None if steps is None else steps[: self.first])
+        before = FilterBank(self.system, None if steps is None else steps[: self.first])
         try:
             for u in before.full_inputs(self.inputs[: self.first]):
                 found[1] = np.asarray(before.model.f(found[1], u))
@@ -268,6 +275,7 @@ class Examination:
             if one.kind != "outliers" or not isinstance(self.source.cost, RobustCost):
                 told.append(finding)
         yield from self.stuck
+        yield from self.coarse
         wrong_units = [one for one in told[:1] if self.faults[0].is_wrong_unit]
         yield from wrong_units
         for flag, what, remedy in (

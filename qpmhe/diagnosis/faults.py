@@ -8,7 +8,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from .bank import Array, FilterBank, Filtered, Hypothesis
+from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
 from .fault_kinds import LEAST_GAIN, MOST_PARTS, SCALED, UNIT_OFFSET, Fault, with_factor
 from .signatures import Signature, additive_faults, moments, removed, with_ends
 
@@ -150,14 +150,8 @@ def _best(
     if refined:
         further = bank.run([base, *(one.hypothesis for one in refined)]).logs[:, 1:]
         tried, logs = [*tried, *refined], np.hstack((logs, further))
-    values, there = logs.sum(axis=0), np.isfinite(base.measurements)
-    fails = not np.isfinite(values[0])  # then any filter that does not is better
-    lowest = np.min(values, where=np.isfinite(values), initial=0.0) - 1e4
-    gains = values[1:] - (lowest if fails else values[0])
-    # Few samples that a filter mistakes, as after gaps, suit many faults: they are outvoted.
-    votes = np.clip(logs[:, 1:] - logs[:, :1], -_MOST_EACH, _MOST_EACH).sum(axis=0)
-    least = LEAST_GAIN * (2.0 - there.mean())
-    enough = (gains > least + _GAIN_EACH * there.sum()) & (fails | (votes > least))
+    values = logs.sum(axis=0)
+    gains, enough, least = _judged(base, logs)
     best: Fault | None = None
     # By their values: where the record is impossible without any, differences have no digits left.
     for k in np.argsort(-values[1:], kind="stable").tolist():
@@ -167,6 +161,26 @@ def _best(
             break
     has_no_ends = best is None or best.kind != "bias" or best.span is None
     return best if best is None or has_no_ends else with_ends(bank, base, null, best)
+
+
+def _judged(base: Hypothesis, logs: Array) -> tuple[Array, Mask, float]:
+    """What filters gain beside the first, whether that is enough for the whole record.
+
+    Also what a local fault must gain.
+    """
+    values, there = logs.sum(axis=0), np.isfinite(base.measurements)
+    fails = not np.isfinite(values[0])  # then any filter that does not is better
+    lowest = np.min(values, where=np.isfinite(values), initial=0.0) - 1e4
+    gains = values[1:] - (lowest if fails else values[0])
+    # Few samples that a filter mistakes, as after gaps, suit many faults: they are outvoted.
+    votes = np.clip(logs[:, 1:] - logs[:, :1], -_MOST_EACH, _MOST_EACH).sum(axis=0)
+    least = LEAST_GAIN * (2.0 - there.mean())
+    return gains, (gains > least + _GAIN_EACH * there.sum()) & (fails | (votes > least)), least
+
+
+def explains(base: Hypothesis, own: Array, other: Array) -> bool:
+    """Whether a filter's log likelihoods (T,) are enough better than the usual one's."""
+    return bool(_judged(base, np.column_stack((own, other)))[1][0])
 
 
 def _scaled(base: Hypothesis) -> Iterator[Fault]:

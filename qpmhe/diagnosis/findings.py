@@ -20,9 +20,8 @@ class Finding:
     kind : str
         ``dead``, ``saturated``, ``missing``, ``failing``, ``noise``, ``disturbance``, ``gain``,
         ``bias``, ``swapped``, ``step``, ``sign``, ``input``, ``shift``, ``clock``, ``outliers``,
-        ``unseen``,
-        ``correlated``, ``estimator``; a note also has ``prior``, ``kept``, ``innovations``,
-        ``drift``, ``record`` or ``rejected``.
+        ``discretization``, ``unseen``, ``correlated``, ``estimator``; a note also has ``prior``,
+        ``kept``, ``innovations``, ``drift``, ``record`` or ``rejected``.
     text : str
         What it is, as a sentence.
     remedy : str

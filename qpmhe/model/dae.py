@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import dimension, numbers, positive, vector
 from ..errors import InvalidInputError, ModelError, ShapeError
 from .algebraic import AlgebraicStates
@@ -184,6 +186,52 @@ def made_from_dae(
     )
 
 
+def made_from_implicit(
+    cls: type[System], residual: Function, h: Function, *, dt: float, n: int, k: int, p: int,
+    m: int, how: Discretization, guess: ArrayLike | None, rate_guess: ArrayLike | None,
+    options: SystemOptions,
+) -> System:
+    """The system that `System.from_implicit` describes: one whose rates are algebraic states."""
+    n, k = dimension("n", n, 1), dimension("k", k, 0)
+    rates = np.zeros(n) if rate_guess is None else vector("rate_guess", rate_guess, n)
+    if k and guess is None:
+        raise InvalidInputError(
+            f"algebraic_guess is missing: k is {k}; expected ({k},), where z is looked for."
+        )
+    start = np.zeros(0) if guess is None else vector("algebraic_guess", guess, k)
+    names = ("xdot", "x", *(("z",) if k else ()))
+    # Of (x, (x', z), u), as `made_from_dae` takes them.
+    of_residual = _of_parts("residual", residual, names, m, n, lambda x, v: (v[..., :n], x))
+    of_output = _of_parts("h", h, names[1:], m, n, lambda x, _: (x,))
+    made = made_from_dae(
+        cls, lambda _, v: v[..., :n], of_residual, of_output, dt=dt, n=n, k=n + k, p=p, m=m,
+        how=how, guess=np.concatenate((rates, start)), options=options,
+    )
+    return made.with_origin(recipe=(cls.from_implicit, {
+        "residual": residual, "h": h, "dt": dt, "n": n, "k": k, "p": p, "m": m,
+        "method": how.method, "steps": how.steps, "algebraic_guess": start if k else None,
+        "rate_guess": rates, **options,
+    }))
+
+
+def _of_parts(
+    name: str, function: Function, names: tuple[str, ...], m: int, n: int, first: Function
+) -> Function:
+    """A user's function of some arguments, the last of them z if there is any, as one of x, v, u.
+
+    ``first`` makes the arguments before z of x and v.
+    """
+    takes_input = _takes_input(name, function, m, names)
+    with_algebraic = names[-1] == "z"
+
+    def arguments(x: Array, v: Array) -> tuple[Array, ...]:
+        return (*first(x, v), v[..., n:]) if with_algebraic else first(x, v)
+
+    if takes_input:
+        return lambda x, v, u: function(*arguments(x, v), u)
+    return lambda x, v: function(*arguments(x, v))
+
+
 def inner_points(
     magnitudes: Sequence[Magnitude], width: int, m: int, states: ConvexSet | None, guess: Array,
     scales: Array | float = 1.0,
@@ -205,32 +253,34 @@ def _of_joint_state(
     """A user's function of x, z and perhaps u as one of w = (x, z) and perhaps u."""
     if isinstance(function, Trusted):
         return function
-    if not callable(function):
-        raise ModelError(f"{name} is {function!r}; expected a function {name}(x, z, u).")
     if _takes_input(name, function, m):
         return lambda w, u: function(w[..., :n], w[..., n:], u)
     return lambda w: function(w[..., :n], w[..., n:])
 
 
-def _takes_input(name: str, function: Function, m: int) -> bool:
-    """Whether a function is one of x, z and u, by its parameters."""
+def _takes_input(
+    name: str, function: Function, m: int, names: tuple[str, ...] = ("x", "z")
+) -> bool:
+    """Whether a function of such arguments is one of u, too, by its parameters."""
+    if not callable(function):
+        raise ModelError(f"{name} is {shown(function)}; expected a function.")
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):  # compiled functions have no signature: pass all arguments
         return m > 0
     positional = [q for q in parameters if q.kind in (q.POSITIONAL_ONLY, q.POSITIONAL_OR_KEYWORD)]
-    rest = any(q.kind is q.VAR_POSITIONAL for q in parameters)
+    rest, least = any(q.kind is q.VAR_POSITIONAL for q in parameters), len(names)
     required = sum(q.default is q.empty for q in positional)
-    most = 3 if m else 2
     by_name = any(q.kind is q.KEYWORD_ONLY and q.default is q.empty for q in parameters)
-    if by_name or required > most or (len(positional) < 2 and not rest):
-        expected = f"{name}(x, z) or {name}(x, z, u)" if m else f"{name}(x, z)"
+    if by_name or required > least + (m > 0) or (len(positional) < least and not rest):
+        expected = f"{name}({', '.join(names)})"
+        if m:
+            expected += f" or {name}({', '.join((*names, 'u'))})"
         raise ModelError(
-            f"{name}{inspect.signature(function)} cannot be called as {expected}; expected that, "
-            "with x (n,), the algebraic states z (k,)"
-            + (" and the inputs u (m,)." if m else ", since m is 0. Pass m if there are inputs.")
+            f"{name}{inspect.signature(function)} cannot be called as {expected}; write it so."
+            + ("" if m else " Pass m if there are inputs.")
         )
-    return m > 0 and (len(positional) > 2 or rest)
+    return m > 0 and (len(positional) > least or rest)
 
 
 def _stacked(*functions: BatchedFunction) -> Trusted:

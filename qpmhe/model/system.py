@@ -16,7 +16,7 @@ from qpmhe_solvers.values import shown
 from .._checks import dimension
 from ..errors import InvalidInputError, ModelError
 from .constraints import Constraint, ConstraintFunctions, checked_constraints
-from .dae import made_from_dae
+from .dae import made_from_dae, made_from_implicit
 from .derivatives import Jacobian
 from .discretize import checked_discretization
 from .functions import BatchedFunction, Trusted
@@ -577,6 +577,67 @@ class System:
             guess=algebraic_guess, options=options,
         )
 
+    @classmethod
+    def from_implicit(
+        cls,
+        residual: Function,
+        h: Function,
+        *,
+        dt: float,
+        n: int,
+        p: int,
+        k: int = 0,
+        m: int = 0,
+        algebraic_guess: ArrayLike | None = None,
+        rate_guess: ArrayLike | None = None,
+        method: str = "radau",
+        steps: int = 1,
+        **options: Unpack[SystemOptions],
+    ) -> System:
+        r"""Discretise :math:`0 = F(\dot x, x, z, u)` of index 1; u is held over the step.
+
+        The rates are algebraic states, too, in front of z: `from_dae` says how they are solved
+        for, and `algebraic_states` gives both.
+
+        Parameters
+        ----------
+        residual : callable
+            F(xdot, x, z, u) (n + k,), or F(xdot, x, z); without z where k is 0.
+        h : callable
+            Output h(x, z, u) (p,) or h(x, z); without z where k is 0.
+        dt : float
+            Sampling time.
+        n, p, k, m : int
+            Numbers of states, outputs, algebraic states and inputs.
+        algebraic_guess, rate_guess : (k,) and (n,) array_like, optional
+            Where z and the rates are looked for. The rates' is zero if left out.
+        method, steps, **options
+            As for `from_dae`.
+
+        Raises
+        ------
+        InvalidInputError
+            If k is not 0 and ``algebraic_guess`` is missing.
+        OptionError, ShapeError, ModelError, SetError
+            As for `from_dae`.
+
+        Examples
+        --------
+        A mass that depends on the position:
+
+        >>> import numpy as np, qpmhe
+        >>> system = qpmhe.System.from_implicit(
+        ...     lambda xdot, x: np.stack([xdot[0] - x[1], (2.0 + x[0]) * xdot[1] + x[0]]),
+        ...     lambda x: x[0], dt=0.1, n=2, p=1)
+        >>> system.algebraic_states(np.array([1.0, 0.0])).round(4)
+        array([ 0.    , -0.3333])
+        """
+        return made_from_implicit(
+            cls, residual, h, dt=dt, n=n, k=k, p=p, m=m,
+            how=checked_discretization(method, steps, tuple(COLLOCATIONS)),
+            guess=algebraic_guess, rate_guess=rate_guess, options=options,
+        )
+
     def algebraic_states(self, x: ArrayLike, u: ArrayLike | None = None) -> Array:
         """The algebraic states z (..., k) at states x (..., n) and inputs u (..., m); NaN for none.
 
@@ -620,6 +681,27 @@ class System:
                 "time, see System.from_ode."
             )
         return self.origin.make_timed(self)
+
+    def discretized(self, method: str, steps: int) -> System | None:
+        """The same model in continuous time by another discretisation; None if there is none.
+
+        Parameters
+        ----------
+        method, steps
+            As for `from_ode`.
+        """
+        if self.dt is None or self.origin.recipe is None:
+            return None
+        maker, arguments = self.origin.recipe
+        inner = next((name for name in ("f", "system") if isinstance(
+            arguments.get(name), System)), None)  # of parameters or noisy inputs among its states
+        if inner is not None:
+            found = arguments[inner].discretized(method, steps)
+            return None if found is None else maker(**arguments | {inner: found})
+        if "method" not in arguments:
+            return None
+        made: System = maker(**arguments | {"method": method, "steps": steps})
+        return made
 
     @property
     def symbolic(self) -> Any:

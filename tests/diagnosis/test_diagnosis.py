@@ -497,3 +497,34 @@ def test_command_writes_the_page(tmp_path):
     short = estimate("short.html", rows[:20])
     assert short.exit_code == 0
     assert "no diagnosis: the run has 20 samples" in short.output.replace("\n", " ")
+
+
+@pytest.mark.filterwarnings("ignore::qpmhe.ModelWarning")  # the estimator says so, too
+@pytest.mark.parametrize(("method", "steps", "expected"), [
+    ("rk4", 1, ["discretization"]), ("rk4", 16, []), ("radau", 2, []),
+])
+def test_a_step_that_is_too_long_comes_before_clocks_and_covariances(method, steps, expected):
+    def rate(x, u):
+        return np.stack([x[..., 1], u[..., 0] - 20.0 * np.sin(x[..., 0]) - 0.5 * x[..., 1]], -1)
+
+    def made(method, steps):
+        return qpmhe.System.from_ode(
+            rate, lambda x: x[..., :1], dt=0.35, n=2, p=1, m=1, method=method, steps=steps
+        )
+
+    deviations, generator = np.array([0.01, 0.1]), np.random.default_rng(2)
+    model, x, Y = made("rk4", 40).model(), np.array([1.0, 0.0]), []
+    U = 4.0 * generator.choice([-1.0, 1.0], (90, 1))
+    for u in U:
+        Y.append(model.functions.h(x, u) + 0.02 * generator.standard_normal(1))
+        x = model.functions.f(x, u) + deviations * generator.standard_normal(2)
+    covariances = {"disturbance": np.diag(deviations**2), "noise": [[4e-4]]}
+    mhe = qpmhe.MovingHorizonEstimator(
+        made(method, steps), qpmhe.ExtendedKalman(prior=np.diag([0.1, 0.5]) ** 2, **covariances),
+        qpmhe.QuadraticCost.from_covariances(**covariances), horizon=10,
+        initial_state=[1.0, 0.0], engine="python", max_qps=1,
+    )
+    diagnosis = qpmhe.diagnose(mhe.run(np.array(Y), U))
+    assert kinds(diagnosis) == expected, str(diagnosis)
+    if expected:
+        assert "The integration step is too long: one step of rk4" in str(diagnosis)

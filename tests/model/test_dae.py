@@ -353,6 +353,60 @@ def test_parameters_go_through_the_step():
     np.testing.assert_allclose(slope[:2, 2], (moved[0] - moved[1]) / 2e-6, rtol=1e-7, atol=1e-12)
 
 
+def test_an_implicit_equation_is_the_dae_that_it_contains():
+    """The swing model with its flow as it is written down, inertia times acceleration."""
+    def residual(xdot, x, z, u):
+        return np.concatenate((
+            xdot[:1] - x[1:], 0.25 * xdot[1:] - u + flows(x, z)[0] + 0.3 * x[1:], balance(x, z)
+        ))
+
+    made = System.from_implicit(
+        residual, voltage, dt=0.1, **SIZES, algebraic_guess=[0.0, 1.0], steps=2
+    )
+    for mine, other in zip(
+        evaluated(made, X, U), evaluated(swing_system(steps=2), X, U), strict=True
+    ):
+        np.testing.assert_allclose(mine, other, rtol=0, atol=1e-12)
+    states = made.algebraic_states(X, U)
+    np.testing.assert_allclose(states[:2], swing(X, states[2:], U), rtol=0, atol=1e-13)
+    assert "f: traced" in made.explain()
+
+
+def of_mass(xdot, x, u):
+    mass = 1.0 + 0.5 * np.sin(x[:1])
+    return np.concatenate((xdot[:1] - x[1:], mass * xdot[1:] + x[:1] - u))
+
+
+def position(x):
+    return x[:1]
+
+
+def test_an_implicit_ode_has_the_step_of_the_explicit_one():
+    def rate(x, u):
+        mass = 1.0 + 0.5 * np.sin(x[..., 0])
+        return np.stack([x[..., 1], (u[..., 0] - x[..., 0]) / mass], -1)
+
+    made = System.from_implicit(of_mass, position, dt=0.3, n=2, p=1, m=1)
+    other = System.from_ode(rate, position, dt=0.3, n=2, p=1, m=1, method="radau")
+    for mine, theirs in zip(evaluated(made, X, U), evaluated(other, X, U), strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-13)
+    again = pickle.loads(pickle.dumps(made))
+    np.testing.assert_array_equal(again.f(X, U), made.f(X, U))
+    augmented = qpmhe.augment_parameters(made, nominal=[0.3])
+    np.testing.assert_allclose(augmented.f(np.append(X, U)), np.append(made.f(X, U), U), atol=1e-13)
+
+
+@pytest.mark.parametrize(("residual", "k", "options", "error", "words"), [
+    (of_mass, 1, {}, qpmhe.errors.InvalidInputError, "algebraic_guess is missing"),
+    (lambda x: x, 0, {}, ModelError, r"cannot be called as residual\(xdot, x\)"),
+    (of_mass, 0, {"rate_guess": [1.0]}, ShapeError, "rate_guess has shape"),
+    (lambda xdot, x, u: x - u, 0, {}, ModelError, "equation 0 depends on no algebraic state"),
+])
+def test_bad_implicit_equations(residual, k, options, error, words):
+    with pytest.raises(error, match=words):
+        System.from_implicit(residual, position, dt=0.3, n=2, p=1, m=1, k=k, **options)
+
+
 # The estimator.
 
 
@@ -483,7 +537,7 @@ def made(algebraic=force, k=1, guess=(0.0,), **options):
      r"algebraic returned shape \(2,\)"),
     ({"rate": lambda x, z: z}, ModelError, r"rate returned shape \(1,\)"),
     ({"rate": lambda x: x}, ModelError, r"rate\(x\) cannot be called as rate\(x, z\)"),
-    ({"rate": lambda x, z, u: x}, ModelError, "since m is 0"),
+    ({"rate": lambda x, z, u: x}, ModelError, "Pass m if there are inputs"),
     ({"m": 1}, ModelError, "m is 1, but neither rate nor algebraic nor h takes an input"),
     ({"algebraic": 3.0}, ModelError, "algebraic is 3.0; expected a function"),
     ({"algebraic": lambda x, z: x[..., :1]}, ModelError,
