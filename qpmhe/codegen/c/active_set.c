@@ -19,36 +19,94 @@
 #define FEW 10
 #define ROUNDS 20
 
-/* Weights of the active rows. Those of W and V have the standard deviation of a disturbance or
- * noise. Rows of X have only that of the prior, which may be vague: so they are stiffer than what
- * the Hessian opposes to them. */
-static void mhe_set_stiffness(mhe_estimator *e, mhe_workspace *k)
+/* Rounds that leave more than this share of the last change only add rounding. */
+#define SHRINKING (real)0.5
+
+/* A solution is precise where the next round would move it by less than this share of its size. */
+#define PRECISE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-5)
+
+/* pliancy[r] += a D^-1 a' for the active rows of a set, a its slope: components of the set are M d, or d
+ * itself without M. */
+static void mhe_add_pliancy(int d, int count, const real *M, const real *rows, const int8_t *place,
+                            const real *D, real *pliancy)
 {
-    mhe_rows *q = &k->rows;
-    for (int i = 0; i < mhe_row_stages(e); i++) {
-        const int own = i * ROWS;
-        for (int at = own; at < own + ROWS; at++)
-            q->weight[at] =
-                q->place[at] == BETWEEN ? 0 : STIFFNESS / (q->deviation[at] * q->deviation[at]);
-        if (MHE_X_SET) {
-            const int first = own + W_COUNT + V_COUNT;
-            real diagonal[NX];
-            int active = 0;
-            for (int r = 0; r < NX + MHE_X_ROWS; r++) active += q->place[first + r] != BETWEEN;
-            if (!active) continue;
-            mhe_stage_curvature(e, k, i, diagonal);
-            for (int j = 0; j < NX; j++)
-                if (q->place[first + j] != BETWEEN) q->weight[first + j] = STIFFER * diagonal[j];
-            for (int r = 0; r < MHE_X_ROWS; r++) {
-                const real *row = e->settings->states.rows + r * NX;
-                real pliancy = 0;
-                if (q->place[first + NX + r] == BETWEEN) continue;
-                for (int j = 0; j < NX; j++)
-                    if (row[j] != 0) pliancy += row[j] * row[j] / diagonal[j];
-                q->weight[first + NX + r] = STIFFER / pliancy;
+    for (int r = 0; r < d + count; r++) {
+        if (place[r] == BETWEEN) continue;
+        for (int j = 0; j < NX; j++) {
+            real slope = 0;
+            for (int q = 0; q < d; q++) {
+                const real share = r < d ? r == q : rows[(r - d) * d + q];
+                if (share != 0) slope += share * (M ? M[q * NX + j] : q == j);
             }
+            pliancy[r] += slope * slope / D[j];
         }
     }
+}
+
+/* Weights of the active rows: so many times what the Hessian, by its diagonal D, opposes to them.
+ * Then the first forces are right to this share, each round leaves it of an error, and no more
+ * digits are lost beside directions that hardly count in the Hessian. */
+static void mhe_set_stiffness(mhe_estimator *e, mhe_workspace *k)
+{
+    const mhe_settings *s = e->settings;
+    for (int i = 0; i < mhe_row_stages(e); i++) {
+        const int8_t *place = k->rows.place + i * ROWS;
+        const real *deviation = k->rows.deviation + i * ROWS;
+        real *weight = k->rows.weight + i * ROWS, D[NX];
+        int active = 0;
+        for (int r = 0; r < ROWS; r++) {
+            weight[r] = 0;
+            active += place[r] != BETWEEN;
+        }
+        if (!active) continue;
+        mhe_stage_curvature(e, k, i, D);
+        if (MHE_X_SET)
+            mhe_add_pliancy(NX, MHE_X_ROWS, 0, s->states.rows, place + W_COUNT + V_COUNT, D,
+                            weight + W_COUNT + V_COUNT);
+        if (MHE_V_SET && i < e->length)
+            mhe_add_pliancy(NY, MHE_V_ROWS, k->at[i]->h_jacobian, s->noises.rows, place + W_COUNT,
+                            D, weight + W_COUNT);
+        if (MHE_W_SET && i < e->length) {
+            const real *rows = s->disturbances.rows;
+            mhe_add_pliancy(NX, MHE_W_ROWS, k->at[i]->f_jacobian, rows, place, D, weight);
+            mhe_stage_curvature(e, k, i + 1, D);
+            mhe_add_pliancy(NX, MHE_W_ROWS, 0, rows, place, D, weight);
+        }
+        for (int r = 0; r < ROWS; r++) { /* some outputs depend on no state */
+            const real least = EPSILON * deviation[r];
+            if (place[r] != BETWEEN) weight[r] = STIFFER / mhe_max(weight[r], least * least);
+        }
+    }
+}
+
+/* Rows of X that are missed by a share of the prior's deviation may be missed by much where the prior
+ * is vague. Their scales become what the Hessian opposes to them, above rounding in their values.
+ * Only where some row is active or missed: else no scale is asked for. */
+static void mhe_sharpen(mhe_estimator *e, mhe_workspace *k, real tolerance)
+{
+    const real *rows = e->settings->states.rows;
+    for (int i = 0; MHE_X_SET && i <= e->length; i++) {
+        real *scale = k->rows.scale + i * ROWS + W_COUNT + V_COUNT, D[NX];
+        const real *d = k->step + i * NX;
+        mhe_stage_curvature(e, k, i, D);
+        for (int r = 0; r < NX + MHE_X_ROWS; r++) {
+            real pliancy = 0, size = 0;
+            for (int j = 0; j < NX; j++) {
+                const real slope = r < NX ? r == j : rows[(r - NX) * NX + j];
+                pliancy += slope * slope / D[j];
+                size += fabs(slope * d[j]);
+            }
+            const real least = mhe_max(sqrt(pliancy), 64 * EPSILON / tolerance * size);
+            if (least < scale[r]) scale[r] = least;
+        }
+    }
+}
+
+static int mhe_is_missed(const mhe_rows *q, int rows)
+{
+    int missed = 0;
+    for (int i = 0; i < rows; i++) missed |= (q->value[i] < q->low[i]) | (q->value[i] > q->high[i]);
+    return missed;
 }
 
 /* The largest miss of a row in its scale; rows.value = c(d) afterwards. */
@@ -194,10 +252,10 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
     const int size = (e->length + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     const real tolerance = e->settings->solver_tolerance / 100;
     mhe_rows *q = &k->rows;
-    int active = mhe_first_guess(q, rows, limit);
+    int active = mhe_first_guess(q, rows, limit), sharp = 0;
     mhe_guess guess = {0, rows + 1, 0};
     for (*iterations = 0;; again = 0) {
-        real open = 0, energy = 0, last = INFINITY;
+        real open = 0, energy = 0, last = INFINITY, left = 0, moved = 0;
         if (active && (*iterations == limit || *iterations == GUESSES)) return STOPPED;
         *iterations += active > 0;
         if (!again) {
@@ -208,12 +266,21 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
             q->load[i] = q->weight[i] * mhe_limit_of(q, i) - q->force[i];
         if (!mhe_solve_loaded(e, k, nearest, active > 0)) return STOPPED;
         mhe_rows_times(e, k, k->step);
-        if (active) open = mhe_push_back(q, rows, &energy);
+        if (!active && !mhe_is_missed(q, rows)) return SOLVED;
+        if (!sharp) {
+            mhe_sharpen(e, k, tolerance);
+            sharp = 1;
+        }
+        if (active) {
+            open = mhe_push_back(q, rows, &energy);
+            left = moved = mhe_size(e, k, k->step);
+        }
+        const real precise = PRECISE * moved;
         mhe_compare(q, rows, tolerance, &guess);
         if (limit == 0 && guess.wrong) return UNCONSTRAINED;
         /* Forces are exact enough for a guess; not yet for a solution. */
-        for (int round = 0; !guess.wrong && open > tolerance; round++) {
-            if (energy > last * (1 - STUCK)) {
+        for (int round = 0; !guess.wrong && (open > tolerance || left > precise); round++) {
+            if (open > tolerance && energy > last * (1 - STUCK)) {
                 guess.wrong = mhe_exclude(q, rows, open);
                 if (!guess.wrong) return EXCLUDED;
                 break;
@@ -224,6 +291,9 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
             for (int j = 0; j < size; j++) k->step[j] += k->direction[j];
             mhe_rows_times(e, k, k->step);
             open = mhe_push_back(q, rows, &energy);
+            const real change = mhe_size(e, k, k->direction), share = change / moved;
+            left = share < SHRINKING ? change * share : 0;
+            moved = change;
             if (open <= tolerance) mhe_compare(q, rows, tolerance, &guess);
         }
         if (!guess.wrong) return SOLVED;

@@ -70,6 +70,13 @@ static int mhe_solve_loads(mhe_estimator *e, mhe_workspace *k)
     return mhe_solve(e, k, 1, k->direction);
 }
 
+/* Reflections leave nothing to refine. */
+static real mhe_size(const mhe_estimator *e, const mhe_workspace *k, const real *d)
+{
+    (void)e; (void)k; (void)d;
+    return 0;
+}
+
 /* The same steps of the interior point. */
 static void mhe_begin_interior(mhe_estimator *e, mhe_workspace *k) { mhe_set_curvatures(e, k); }
 

@@ -1,7 +1,15 @@
 /* What a QP with rows needs of factor.c. */
 
+@mhe_workspace
+    /* The panels before they are factorised, where rows are active, and their diagonal. */
+    mhe_real plain[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
+    mhe_real diagonal[(MHE_HORIZON + 1) * MHE_NX];
+@
+/* The largest weight of an equation in the interior point. */
 #define STIFFNESS (sizeof(real) == 8 ? (real)1e6 : (real)1e3)
 
+/* Weights of active rows in the active-set method, beside what opposes them. Rounds refine what the
+ * sums have lost to them. */
 #define STIFFER (sizeof(real) == 8 ? (real)1e3 : (real)1e2)
 
 /* No row is one on a direction that has no disturbance in any trial. */
@@ -19,8 +27,7 @@ static void mhe_set_limits_about(mhe_workspace *k, const real *w)
 /* The diagonal of the Hessian's block of d(i). */
 static void mhe_stage_curvature(mhe_estimator *e, const mhe_workspace *k, int i, real *diagonal)
 {
-    const real *panel = k->panels + i * NX * WIDTH;
-    for (int j = 0; j < NX; j++) diagonal[j] = panel[j * WIDTH + j];
+    for (int j = 0; j < NX; j++) diagonal[j] = k->diagonal[i * NX + j];
     (void)e;
 }
 
@@ -96,12 +103,12 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
     (void)s;
 }
 
-/* out = H d, from the panels before they are factorised. */
-static void mhe_hessian_times(const mhe_workspace *k, int count, const real *d, real *out)
+/* out = H d, from panels that are not factorised. */
+static void mhe_hessian_times(const real *panels, int count, const real *d, real *out)
 {
     for (int j = 0; j < (count + 1) * NX; j++) out[j] = 0;
     for (int i = 0; i <= count; i++) {
-        const real *panel = k->panels + i * NX * WIDTH;
+        const real *panel = panels + i * NX * WIDTH;
         const int last = i < count ? 2 * NX : NX;
         for (int r = 0; r < NX; r++) {
             const real *row = panel + r * WIDTH, own = d[i * NX + r];
@@ -121,14 +128,16 @@ static int mhe_factorise_weighted(mhe_estimator *e, mhe_workspace *k, const real
                                   int active)
 {
     mhe_build(e, k, offset, nearest);
+    for (int j = 0; j < (e->length + 1) * NX; j++) k->diagonal[j] = k->panels[j * WIDTH + j % NX];
     if (active) {
+        memcpy(k->plain, k->panels, sizeof(real) * (size_t)((e->length + 1) * NX * WIDTH));
         mhe_set_stiffness(e, k);
         mhe_add_weights(e, k);
     }
     return mhe_factorise(k, e->length);
 }
 
-/* The increments that minimise the QP with the rows' loads, or these alone. */
+/* The increments that minimise the QP with the rows' loads. */
 static int mhe_solve_loaded(mhe_estimator *e, mhe_workspace *k, int nearest, int active)
 {
     (void)nearest; /* the gradient is zero then */
@@ -137,11 +146,26 @@ static int mhe_solve_loaded(mhe_estimator *e, mhe_workspace *k, int nearest, int
     return mhe_solve(k, e->length, k->step);
 }
 
+/* What these loads add to the increments, and what rounding has left of them: forces that are not
+ * balanced. */
 static int mhe_solve_loads(mhe_estimator *e, mhe_workspace *k)
 {
-    memset(k->direction, 0, sizeof(real) * (size_t)(e->length + 1) * NX);
+    const int rows = mhe_row_stages(e) * ROWS;
+    mhe_rows *q = &k->rows;
+    mhe_hessian_times(k->plain, e->length, k->step, k->product);
+    for (int j = 0; j < (e->length + 1) * NX; j++) k->direction[j] = -k->product[j] - k->gradient[j];
+    for (int i = 0; i < rows; i++) q->load[i] -= q->force[i];
     mhe_add_loads(e, k, k->direction);
     return mhe_solve(k, e->length, k->direction);
+}
+
+/* The length of increments, in the units of the Hessian's diagonal. */
+static real mhe_size(const mhe_estimator *e, const mhe_workspace *k, const real *d)
+{
+    real sum = 0;
+    for (int j = 0; j < (e->length + 1) * NX; j++)
+        sum += k->diagonal[j] * d[j] * d[j];
+    return sqrt(sum);
 }
 
 /* The same steps of the interior point. */
@@ -175,7 +199,7 @@ static real mhe_unbalanced(mhe_estimator *e, mhe_workspace *k, int nearest)
     const int size = (e->length + 1) * NX;
     real worst = 0;
     (void)nearest; /* the gradient is zero then */
-    mhe_hessian_times(k, e->length, k->step, k->product);
+    mhe_hessian_times(k->panels, e->length, k->step, k->product);
     for (int j = 0; j < size; j++) k->residual[j] = -k->product[j] - k->gradient[j];
     mhe_add_loads(e, k, k->residual);
     for (int j = 0; j < size; j++) {

@@ -4,8 +4,7 @@ A difference is explained, in this order: by rounding, where an engine differs a
 when its memory and its data change in their last digits; by the tolerance of the Python step's QPs,
 where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
 where it differs as much from itself when the QPs change in their last digits; by a cap or
-by a QP that a method has not solved, mostly since it has no feasible point; by a direction in which
-J is nearly flat, where the step in C loses digits to the weights of active rows. What is left is a
+by a QP that a method has not solved, mostly since it has no feasible point. What is left is a
 fault.
 """
 
@@ -22,10 +21,9 @@ from qpmhe.codegen.exchange import hand_over, record_of
 from qpmhe_solvers import RawSolution, Solver, SolveStatus, create
 from qpmhe_solvers.options import SolverOptions
 
-from .judge import EPS, nudged
+from .judge import nudged
 
 CLOSE = 1e-6  # of two estimates in units, and of their J as a share
-FLAT = 1e8  # condition of a Hessian from which on J is nearly flat in a direction
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
@@ -57,7 +55,6 @@ class Nudging(Solver):
     def __init__(self):
         super().__init__(SolverOptions())
         self.unsolved = False
-        self.condition = 1.0  # the largest one of their Hessians in units of its diagonal
         self.r, self.inner = np.random.default_rng(4), create(
             "auto", SolverOptions(absolute_tolerance=1e-12)
         )
@@ -67,10 +64,6 @@ class Nudging(Solver):
         for part in (other.band, other.gradient):
             part[...] = nudged(self.r, part)
         found = self.inner.solve(other)
-        lower = np.tril(qp.dense())
-        roots = np.sqrt(np.diag(lower))
-        values = np.linalg.eigvalsh(lower / np.outer(roots, roots))
-        self.condition = max(self.condition, values[-1] / max(values[0], EPS))
         solved = found.status is SolveStatus.SOLVED
         self.unsolved |= not solved  # also one of a correction, which no status tells
         return RawSolution(found.d, solved, found.iterations, found.bound_duals, found.row_duals)
@@ -195,7 +188,7 @@ class Beside:
             return "cap"
         if solver.unsolved or STOPPED & (estimate.status | other.status):
             return "unsolved QP"
-        return "flat J" if solver.condition > FLAT else "open"
+        return "open"
 
     def _is_rounding(self, estimate, other, kind, x, J, act):
         r, engine = np.random.default_rng(3), self.compiled._engine
@@ -225,7 +218,7 @@ class Beside:
                 "python", backend=Nudging(), max_solver_iterations=None
             )
         found, solver = [], self.nudging.settings.backend
-        solver.condition, solver.unsolved = 1.0, False
+        solver.unsolved = False
         for _ in range(_TRIES):
             self.compiled._engine._memory[...] = self.memory
             self._hand_over(self.nudging)
