@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,13 +32,20 @@ class Hypothesis:
 
     measurements: Array  # (T, p), NaN where missing
     inputs: Array  # (T, m)
-    noise: Array  # R
+    noise: Array  # R (p, p), or (T, p, p) where it changes
     disturbance: Array  # Q of what the disturbance adds to the state
     start: Array  # the first estimate, and its covariance
     prior: Array
     step: float = 1.0  # length of each, as a multiple of what the record says
     outliers: bool = False  # whether single measurements may be such, which it then leaves out
     gains: Array | None = None  # (p,): what the record's numbers were divided by to make y
+    repeats: Array | None = None  # (T,): how many steps of the model lie behind each sample
+    bank: FilterBank | None = None  # the filters of another model, where it has one
+
+    @property
+    def usual_noise(self) -> Array:
+        """R, or its mean where it changes."""
+        return self.noise if self.noise.ndim == 2 else np.asarray(self.noise.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +177,25 @@ class FilterBank:
             return found
 
     def run(self, hypotheses: Sequence[Hypothesis]) -> Filtered:
-        """Filter the record under all hypotheses at once."""
+        """Filter the record under all hypotheses, those of one model at once."""
+        banks = {id(one.bank or self): one.bank or self for one in hypotheses}
+        if banks.keys() == {id(self)}:
+            return self._run(hypotheses, hypotheses[0])
+        members = {
+            key: [k for k, one in enumerate(hypotheses) if (one.bank or self) is bank]
+            for key, bank in banks.items()
+        }
+        found = {
+            key: banks[key]._run([hypotheses[k] for k in some], hypotheses[0])
+            for key, some in members.items()
+        }
+        logs = np.empty((len(hypotheses[0].measurements), len(hypotheses)))
+        for key, some in members.items():
+            logs[:, some] = found[key].logs
+        return replace(found[id(hypotheses[0].bank or self)], logs=logs)
+
+    def _run(self, hypotheses: Sequence[Hypothesis], usual: Hypothesis) -> Filtered:
+        """Filter the record under hypotheses of this model, with units and evidence of `usual`."""
         y = np.array([one.measurements for one in hypotheses])
         u = np.array([self.full_inputs(one.inputs, one.step) for one in hypotheses])
         start = np.array([one.start for one in hypotheses])
@@ -185,18 +210,25 @@ class FilterBank:
         outliers = np.array([one.outliers for one in hypotheses])
         scale = np.array([1.0 if self._is_timed else one.step for one in hypotheses])[:, None]
         # Outputs count in deviations of the usual noise, whatever their units.
-        unit = np.sqrt(hypotheses[0].noise.diagonal())
-        noise = np.array([one.noise for one in hypotheses]) / np.multiply.outer(unit, unit)
+        unit = np.sqrt(usual.usual_noise.diagonal())
+        units = np.multiply.outer(unit, unit)
+        noise = np.array([one.usual_noise for one in hypotheses]) / units
+        changing = {k: one.noise / units for k, one in enumerate(hypotheses) if one.noise.ndim > 2}
+        repeats = None if all(one.repeats is None for one in hypotheses) else np.array([
+            np.ones(total, np.intp) if one.repeats is None else one.repeats for one in hypotheses
+        ])
         eye_n, eye_p = np.eye(n), np.eye(p)
         x, covariance = start.copy(), prior.copy()
         alive, logs = np.ones(count, np.bool_), np.zeros((total, count))
         shapes = (n,), (n,), (p,), (p, p), (p, p), (n, n), (n, n), (p, n), (n, p)
         first = Filtered(logs, *(np.empty((total, *shape)) for shape in shapes))
         extreme = np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi))  # beside a normal distribution
-        usual, any_outliers = np.log1p(-_SHARE), outliers.any()
+        inlying, any_outliers = np.log1p(-_SHARE), outliers.any()
         left_out = np.zeros((count, p))
         for t in range(total):
             now, seen = u[:, t], there[:, t]
+            for k, varying in changing.items():
+                noise[k] = varying[t]
             c = self._values(h_jacobian, x, now, (p, n)) / unit[:, None]
             e = self.errors(y[:, t], self._values(h, x, now, (p,))) / unit
             transposed = covariance @ c.transpose(0, 2, 1)
@@ -207,7 +239,7 @@ class FilterBank:
                 tail = np.log1p(e * e / own / _WIDTH**2) + 0.5 * np.log(own)
                 seen, left_out = seen & ~far, left_out + far
                 logs[t] += np.where(far, extreme - tail, 0.0).sum(axis=1)
-                logs[t] += usual * (outliers * seen.sum(axis=1))
+                logs[t] += inlying * (outliers * seen.sum(axis=1))
             spread = spread + noise
             if not seen.all():
                 spread = np.where(seen[:, :, None] & seen[:, None, :], spread, eye_p)
@@ -245,16 +277,27 @@ class FilterBank:
             if (scale != 1.0).any():
                 following = x + scale * (following - x)
                 a = eye_n + scale[:, :, None] * (a - eye_n)
-            first.transitions[t], x = a[0], following
+            before, x, former = x, following, covariance
             covariance = a @ covariance @ a.transpose(0, 2, 1) + disturbance
+            if repeats is not None and (repeats[:, t] != 1).any():
+                held = repeats[:, t] == 0
+                x[held], covariance[held], a[held] = before[held], former[held], eye_n
+                for further in range(1, int(repeats[:, t].max())):
+                    some = np.flatnonzero(repeats[:, t] > further)
+                    slope = self._values(f_jacobian, x[some], now[some], (n, n))
+                    x[some] = self._values(f, x[some], now[some], (n,))
+                    covariance[some] = slope @ covariance[some] @ slope.transpose(0, 2, 1)
+                    covariance[some] += disturbance[some]
+                    a[some] = slope @ a[some]
+            first.transitions[t] = a[0]
         for k, one in enumerate(hypotheses):  # the density of the record's own numbers
             if one.gains is not None:
                 logs[:, k] -= there[k] @ np.log(one.gains)
         # A shifted record lacks some samples, which must make no difference.
-        counts = there.sum(axis=(1, 2))
-        logs *= counts[0] / np.maximum(counts, 1)
+        counts, evidence = there.sum(axis=(1, 2)), np.isfinite(usual.measurements)
+        logs *= evidence.sum() / np.maximum(counts, 1)
         if self._loss is None:
-            recovers = _recovering(there[0].any(axis=1))
+            recovers = _recovering(np.asarray(evidence.any(axis=1)))
             logs[recovers], first.innovations[recovers] = 0.0, np.nan
         # What leaves out most of a sensor does not explain it.
         alive &= (left_out <= _MOST_OUTLIERS * there.sum(axis=1)).all(axis=1)

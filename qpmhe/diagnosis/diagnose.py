@@ -116,18 +116,21 @@ def diagnose(
     An extended Kalman filter with the model, and with the inverse weights Q, R as covariances,
     runs over the record from the N-th sample on, or from the tenth. If all is well, its
     innovations are white and have the predicted covariance. Where they do not, each fault below
-    has a filter that corrects the record for this fault. The fault that makes the record most
-    likely is the first finding; the search for others continues with it corrected. In the end
-    factors of R and Q are searched together; they are named only if the innovations are white with
-    them, and if no coloured noise or lag of a sensor explains the record as well. The ten
+    has filters that correct the record for this fault. All are judged by the likelihood of the same
+    measurements; the best is the first finding, with those that the record cannot tell from it
+    (`Finding.equals`). The search for others continues with it corrected. In the end factors of R
+    and Q are searched together; they are named only if the innovations are white with them. The ten
     measurements after a gap of ten samples or more are no evidence.
 
     * an integration step that is too long for the disturbance's size;
-    * R or Q, of all or of one component, too small or too large by a factor;
-    * a biased sensor, throughout or for a time, one in another unit; two that are swapped;
-    * a dead sensor, one that is saturated, and outliers;
-    * steps of another length, measurements that are late or early, clocks that drift;
-    * an input with the wrong sign, or another gain.
+    * R or Q, of all or of one component, too small or too large by a factor; R that changes once;
+    * a biased sensor, throughout, for a time or growing, one in another unit; two that are swapped;
+    * a dead sensor, one that is saturated or rounded, outliers;
+    * noise of a sensor that is correlated in time, or a lag of the first order;
+    * steps of another length, measurements that are late or early, clocks that drift, times that
+      scatter, rows that are missing or there twice;
+    * an input with the wrong sign, or another gain; one of the estimator's `parameters` that is
+      wrong.
 
     It also reports directions of the state that the data do not see, innovations that are
     correlated with themselves or with the inputs, steps that kept the candidate, with the reason,
@@ -159,8 +162,10 @@ def diagnose(
     -----
     The weights count as inverse covariances, also with a discount. A fault is reported if it
     makes the record more likely by a factor of :math:`e^{12}`, up to :math:`e^{24}` where
-    measurements are missing, and by 3.5 % for each measurement where it concerns all of them, no
-    sample counting for more than a factor of :math:`e^3`; and if it is large enough to matter.
+    measurements are missing, and, where it concerns all of them, by 3.5 % for each, no sample
+    counting for more than a factor of :math:`e^3`; and if it is large enough to matter. Where it
+    may concern few samples, :math:`\tfrac12 k \log T` comes on top for k numbers that the record
+    determines, such as a size and a beginning. `causes.py` has the table of all hypotheses.
     Inputs that a controller computes from states that it does not measure can look like delays.
 
     References

@@ -16,10 +16,10 @@ from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
 from ..terms.information import prior_units
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
-from .fault_kinds import LEAST_GAIN, SCALED, Fault
-from .faults import search
+from .causes import in_words
+from .faults import SCALED, Evidence, Fault
 from .findings import Finding, Names, listed, number, percent
-from .sensor_memory import MemoryBank
+from .search import search
 from .steps import finer
 from .stuck import stuck
 
@@ -92,7 +92,7 @@ class Examination:
         self.inputs = _held(np.zeros((total, 0)) if source.inputs is None else source.inputs)
         self.is_judged = True
         self._filter(disturbance)
-        length, same = source.settings.horizon, len(self.best.states) == len(self.null.states)
+        length, same = source.settings.horizon, self.best.states.shape == self.null.states.shape
         # What the windows see is examined along the states of the filter that explains the record.
         self.along = self.best if same and np.isfinite(self.best.logs).all() else self.null
         self.horizon = min(length, len(self.along.states))
@@ -160,42 +160,47 @@ class Examination:
             self.faults, self.best, self.unexplained = [], null, []
         whole = 0, len(base.measurements) - 1
         self.searched = begin + self.first if begin else 0, begin + self.first + whole[1]
-        if begin:
-            self.faults = [
-                replace(one, span=whole) if one.span is None and not one.is_wrong_unit else one
-                for one in self.faults
-            ]
-        for k, one in enumerate(self.faults):
-            if one.span is not None:  # before the filter began there is no evidence, nor an end
-                low, high = one.span[0] + begin, one.span[1] + begin + self.first
-                self.faults[k] = replace(one, span=(low + self.first if low else 0, high))
+        self.faults = [
+            self._placed(
+                replace(one, span=whole) if begin and one.span is None and not one.is_wrong_unit
+                else one, begin)
+            for one in self.faults
+        ]
+
+    def _placed(self, one: Fault, begin: int) -> Fault:
+        """A fault with the samples of the run; before the filter began there is no evidence."""
+        span = one.span
+        if span is not None:
+            low, high = span[0] + begin, span[1] + begin + self.first
+            span = low + self.first if low else 0, high
+        rows = tuple(row + begin + self.first for row in one.rows)
+        return replace(
+            one, span=span, rows=rows, equals=tuple(self._placed(k, begin) for k in one.equals)
+        )
 
     def _verified(
         self, bank: FilterBank, base: Hypothesis, null: Filtered
     ) -> tuple[list[Fault], Filtered, list[tuple[int, int, float, str]]]:
-        """Faults; factors of R and Q only if they explain the record, and nothing else does.
+        """Faults; factors of R and Q only if they explain the record.
 
         Also the filter with them, and what correlation it leaves: sensor, lag, size, and what that
         tells.
         """
-        faults, corrected = search(bank, base, null, self._starts())
+        evidence = Evidence(
+            bank, base, null, self._starts(), len(self.source.settings.parameters or ())
+        )
+        faults, corrected = search(evidence)
         best, why = bank.run([corrected]), ""
         coloured = self._colour(best.normalised, _COLOURED, _DOUBTFUL) if faults else []
         scaled = [k for k, one in enumerate(faults) if one.kind in SCALED]
         if scaled:
             before = faults[: scaled[0]]
-            rest = replace(
-                before[-1].hypothesis if before else base,
-                noise=base.noise, disturbance=base.disturbance,
-            )
-            gain = float(np.subtract(*bank.run([rest, corrected]).likelihoods[::-1]))
             if coloured:
                 why = "Factors of Q and R do not make them white. "
-            elif np.isfinite(gain) and MemoryBank(bank).gain(rest) > gain - LEAST_GAIN:
-                why = "A sensor with a memory explains that as well as factors of Q and R do. "
-            if why:
+                rest = before[-1].hypothesis if before else base
+                if rest.noise.ndim == base.noise.ndim:
+                    rest = replace(rest, noise=base.noise, disturbance=base.disturbance)
                 faults, best = before, bank.run([rest])
-                coloured = coloured or self._colour(best.normalised, 0.0, np.inf)
         return faults, best, [
             (*one, why) for one in sorted(coloured, key=lambda one: -abs(one[2]))
         ]
@@ -269,7 +274,7 @@ class Examination:
         """What is certain first, but a wrong unit before what follows from it."""
         deviations, told = np.sqrt(self.noise.diagonal()), []
         for one in self.faults:
-            finding = one.in_words(self.names, deviations, self.outliers)
+            finding = in_words(one, self.names, deviations, self.outliers)
             if self.unexplained and not one.is_wrong_unit:
                 finding = replace(finding, remedy=f"{finding.remedy} {_DOUBT}")
             if one.kind != "outliers" or not isinstance(self.source.cost, RobustCost):
@@ -412,7 +417,7 @@ class Examination:
         for one in self.faults:
             if one.kind == "outliers" and isinstance(self.source.cost, RobustCost):
                 deviations = np.sqrt(self.noise.diagonal())
-                told = one.in_words(names, deviations, self.outliers)
+                told = in_words(one, names, deviations, self.outliers)
                 yield note(one.kind, told.text, "The cost is robust.")
         is_followed = bool(np.isfinite(self.along.logs).all())
         judged = self._judged(is_followed)

@@ -19,9 +19,10 @@ class Finding:
     ----------
     kind : str
         ``dead``, ``saturated``, ``missing``, ``failing``, ``noise``, ``disturbance``, ``gain``,
-        ``bias``, ``swapped``, ``step``, ``sign``, ``input``, ``shift``, ``clock``, ``outliers``,
-        ``discretization``, ``unseen``, ``correlated``, ``estimator``; a note also has ``prior``,
-        ``kept``, ``innovations``, ``drift``, ``record`` or ``rejected``.
+        ``bias``, ``ramp``, ``swapped``, ``step``, ``sign``, ``input``, ``parameter``, ``shift``,
+        ``lag``, ``clock``, ``jitter``, ``dropped``, ``doubled``, ``outliers``, ``coloured``,
+        ``change``, ``quantised``, ``discretization``, ``unseen``, ``correlated``, ``estimator``; a
+        note also has ``prior``, ``kept``, ``innovations``, ``drift``, ``record`` or ``rejected``.
     text : str
         What it is, as a sentence.
     remedy : str
@@ -31,6 +32,8 @@ class Finding:
         estimates. ``note``: worth knowing.
     where : (float, float) or None
         First and last time, if not the whole run.
+    equals : tuple of str
+        Kinds of other causes that explain the record as well; the text names them.
     """
 
     kind: str
@@ -38,6 +41,7 @@ class Finding:
     remedy: str = ""
     severity: str = "fault"
     where: tuple[float, float] | None = None
+    equals: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.text} {self.remedy}".strip()
@@ -74,6 +78,17 @@ class Names:
         begin, end = self.span(first, last)
         step = abs(self.step)
         return f" between {_time(begin, step)} and {_time(end, step)} {self.unit}"
+
+    def at(self, sample: int) -> str:
+        """The time of a sample in words."""
+        if self.unit == "samples":
+            return f"sample {sample}"
+        return f"{_time(self.span(sample, sample)[0], abs(self.step))} {self.unit}"
+
+    def rate(self, change: float) -> str:
+        """A change in each sample, in the time's unit."""
+        one = "sample" if self.unit == "samples" else self.unit
+        return f"{number(change / self.step)} per {one}"
 
     def samples(self, count: float) -> str:
         """A number of samples, and how long they take."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from .bank import Array, FilterBank, Filtered, Hypothesis
-from .fault_kinds import LEAST_GAIN, MOST_PARTS, Fault, with_factor
+from .faults import LEAST_GAIN, MOST_PARTS, Evidence, Fault, with_factor
 
 # Shares of the size that innovations show of a gain.
 _AROUND = (0.5, 1.0, 1.5, 2.5)
+# Places where a ramp may begin.
+_RAMPS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,25 +28,28 @@ class Signature:
     span: tuple[int, int] | None = None
 
 
-def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Signature]:
-    total, p = base.measurements.shape
+def _signatures(evidence: Evidence) -> Iterator[Signature]:
+    bank, base, null, total = evidence.bank, evidence.base, evidence.null, evidence.total
+    p, m, inputs = base.measurements.shape[1], base.inputs.shape[1], evidence.inputs
     none_x = np.zeros((total, bank.system.n))
-    inputs = bank.full_inputs(base.inputs, base.step)
     # At each sample from those before it alone: else noise would look like a fault.
     expected, moves = bank.moves(null.states, inputs)
-    if base.inputs.shape[1]:
+    if m:
         yield Signature("shift", (), -moves, none_x)
-    if 1 < p <= MOST_PARTS:
-        for j in range(p):
-            yield Signature("shift", (j,), -moves * (np.arange(p) == j), none_x)
-    for j in range(p) if p <= MOST_PARTS else ():
-        yield Signature("gain", (j,), expected * (np.arange(p) == j), none_x)
+    if p > 1:
+        for part in evidence.sensors:
+            yield Signature("shift", part, -moves * (np.arange(p) == part[0]), none_x)
+    for part in evidence.sensors:
+        yield Signature("gain", part, expected * (np.arange(p) == part[0]), none_x)
+    if p > 1:
+        yield Signature("gain", (), expected, none_x)
     reached = bank.following(null.corrected, inputs)
-    for j in range(base.inputs.shape[1]):
+    for j in range(m):
         without = inputs.copy()
         without[:, j] = 0.0
         yield Signature(
-            "input", (j,), expected - bank.expected(null.states, without),
+            "input" if j < m - evidence.parameters else "parameter", (j,),
+            expected - bank.expected(null.states, without),
             reached - bank.following(null.corrected, without),
         )
     blocks = max(1, min(32 if p <= MOST_PARTS else 8, total // 4))
@@ -52,6 +57,11 @@ def _signatures(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[
     for j in range(p):
         for first, end in pairwise(edges):
             yield _bias(bank, total, j, first, end - 1)
+    for part in evidence.sensors:
+        for first in np.linspace(0, total, _RAMPS + 1).astype(int).tolist()[:-1]:
+            outputs = np.zeros((total, p))
+            outputs[first:, part[0]] = np.arange(total - first)
+            yield Signature("ramp", part, outputs, none_x, (first, total - 1))
 
 
 def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> Signature:
@@ -62,7 +72,18 @@ def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> S
     )
 
 
-def additive_faults(bank: FilterBank, base: Hypothesis, null: Filtered) -> Iterator[Fault]:
+def additive(kind: str) -> Callable[[Evidence], list[Fault]]:
+    """What makes the additive faults of a kind; all kinds are looked for together."""
+
+    def found(evidence: Evidence) -> list[Fault]:
+        if "additive" not in evidence.shared:
+            evidence.shared["additive"] = list(_additive_faults(evidence))
+        return [one for one in evidence.shared["additive"] if one.kind == kind]
+
+    return found
+
+
+def _additive_faults(evidence: Evidence) -> Iterator[Fault]:
     """Additive faults, of the size that the innovations of the filter without them show.
 
     An additive fault moves the innovations by a signature that is linear in its size; they are
@@ -73,10 +94,11 @@ def additive_faults(bank: FilterBank, base: Hypothesis, null: Filtered) -> Itera
     Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation
     of jumps in linear systems, IEEE Transactions on Automatic Control 21 (1976).
     """
+    bank, base, null = evidence.bank, evidence.base, evidence.null
     if not np.isfinite(null.logs).all():
         return
     signatures = [
-        one for one in _signatures(bank, base, null)
+        one for one in _signatures(evidence)
         if np.isfinite(one.outputs).all() and np.isfinite(one.states).all()
     ]
     if not signatures:
@@ -164,10 +186,12 @@ def with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -
 
 def removed(base: Hypothesis, one: Signature, size: float) -> Fault:
     """The record without this fault."""
-    if one.kind == "input":
-        kind = "sign" if size < -1.0 else "input"
-        return with_factor(base, kind, one.subject, 1.0 + size)
+    if one.kind in ("input", "parameter"):
+        return with_factor(base, one.kind, one.subject, 1.0 + size)
     if one.kind == "gain":
         return with_factor(base, "gain", one.subject, float(np.exp(size)))
-    y = base.measurements - size * one.outputs
-    return Fault(one.kind, size, replace(base, measurements=y), one.subject, one.span)
+    changed = replace(base, measurements=base.measurements - size * one.outputs)
+    return Fault(
+        one.kind, size, changed, one.subject, one.span,
+        again=lambda value: removed(base, one, value), family=one.span,
+    )

@@ -9,8 +9,8 @@ import numpy as np
 from ..model.residuals import difference
 from ..model.system import System
 from .bank import Array, FilterBank, Filtered, Hypothesis
-from .faults import explains
 from .findings import Finding, Names, number
+from .search import explains
 
 # A step that is off by less than this share of a standard deviation of w does no harm.
 _HARMLESS = 0.1
