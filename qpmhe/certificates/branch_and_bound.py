@@ -62,19 +62,31 @@ class Cells:
 
     def halve(self, low: Array, high: Array, scores: Array, bounds: Array | float = np.inf) -> None:
         """Put the halves of cells back, along the coordinates with the largest scores."""
-        region, rows = self._region, np.arange(low.shape[0])
-        known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
-        width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
-        which = np.where(known[:, None], scores, (high - low) / width).argmax(axis=1)
-        middle = 0.5 * (low[rows, which] + high[rows, which])
-        first_high, second_low = high.copy(), low.copy()
-        first_high[rows, which] = second_low[rows, which] = middle
-        lower, upper = np.vstack((low, second_low)), np.vstack((first_high, high))
-        stay = ~region.outside(lower, upper)
+        lower, upper = _halves(self._region, low, high, scores)
+        stay = ~self._region.outside(lower, upper)
         self._lower = np.vstack((self._lower, lower[stay]))
         self._upper = np.vstack((self._upper, upper[stay]))
         bounds = np.tile(np.broadcast_to(bounds, len(low)), 2)
         self.inherited = np.append(self.inherited, bounds[stay])
+
+
+def _halves(region: Region, low: Array, high: Array, scores: Array) -> tuple[Array, Array]:
+    """The first halves of all cells, and then the second ones."""
+    rows = np.arange(low.shape[0])
+    known = np.isfinite(scores).all(axis=1) & (scores.max(axis=1) > 0.0)
+    width = np.where(region.upper > region.lower, region.upper - region.lower, np.inf)
+    which = np.where(known[:, None], scores, (high - low) / width).argmax(axis=1)
+    middle = 0.5 * (low[rows, which] + high[rows, which])
+    first_high, second_low = high.copy(), low.copy()
+    first_high[rows, which] = second_low[rows, which] = middle
+    return np.vstack((low, second_low)), np.vstack((first_high, high))
+
+
+def halves_of(region: Region, low: Array, high: Array, scores: Array) -> tuple[Array, Array]:
+    """Halves of cells along the coordinates with the largest scores, within a region."""
+    lower, upper = _halves(region, low, high, scores)
+    stay = ~region.outside(lower, upper)
+    return lower[stay], upper[stay]
 
 
 def _scores(enclosure: Enclosure, left: NDArray[np.intp]) -> Array:

@@ -28,7 +28,7 @@ from .evidence import Evidence, MismatchError, json_ready
 from .inequalities import Form
 from .invariance import supports
 from .model_values import ModelValues
-from .observer_bound import initial_length, largest_ratio
+from .norms import initial_length, largest_ratio
 from .regions import Region, bounded_region
 from .sdp import started
 from .search import Search

@@ -8,7 +8,8 @@ import numpy as np
 
 from .._checks import Array
 from ..costs import Cost
-from .observer_bound import ObserverBound, largest_ratio
+from .norms import largest_ratio
+from .observer_bound import ObserverBound
 from .properties import Detectability
 from .sizes import OUTWARD, Sizes, lengths_of
 

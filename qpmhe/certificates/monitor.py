@@ -18,9 +18,11 @@ from ..terms.hold import Hold
 from ..terms.sum import further_terms
 from .certificate import Certificate
 from .content import Content
+from .events import CONTRADICTION, REINITIALIZED
 from .evidence import MismatchError
 from .measured_cost import MeasuredCost
-from .observer_bound import CONTRADICTION, REINITIALIZED, ObserverBound, largest_ratio
+from .norms import largest_ratio
+from .observer_bound import ObserverBound, Tube
 from .sizes import Size, Sizes
 
 _RELATIVE = 1e-6
@@ -153,8 +155,9 @@ class Monitor:
             estimator.observer, self._system, estimator.settings.projection_metric
         )
         self.sizes = bound.sizes if sizes is None else sizes
-        self._entering = bound.entering(self.sizes.disturbance, self.sizes.noise)
-        self._radius = bound.initial(initial_error)
+        given = self.sizes.disturbance, self.sizes.noise
+        self._entering, self._added = bound.entering(*given), bound.added(*given)
+        self._tube = bound.begun(initial_error)
         self._time, self._z = estimator.time, estimator.observer_state
         self._ends = REINITIALIZED if estimator.settings.candidate != "observer" else ""
         self.lost: int | None = None
@@ -162,7 +165,7 @@ class Monitor:
         self.steps, self._horizon = 0, estimator.horizon
         # Of the window: z and b at its states, and its inputs.
         self._before: deque[tuple[Array, float]] = deque(maxlen=estimator.horizon + 1)
-        self._before.append((self._z, self._radius))
+        self._before.append((self._z, self._tube.radius))
         self._inputs: deque[Array] = deque(maxlen=estimator.horizon)
         self._certificate: Certificate | None = None
         self._measured: MeasuredCost | None = None
@@ -218,11 +221,12 @@ class Monitor:
             elif not reason and not np.array_equal(z, self._z):
                 reason = _MOVED
             if reason:
-                self.lost, self.reason, self._radius = t, reason, math.nan
+                self.lost, self.reason = t, reason
+                self._tube = Tube(math.nan, np.full_like(z, math.nan))
         self._time, self._z = t + 1, z.copy()
         if not again:
             self.steps += 1
-            self._before.append((self._z, self._radius))
+            self._before.append((self._z, self._tube.radius))
             self._inputs.append(given)
         if not self.barred or self._measured is not None:
             reason = self.reason or self._left(estimate, again)
@@ -232,15 +236,16 @@ class Monitor:
                 reason = _RESTORED
             if reason and not self.barred:
                 self.barred = f"from sample {t} on: {reason}"
-        lower, upper = self.bound.around(self._radius, self._z)
-        error = float(self.bound.farthest(self._radius, estimate.state - self._z, self._z))
+        (radius, box), z = self._tube, self._z
+        lower, upper = self.bound.around(radius, z, box)
+        error = float(self.bound.farthest(radius, estimate.state - z, z, box))
         kind = "observer"
         if self._measured is not None:
             stages = len(self._before) - 1
             least = self._measured.error(self._before[0][1], stages, estimate.cost)
             if least < error:
                 error, kind = least, "measured"
-        return Reading(t, self._radius, lower, upper, error, kind, self.lost, self.reason)
+        return Reading(t, radius, lower, upper, error, kind, self.lost, self.reason)
 
     def _order(self, time: int) -> str:
         """Why an estimate is not the next one; empty if it is, or is the same again."""
@@ -283,8 +288,11 @@ class Monitor:
             changed = self._model.difference(system, (turn,))
             if changed:
                 return f"the system is another than was certified: {changed}"
-        self._radius = bound.advanced(self._radius, self._entering)
-        return CONTRADICTION if bound.is_empty(self._radius, z) else ""
+        self._tube = bound.followed(
+            self._tube, self._entering, self._added, observer=before, u=u,
+            projected=Status.OBSERVER_PROJECTED in estimate.status,
+        )
+        return CONTRADICTION if bound.is_empty(self._tube.radius, z, self._tube.box) else ""
 
     def _left(self, estimate: Estimate, again: bool) -> str:
         """Which of the theorem's hypotheses does not hold of the window; empty if all do.
@@ -331,8 +339,9 @@ class Monitor:
                 "only a monitor of an ObserverBound has a state; pass certificate.observer_bound."
             )
         return {
-            "time": self._time, "observer": self._z.copy(), "radius": self._radius,
-            "lost": self.lost, "reason": self.reason, "metric": self.bound.metric.copy(),
+            "time": self._time, "observer": self._z.copy(), "radius": self._tube.radius,
+            "box": self._tube.box.copy(), "lost": self.lost, "reason": self.reason,
+            "metric": self.bound.metric.copy(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -344,6 +353,7 @@ class Monitor:
         try:
             z = np.array(state["observer"], np.float64).reshape(self._z.shape)
             time, radius = int(state["time"]), float(state["radius"])
+            box = np.array(state["box"], np.float64).reshape(self._z.shape)
             lost = None if state["lost"] is None else int(state["lost"])
             reason = str(state["reason"])
             metric = np.array(state["metric"], np.float64).reshape(mine.shape)
@@ -353,7 +363,8 @@ class Monitor:
             raise InvalidInputError(
                 f"the state does not come from a monitor of this observer: {error}."
             ) from error
-        self._time, self._z, self._radius, self.lost, self.reason = time, z, radius, lost, reason
+        self._time, self._z, self._tube = time, z, Tube(radius, box)
+        self.lost, self.reason = lost, reason
 
 
 def _barred(estimator: MovingHorizonEstimator) -> str:

@@ -16,10 +16,9 @@ or detectability enters.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,13 +34,14 @@ from ..observers import Observer
 from .content import Content
 from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
-from .enclosures import evaluated
+from .events import CONTRADICTION, REINITIALIZED, check_model, first_event
 from .evidence import Evidence, MismatchError, at_most, json_ready
 from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region
-from .model_values import SAME_MODEL
+from .norms import SLACKS, initial_length
 from .properties import ObserverStability
-from .regions import Region, bounded_region
+from .regions import Region, beyond, bounded_region
+from .rowwise import RowwiseStep
 from .sizes import (
     OUTWARD,
     UNIT,
@@ -55,30 +55,18 @@ from .sizes import (
 
 # How close to its limit the bound is when it is called settled, and in how many samples at most.
 _SETTLED, _MOST_SAMPLES = 0.1, 10**6
+# Of each component: how many steps its limit may take, and by how little they change at the end.
+_MOST_STEPS, _LITTLE = 3000, 1e-5
+# Boxes of more states are bounded by sums over their sides.
+_MOST_SIGNS = 10
 # How much of the time is for the contraction, and of the rest for the region itself.
 _CONTRACTION, _INVARIANCE = 0.8, 0.6
-_SLACKS = (1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 
-#: Of an estimator whose observer does not run on.
-REINITIALIZED = (
-    "the candidate comes from an observer that restarts at each sample, whose states this bound "
-    "does not cover"
-)
-#: Where the data contradict what is assumed.
-CONTRADICTION = (
-    "no state of the region fits the bound: the disturbances, the noises or the initial error were "
-    "larger than stated, or the model is another one"
-)
-_EVENTS = {
-    Status.MISSING: "a measurement was missing",
-    Status.MODEL_FAILED: "the model failed, and the observer restarted",
-    Status.METRIC_SINGULAR: "the observer was projected in the projection's own metric",
-    Status.RESTARTED: "the observer was restarted from an estimate (RESTARTED)",
-}
-_PROJECTED = (
-    "the observer was projected onto X in another metric than the certified one, "
-    "metric=observer_bound.metric"
-)
+class Tube(NamedTuple):
+    """Bounds at one time: |x - z|_P <= radius, and |x_i - z_i| <= box[i]."""
+
+    radius: float
+    box: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +119,8 @@ class ObserverBound:
     inner : Invariance or None
         The same for a smaller region, around which the observer stays in the region: within the
         bound's limit. None where there is no such region, or its invariance is not proved.
+    rowwise : RowwiseStep or None
+        The step of each component's bound, where it is known.
     """
 
     stability: ObserverStability
@@ -139,6 +129,7 @@ class ObserverBound:
     projection: Array | None = None
     invariance: Invariance | None = None
     inner: Invariance | None = None
+    rowwise: RowwiseStep | None = field(default=None, repr=False)
 
     @property
     def evidence(self) -> Evidence:
@@ -193,6 +184,11 @@ class ObserverBound:
         own = projection_metric == "observer"
         return replace(self, projection=observer.metric if own else None)
 
+    def with_rows(self, system: System) -> ObserverBound:
+        """The same with the step of its components, of the certified system."""
+        rows = RowwiseStep(system, self.region, self.gain, self._inverse)
+        return replace(self, rowwise=rows)
+
     @cached_property
     def _inverse(self) -> Array:
         """A matrix G with P^-1 <= G, as P <= P G P."""
@@ -200,7 +196,7 @@ class ObserverBound:
         units = np.outer(scale, scale)
         P = Matrices.exact((units * self.metric)[None])
         guess = np.linalg.inv(P.middle[0])
-        for slack in _SLACKS:
+        for slack in SLACKS:
             G = 0.5 * (1.0 + slack) * (guess + guess.T)
             if definite(P @ Matrices.exact(G[None]) @ P - P)[0]:
                 return units * G
@@ -268,6 +264,92 @@ class ObserverBound:
         reached = self.rate * radius
         return min(reached + length, math.hypot(reached, root)) * OUTWARD
 
+    def added(self, disturbances: Size | None = None, noises: Size | None = None) -> Array:
+        """What w and v add to each component, always (n,) or at each sample (T, n)."""
+        w = self.sizes.disturbance if disturbances is None else disturbances
+        v = self.sizes.noise if noises is None else noises
+        if self.rowwise is None:
+            return np.full(self.region.n, np.inf)
+        return self.rowwise.added(w, v)
+
+    def begun(self, error: Size) -> Tube:
+        """The bounds at first, from x(0) - z(0) as in `initial`."""
+        radius = self.initial(error)
+        extent = extent_of("initial_error", error, self.region.n)
+        return Tube(radius, np.minimum(extent * OUTWARD, self.components(radius)))
+
+    def followed(
+        self, tube: Tube, entering: ArrayLike, added: Array, *, projected: bool,
+        observer: Array | None = None, u: Array | None = None,
+    ) -> Tube:
+        """The bounds one sample later, with the observer in the region, whose state may be given.
+
+        Where it is ``projected``, |e_i| may have grown though |e|_P has not.
+        """
+        radius = self.advanced(tube.radius, entering)
+        box: Array = self.components(radius)
+        if self.rowwise is not None and not projected:
+            within = np.minimum(tube.box, self._widths * OUTWARD)
+            step = self.rowwise.step(within, tube.radius, observer, u)
+            box = np.minimum(box, (step + added) * OUTWARD)
+        return Tube(min(radius, self._across(box)), box)
+
+    def _across(self, box: Array) -> float:
+        """The largest |e|_P in a box."""
+        if box.size > _MOST_SIGNS:
+            return float(weighted_lengths(box, np.abs(self.metric)))
+        return float(weighted_lengths(self._signs * box, self.metric).max())
+
+    @cached_property
+    def _signs(self) -> Array:
+        n = self.region.n
+        negative = (np.arange(2 ** (n - 1))[:, None] >> np.arange(n)) & 1
+        return np.where(negative, -1.0, 1.0)
+
+    @property
+    def unprojected(self) -> bool:
+        """Whether the observer is shown never to be projected onto X, if the `condition` holds."""
+        system = self.stability.system
+        if system is None or system.states is None:
+            return system is not None
+        X = Region(system.states, system.states.lower, system.states.upper)
+        states = Region(self.region.states, *(
+            each[: system.n] for each in (self.region.lower, self.region.upper)
+        ))
+        return self.inner is not None and not beyond(states, X)
+
+    @property
+    def begins_within(self) -> bool:
+        """Whether `settled` needs an initial error within the limit of |x - z|_P."""
+        system = self.stability.system
+        return self.unprojected and system is not None and system.states is not None
+
+    @cached_property
+    def settled(self) -> Tube:
+        """The limit of the bounds as t grows, for `sizes` at all times.
+
+        Each step of the tube increases with the tube: its limit superior is at most what a step
+        makes of it, and so at most what any number of steps make of a larger one.
+        """
+        radius = self.limit()
+        tube = Tube(radius, np.minimum(self.components(radius), self._widths * OUTWARD))
+        return self._iterated(tube, _MOST_STEPS)[0] if self.unprojected else tube
+
+    def _iterated(self, tube: Tube, most: int, until: Array | None = None) -> tuple[Tube, int]:
+        """Steps of a tube that holds at all times, up to a box or until they change little."""
+        added = self.added()
+        for k in range(most):
+            if self.rowwise is None or (until is not None and (tube.box <= until).all()):
+                return tube, k
+            step = self.rowwise.step(tube.box, tube.radius) + added
+            box = np.minimum(tube.box, step * OUTWARD)
+            following = Tube(min(tube.radius, self._across(box)), box)
+            little = _LITTLE if until is None else 0.0
+            if (box >= (1.0 - little) * tube.box).all():
+                return following, k
+            tube = following
+        return tube, most
+
     def limit(self, disturbances: Size | None = None, noises: Size | None = None) -> float:
         """The limit of b(t) as t grows, for bounds on w and v that hold at all times."""
         entering = self.entering(disturbances, noises)
@@ -282,9 +364,16 @@ class ObserverBound:
         """Upper bounds on |x_i - z_i| where |x - z|_P <= radius: (..., n) for (...)."""
         return np.multiply.outer(numbers("radius", radius, finite=False), self.slopes) * OUTWARD
 
-    def around(self, radius: ArrayLike, observer: Array) -> tuple[Array, Array]:
-        """Sides (..., n) of a box that holds the true state: around z, and within the region."""
+    def around(
+        self, radius: ArrayLike, observer: Array, box: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Sides (..., n) of a box that holds the true state: around z, and within the region.
+
+        From |x - z|_P <= radius, and |x_i - z_i| <= box[..., i] where it is given.
+        """
         half = self.components(radius)
+        if box is not None:
+            half = np.minimum(half, box)
         n = self.region.n
         margin = UNIT * (np.abs(observer) + half)
         return (
@@ -293,7 +382,8 @@ class ObserverBound:
         )
 
     def farthest(
-        self, radius: ArrayLike, offset: ArrayLike, observer: ArrayLike | None = None
+        self, radius: ArrayLike, offset: ArrayLike, observer: ArrayLike | None = None,
+        box: Array | None = None,
     ) -> Array:
         r"""Upper bound on the distance from x_hat to the points of the set around z, (...).
 
@@ -303,7 +393,7 @@ class ObserverBound:
         .. math::
             |o - e|^2 \le |o|^2 + 2 b |o|_{P^{-1}} + b^2 a^2 .
 
-        With the observer's state z (..., n), only what is within the region counts.
+        With the observer's state z (..., n), only what is within the region and the box counts.
         """
         b, o = np.asarray(radius, np.float64), np.asarray(offset, np.float64)
         across = b * weighted_lengths(o, self._inverse)
@@ -311,7 +401,7 @@ class ObserverBound:
         found: Array = np.sqrt(squares) * OUTWARD**2
         if observer is not None:
             z = np.asarray(observer, np.float64)
-            lower, upper = self.around(b, z)
+            lower, upper = self.around(b, z, box)
             away = np.maximum(np.abs(z + o - lower), np.abs(upper - z - o))
             found = np.minimum(found, np.linalg.norm(away, axis=-1) * OUTWARD)
         return found
@@ -353,18 +443,44 @@ class ObserverBound:
                 source.observer, source.system, source.settings.projection_metric
             )
             inputs, steps, usual = source.inputs, source.steps, source.system.dt
-            _check_model(self.stability, self.region, source.system, z[:-1], inputs)
-        radius = self.radii(len(run), initial_error, disturbances, noises)
+            check_model(self.stability, self.region, source.system, z[:-1], inputs)
+        radius, box = self._tubes(run, inputs, disturbances, noises, initial_error)
         lost, reason = own.first_event(run.flags, z[:-1], inputs, steps, usual)
-        empty = self.is_empty(radius[1:], z[1:])
+        empty = self.is_empty(radius[1:], z[1:], box[1:])
         if empty.any() and (lost is None or empty.argmax() < lost):
             lost, reason = int(empty.argmax()), CONTRADICTION
         if source is not None and source.settings.candidate != "observer":
             lost, reason = 0, REINITIALIZED
         if lost is not None:
-            radius[lost + 1 :] = np.nan
-        error = self.farthest(radius, run.states - z, z)
-        return Band(radius, *self.around(radius, z), error, lost, reason)
+            radius[lost + 1 :] = box[lost + 1 :] = np.nan
+        error = self.farthest(radius, run.states - z, z, box)
+        return Band(radius, *self.around(radius, z, box), error, lost, reason)
+
+    def _tubes(
+        self, run: Run, inputs: Array | None, disturbances: Size | None, noises: Size | None,
+        initial_error: Size,
+    ) -> tuple[Array, Array]:
+        """Radii (T + 1,) and boxes (T + 1, n) along a run, as far as its observer is in the region.
+
+        Beyond, they are those of the ball alone, and do not count.
+        """
+        z, steps, n = run.observer_states, len(run), self.region.n
+        radius = self.radii(steps, initial_error, disturbances, noises)
+        box = self.components(radius)
+        entering = np.broadcast_to(self.entering(disturbances, noises), (steps, 2))
+        added = np.broadcast_to(self.added(disturbances, noises), (steps, n))
+        within = np.append(self.region.contains(z[:-1]), False)
+        projected = (run.flags & Status.OBSERVER_PROJECTED.value) != 0
+        tube = self.begun(initial_error)
+        for t in range(steps + 1):
+            radius[t], box[t] = tube
+            if not within[t]:
+                break
+            tube = self.followed(
+                tube, entering[t], added[t], projected=bool(projected[t]), observer=z[t],
+                u=None if inputs is None else inputs[t],
+            )
+        return radius, box
 
     def first_event(
         self, flags: NDArray[np.integer[Any]], observer: Array, inputs: Array | None = None,
@@ -375,28 +491,15 @@ class ObserverBound:
         From values of the statuses (T,), z(0), ..., z(T-1), inputs (T, m), and lengths of the
         steps (T,) beside the one that is certified.
         """
-        events = _EVENTS if self.projects else _EVENTS | {Status.OBSERVER_PROJECTED: _PROJECTED}
-        where: list[tuple[Any, str, Any]] = [
-            ((flags & flag.value) != 0, text, flags) for flag, text in events.items()
-        ]
-        outside = "the observer was outside of the region, at {}"
-        where.append((~self.region.contains(observer), outside, observer))
-        if inputs is not None:
-            low, high = self.region.lower[self.region.n :], self.region.upper[self.region.n :]
-            beyond = ~((low <= inputs) & (inputs <= high)).all(axis=1)
-            where.append((beyond, "the input {} is outside of what was certified", inputs))
-        if steps is not None:
-            text = f"the step had the length {{}}, and {usual or 0.0:.6g} is certified"
-            where.append((np.asarray(steps) != usual, text, np.asarray(steps)))
-        first = [(int(there.argmax()), *rest) for there, *rest in where if there.any()]
-        if not first:
-            return None, ""
-        t, text, values = min(first, key=itemgetter(0))
-        return t, text.format(np.round(values[t], 6).tolist())
+        return first_event(
+            self.region, self.projects, flags, observer, inputs, steps, usual
+        )
 
-    def is_empty(self, radius: ArrayLike, observer: Array) -> NDArray[np.bool_]:
+    def is_empty(
+        self, radius: ArrayLike, observer: Array, box: Array | None = None
+    ) -> NDArray[np.bool_]:
         """Whether no state of the region is in the set around z."""
-        lower, upper = self.around(radius, observer)
+        lower, upper = self.around(radius, observer, box)
         return np.asarray(np.any(lower > upper, axis=-1))
 
     @property
@@ -406,19 +509,32 @@ class ObserverBound:
 
     @property
     def settling_samples(self) -> int | None:
-        """Samples until b(t) is within 10 % of its limit, from anywhere; None where that is 0."""
+        """Samples until the bounds are within 10 % of their limit, from anywhere.
+
+        From an initial error within the limit where the bound `begins_within` it. None where the
+        limit is 0, or it takes too many steps.
+        """
         radius, limit = self.initial(Box(-self._widths, self._widths)), self.limit()
         if not limit > 0.0:
             return None
-        entering, samples = self.entering(), 0
-        while radius > (1.0 + _SETTLED) * limit and samples < _MOST_SAMPLES:
+        rows = self.rowwise is not None and self.unprojected
+        entering, samples, room = self.entering(), 0, 0.5 * _SETTLED if rows else _SETTLED
+        if self.begins_within:
+            radius = limit
+        while radius > (1.0 + room) * limit and samples < _MOST_SAMPLES:
             radius, samples = self.advanced(radius, entering), samples + 1
-        return samples
+        if not rows:
+            return samples
+        # Then the components, which follow the radius.
+        box = np.minimum(self.components(radius), self._widths * OUTWARD)
+        until = (1.0 + _SETTLED) * self.settled.box
+        reached, after = self._iterated(Tube(radius, box), _MOST_STEPS, until)
+        return samples + after if (reached.box <= until).all() else None
 
     @property
     def headline(self) -> str:
         """The bound in the limit, in the states' units, and how soon it is reached, in one line."""
-        limit, after = self.components(self.limit()), self.settling_samples
+        limit, after = self.settled.box, self.settling_samples
         each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {at_most(b, 3)}" for i, b in enumerate(limit))
         when = f" and at most 10 % more from sample {after} on" if after else ""
         wide = " x ".join(f"{width:.3g}" for width in self._widths)
@@ -426,6 +542,8 @@ class ObserverBound:
         nothing = f": it says nothing about {vacuous}" if vacuous else ""
         stays = self.invariance is not None and self.invariance.holds
         how = f"{self.evidence}{'' if stays else ' while x stays in the region'}"
+        if self.begins_within:
+            how = f"{self.evidence} from an initial error within the limit on"
         return f"{each} in the limit{when} ({how}), on a region {wide} wide{nothing}"
 
     @property
@@ -449,7 +567,7 @@ class ObserverBound:
         names = ("evidence", "rate", "metric", "gain", "sizes", "condition", "invariance")
         limit = self.limit()
         content: dict[str, Any] = json_ready({name: getattr(self, name) for name in names} | {
-            "limit": limit, "components": self.components(limit),
+            "limit": limit, "components": self.settled.box,
             "length": self.farthest(limit, np.zeros(len(self.gain))),
         })
         return content
@@ -474,8 +592,12 @@ def bound_observer(
 def with_invariance(
     bound: ObserverBound, system: System, seconds: float | Deadline
 ) -> ObserverBound:
-    """The bound, with the findings on whether state and observer stay in the region."""
+    """The bound, with the findings on whether state and observer stay in the region.
+
+    And with the step of its components.
+    """
     deadline, size, inner = Deadline.of(seconds), bound.sizes.extent[0], None
+    bound = bound.with_rows(system)
     found = certify_invariance(
         system, bound.region, disturbance=size, seconds=deadline.part(_INVARIANCE)
     )
@@ -484,32 +606,6 @@ def with_invariance(
         inner = certify_invariance(system, region, disturbance=size, seconds=deadline)
     kept = inner is not None and inner.holds
     return replace(bound, invariance=found, inner=inner if kept else None)
-
-
-def initial_length(error: Size, weight: Array) -> float:
-    """|e|_W from an initial error: a vector (n,), a bound on its length, or a set that holds it."""
-    found = lengths_of("initial_error", error, weight)
-    if found.ndim:
-        raise ShapeError("initial_error has several samples; expected the error at the first one.")
-    return float(found)
-
-
-def largest_ratio(metric: Array, other: Array) -> float:
-    """A number c with |e|_P <= c |e|_M for all e, P the first and M the other metric."""
-    from scipy.linalg import eigh
-
-    units = 1.0 / np.sqrt(other.diagonal())
-    metric, other = np.outer(units, units) * metric, np.outer(units, units) * other
-    top = float(eigh(metric, other, eigvals_only=True)[-1])
-    for slack in _SLACKS:
-        found = top * (1.0 + slack)
-        scaled = metric[None] / found
-        rest = Matrices(other[None], 4.0 * UNIT * np.abs(other[None])) - Matrices(
-            scaled, 6.0 * UNIT * np.abs(scaled)
-        )
-        if found > 0.0 and definite(rest)[0].all():
-            return math.sqrt(found) * OUTWARD
-    return math.inf
 
 
 def _check_wrapping(largest: Array, room: Array) -> None:
@@ -521,40 +617,3 @@ def _check_wrapping(largest: Array, room: Array) -> None:
             f"{room[j]:.6g}, so that no innovation wraps in the region. Certify a smaller region "
             "for a larger noise."
         )
-
-
-def _check_model(
-    stability: ObserverStability, region: Region, used: System, states: Array, inputs: Array | None
-) -> None:
-    """Refuse a run of another model: by certified values, and at the run's states by the system."""
-    certified = stability.system
-    for who, system in (("the system", certified), ("the run's system", used)):
-        # Values of functions without an expression are compared at all states of the run below.
-        changed = "" if system is None else stability.difference(system, certified is not None)
-        if changed:
-            raise MismatchError(
-                f"{who} is another than was certified: {changed}; certify the system of the run."
-            )
-    points = np.hstack((states, np.zeros((len(states), 0)) if inputs is None else inputs))
-    low, high, n = region.lower[region.n :], region.upper[region.n :], region.n
-    # Elsewhere the bound ends, and the model need not be defined.
-    usual = ((low <= points[:, n:]) & (points[:, n:] <= high)).all(axis=1)
-    times = np.flatnonzero(region.contains(states) & usual)
-    if certified is None or not times.size:
-        return
-    points = points[times]
-    for name in ("f", "h"):
-        mine, other = (
-            evaluated(name, getattr(one, name), points, n) for one in (certified, used)
-        )
-        # Of each component's own unit.
-        size = np.abs(mine).max(axis=0)
-        if name == "f":
-            size = np.maximum(size, np.abs(points[:, :n]).max(axis=0))
-        same = (np.abs(mine - other) <= SAME_MODEL * size).all(axis=1)
-        if not same.all():
-            k = int(same.argmin())
-            raise MismatchError(
-                f"{name} of the run's system is {other[k].tolist()} at sample {times[k]}, and that "
-                f"of the certified one {mine[k].tolist()}; certify the system of the run."
-            )

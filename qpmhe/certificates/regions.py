@@ -78,7 +78,7 @@ class Region:
         if not self.is_box:  # its vertices, and the rest moved towards their middle
             n, (G, g) = self.n, inequalities(self.states)
             others = np.random.default_rng(0).standard_normal((_DIRECTIONS, n))
-            vertices = np.array([_support(G, g, e)[0] for e in (*np.eye(n), *-np.eye(n), *others)])
+            vertices = np.array([support(G, g, e)[0] for e in (*np.eye(n), *-np.eye(n), *others)])
             middle = vertices.mean(axis=0)
             points[1 : len(vertices) + 1, :n] = vertices[: len(points) - 1]
             away = points[:, :n] - middle
@@ -173,7 +173,7 @@ def bounds(states: ConvexSet) -> tuple[Array, Array]:
         return states.lower, states.upper
     n = states.dimension
     G, g = inequalities(states)
-    found = [_support(G, g, e)[1:] for e in (*-np.eye(n), *np.eye(n))]
+    found = [support(G, g, e)[1:] for e in (*-np.eye(n), *np.eye(n))]
     sides, residuals = np.moveaxis(np.reshape(found, (2, n, 2)), -1, 0)
     if not np.isfinite(sides).all():
         return -sides[0], sides[1]
@@ -206,7 +206,7 @@ def row_bounds(rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
     return low @ positive + high @ negative - rounding, high @ positive + low @ negative + rounding
 
 
-def _support(G: Array, g: Array, e: Array) -> tuple[Array, float, float]:
+def support(G: Array, g: Array, e: Array) -> tuple[Array, float, float]:
     """A vertex that maximises e^T x over G x <= g, y^T g, and a bound on |G^T y - e|_1.
 
     The multipliers y >= 0 are the maximum's; y^T g is infinite where there is none.

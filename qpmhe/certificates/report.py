@@ -79,8 +79,7 @@ def _proved_observer(
     widths, own = (region.upper - region.lower)[: system.n], None
 
     def limits(stability: ObserverStability) -> tuple[Any, bool]:
-        proved = ObserverBound(stability, region, sizes)
-        limit = proved.components(proved.limit())
+        limit = ObserverBound(stability, region, sizes).with_rows(system).settled.box
         return limit, bool((limit < widths)[widths > 0.0].all())
 
     try:

@@ -117,7 +117,7 @@ def load(path: str | Path, system: System, observer: Observer) -> ObserverBound:
     changed = bound.stability.difference(system)
     if changed:
         raise MismatchError(f"{path} is for another system: {changed}. {_AGAIN}")
-    return bound.of_observer(observer, system)
+    return bound.with_rows(system).of_observer(observer, system)
 
 
 def _checksum(rest: Mapping[str, Any]) -> str:

@@ -101,13 +101,17 @@ def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
     reached = bound.components(bound.radii(1, 2.0)[1])[0]
     assert 2.0 * 0.5 + 0.16 <= reached <= 2.0 * bound.rate + 0.1601
     assert bound.components(bound.radii(0, [-2.0])[0])[0] == pytest.approx(2.0)
-    whole = bound.radii(bound.settling_samples, box(-18.0, 18.0))
-    assert whole[-1] <= 1.1 * bound.limit() < whole[-2]
+    assert 0.32 <= bound.settled.box[0] <= 1.001 * 0.32
+    tube, whole = bound.begun(box(-18.0, 18.0)), []
+    for _ in range(bound.settling_samples):
+        tube = bound.followed(tube, bound.entering(), bound.added(), projected=False)
+        whole.append(tube.box[0])
+    assert whole[-1] <= 1.1 * bound.settled.box[0] < whole[len(whole) // 2]
     # What is shown is no smaller than what is proved.
     shown = re.fullmatch(r"\|x1 - z1\| <= (\S+) in the limit and .* on \(proved.*", bound.headline)
     for value, text in ((0.4031, "0.404"), (0.9, "0.9"), (99.91, "100"), (np.inf, "inf")):
         assert at_most(value, 3) == text
-    assert 0.0 <= float(shown[1]) / bound.components(bound.limit())[0] - 1.0 < 0.01
+    assert 0.0 <= float(shown[1]) / bound.settled.box[0] - 1.0 < 0.01
 
 
 def plain(vectors, weight):
