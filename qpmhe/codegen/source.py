@@ -179,7 +179,7 @@ def _step_parts(model: CasadiModel) -> list[str]:
         "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),
     }
     rate = _filled("algebraic", values) if model.guess else template("rate.c")
-    return [template("equations.c"), rate, _filled("step_implicit", values), *substeps]
+    return [_filled("equations", values), rate, _filled("step_implicit", values), *substeps]
 
 
 # Classes of CasADi that have no C code, in words. CasADi itself prints a warning for each call.

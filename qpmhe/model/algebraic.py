@@ -111,7 +111,7 @@ class AlgebraicStates:
             length = _share(step, algebraic_sizes(found, np.abs(x), np.abs(z + step)))
             scale = np.abs(z) + np.abs(step)
             before = _share(step, scale)
-            done = (length <= ROUNDING) | ((length <= SMALL) & (length > 0.5 * last))
+            done = converged(length, last)
             lost, factor = ~np.isfinite(length), np.ones(len(at))
             trial = w[at]
             for _ in range(MOST_HALVINGS):
@@ -133,6 +133,16 @@ class AlgebraicStates:
             if not left.any():
                 return
             at, values, J, last = at[left], values[left], slopes[left], length[left]
+
+
+def converged(length: Array, last: Array) -> Mask:
+    """Whether Newton's method is at its end, behind corrections of these shares (K,).
+
+    Rounding stops it, or it converges so fast that the next correction would be rounding.
+    """
+    fast = np.isfinite(last) & (length * (length / last) ** 2 <= ROUNDING)
+    found: Mask = (length <= ROUNDING) | ((length <= SMALL) & ((length > 0.5 * last) | fast))
+    return found
 
 
 def eliminated(values: Array, J: Array, n: int) -> Eliminated:

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from .algebraic import (
     MOST_HALVINGS,
     MOST_ITERATIONS,
-    ROUNDING,
-    SMALL,
     AlgebraicStates,
     Batched,
     Eliminated,
     algebraic_sizes,
+    converged,
     eliminated,
     inverse,
     solved,
@@ -172,7 +171,7 @@ class ImplicitStep:
             if W.shape[2] > n:
                 step, others = _with_algebraic(found, step, W[at, :, n:], size)
                 length = np.maximum(length, others)
-            done = (length <= ROUNDING) | ((length <= SMALL) & (length > 0.5 * last))
+            done = converged(length, last)
             if iteration == 0:
                 side[at] = found.side[:, :1]
             # Another solution for z is no stage of this step.

@@ -122,7 +122,7 @@ static int mhe_complete(const real *x, const real *u, real *w)
         int good = 0;
         const real length = mhe_algebraic_share(r, w + NX, sizes, r->step);
         if (!isfinite(length)) return 0;
-        const int done = length <= (real)$rounding || (length <= (real)$small && length > last / 2);
+        const int done = mhe_converged(length, last);
         for (int i = 0; i < NZ; i++) scale[i] = (real)(fabs(w[NX + i]) + fabs(r->step[i]));
         const real before = mhe_share(r->step, scale);
         for (int halving = 0; halving < $halvings && !good; halving++) {

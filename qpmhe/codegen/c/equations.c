@@ -1,4 +1,15 @@
-/* Linear equations by LU factors with row pivots. Matrices are stored by rows. */
+/* Equations by Newton's method: its end, and LU factors with row pivots. Matrices are stored by
+ * rows. */
+
+/* Whether rounding stops Newton's method behind corrections of these shares, or it converges so
+ * fast that the next correction would be rounding. */
+static int mhe_converged(real length, real last)
+{
+    const real rate = length / last;
+    return length <= (real)$rounding ||
+           (length <= (real)$small &&
+            (length > last / 2 || (isfinite(last) && length * rate * rate <= (real)$rounding)));
+}
 
 /* The factors of M, in place; whether M is regular. */
 static int mhe_factor_equations(int size, real *M, int *pivot)

@@ -109,7 +109,7 @@ static int mhe_solve_stages(const real *x, const real *u, real h, real *W)
         mhe_stage_sizes(x, h, W, step, r, sizes);
         const real length = mhe_stage_moves(r, W, sizes, step, moves);
         if (!isfinite(length)) return 0;
-        const int done = length <= (real)$rounding || (length <= (real)$small && length > last / 2);
+        const int done = mhe_converged(length, last);
         int inside = 0;
         for (int halving = 0; halving < $halvings && !inside; halving++) {
             for (int i = 0; i < MHE_STAGES * NW; i++) trial[i] = W[i] + moves[i];
