@@ -37,8 +37,8 @@ def compare(
     ] = None,
     record: Annotated[
         list[str] | None,
-        typer.Option(help="Measured record, CSV (also .gz) or Parquet with a time column, to "
-                          "compare on; may be repeated. Seeds and noise levels do not apply."),
+        typer.Option(help=f"Measured record with times to compare on, {options.KINDS}; may be "
+                          "repeated. Seeds and noise levels do not apply."),
     ] = None,
     backend: Annotated[
         list[str] | None,

@@ -24,8 +24,7 @@ def estimate(
     model: options.Model,
     record: Annotated[
         str,
-        typer.Argument(help="CSV (also .gz) or Parquet file with a time column; - is standard "
-                       "input."),
+        typer.Argument(help=f"{options.KINDS}, with times; - is CSV on standard input."),
     ],
     out: Annotated[
         str, typer.Option(help="File to write, .csv or .parquet; - is standard output.")

@@ -28,6 +28,9 @@ Width = Annotated[
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
+#: What a record may be.
+KINDS = "CSV (also .gz), Parquet, MF4, MAT, HDF5, MCAP or ROS bag"
+
 # How a record is read: type, default and option.
 _READING: dict[str, tuple[Any, Any, Any]] = {
     "time": (str | None, None, typer.Option(help="Column of the time.")),
@@ -46,6 +49,11 @@ _READING: dict[str, tuple[Any, Any, Any]] = {
         min=0, help="Largest number of missing samples in a row.")),
     "skip_repeated": (bool, False, typer.Option(
         "--skip-repeated", help="Skip lines with the same time as the line before.")),
+    "same_time": (float | None, None, typer.Option(
+        help="Times of channels with clocks of their own that differ by at most this (in s, or the "
+             "file's unit) are one sample.")),
+    "log_time": (bool, False, typer.Option(
+        "--log-time", help="Of ROS bags: take the times of the log, not those of the headers.")),
     "separator": (str | None, None, typer.Option(
         help="Separator of a CSV file: a character, or comma, semicolon, tab, bar, space.")),
     "decimal": (Literal["auto", ".", ","], "auto", typer.Option(help="Decimal mark.")),

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def tune(
     model: options.Model,
     record: Annotated[
-        list[str], typer.Argument(help="CSV (also .gz) or Parquet files with a time column.")
+        list[str], typer.Argument(help=f"Records with times: {options.KINDS}.")
     ],
     out: Annotated[Path, typer.Option(help="TOML file to write.")] = Path("weights.toml"),
     horizon: options.Horizon = None,

@@ -1,7 +1,8 @@
-"""Measured records: estimates from a table of samples, file to file or line by line."""
+"""Measured records: read from files, and estimated file to file or line by line."""
 
 from .checkpoints import CheckpointError, WriteError
+from .frame import read
 from .session import Summary, estimate_record
 from .tables import RecordError
 
-__all__ = ["CheckpointError", "RecordError", "Summary", "WriteError", "estimate_record"]
+__all__ = ["CheckpointError", "RecordError", "Summary", "WriteError", "estimate_record", "read"]

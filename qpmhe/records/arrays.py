@@ -42,16 +42,19 @@ def read_record(
     columns = ColumnNames(model.outputs, model.inputs, time, outputs, inputs)
     make_steps = partial(Steps, system, usual=usual, scale=time_scale, max_gap=max_gap)
     steps = make_steps()
-    found = _read(path, columns, steps, table)
-    if report is not None and steps.note:
-        report(f"{path}: {steps.note}")
+    found, notes = _read(path, columns, steps, table)
+    if report is not None:
+        for note in [*notes, *([f"{path}: {steps.note}"] if steps.note else [])]:
+            report(note)
     if truth is None:
         return found
     columns = ColumnNames(model.states, (), time, truth, option="truth")
-    return found._replace(states=_read(path, columns, make_steps(), table)[0])
+    return found._replace(states=_read(path, columns, make_steps(), table)[0].measurements)
 
 
-def _read(path: str, columns: ColumnNames, steps: Steps, table: dict[str, Any]) -> RecordArrays:
+def _read(
+    path: str, columns: ColumnNames, steps: Steps, table: dict[str, Any]
+) -> tuple[RecordArrays, list[str]]:
     reader = RecordReader(path, columns, **table)
     ys: list[Array] = []
     us: list[Array] = []
@@ -80,4 +83,5 @@ def _read(path: str, columns: ColumnNames, steps: Steps, table: dict[str, Any]) 
     if any(each is not None for each in lengths):
         typical = steps.usual or np.nan
         dt = np.array([typical if each is None else each for each in [*lengths, None]])
-    return RecordArrays(np.array(ys), np.array(us) if us[0].size else None, dt, steps.usual)
+    inputs = np.array(us) if us[0].size else None
+    return RecordArrays(np.array(ys), inputs, dt, steps.usual), reader.notes

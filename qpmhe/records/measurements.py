@@ -8,15 +8,16 @@ import re
 from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Any, NamedTuple
+from difflib import SequenceMatcher
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from .._checks import Array, count
 from ..errors import InvalidInputError, OptionError
-from .tables import RecordError, TableRow, open_table
+from .readers import open_table
+from .tables import TIMES, RecordError, Table, TableRow
 
-_TIMES = ("time", "t", "timestamp", "datetime", "date_time", "zeit", "zeitstempel")
 # Units with which a column called "t" is the time, and no temperature.
 _TIME_UNITS = frozenset((
     "ns", "us", "\u00b5s", "\u03bcs", "ms", "s", "sec", "second", "seconds", "min", "minute",
@@ -55,15 +56,17 @@ class Measurement:
 
 
 class RecordReader:
-    """A CSV or Parquet file, or standard input; counts what it holds and skips.
+    """A file of any kind, or standard input; counts what it holds and skips.
 
-    `cut` is the last line, if it has no end; `blank` counts rows that hold nothing.
+    `columns` are positions in a row. `cut` is the last line, if it has no end; `blank` counts rows
+    that hold nothing.
     """
 
     def __init__(
-        self, path: str, names: ColumnNames, *, separator: str | None = None,
+        self, path: str, names: ColumnFinder, *, separator: str | None = None,
         encoding: str = "utf-8", decimal: str = "auto", missing: Sequence[str] = (),
         skip_repeated: bool = False, skip_lines: int = 0, time_format: str | None = None,
+        same_time: float | None = None, log_time: bool = False,
     ) -> None:
         self.is_stream = path == "-"
         self.held = self.repeated = self.blank = 0
@@ -71,22 +74,32 @@ class RecordReader:
         self._skip_repeated = skip_repeated
         self._reader = FieldReader(decimal, missing, time_format)
         self._table = table = open_table(
-            path, separator, encoding, count("--skip-lines", skip_lines, 0)
+            path, separator, encoding, count("--skip-lines", skip_lines, 0), time=names.time,
+            same_time=same_time, log_time=log_time,
         )
         self.name, self.total = table.name, table.total
         try:
-            self._columns = names.find(table.header, table.name, table.header_line)
+            columns = names.find(table)
         except InvalidInputError as error:
             if isinstance(error, RecordError):
                 error.args = (f"{error}{table.hint}",)
             table.close()
             raise
+        places = table.select([i for i in columns.chosen if i >= 0], columns.inputs) | {-1: -1}
+        self.columns = Columns(places[columns.time], *(
+            tuple(places[i] for i in each) for each in (columns.outputs, columns.inputs)
+        ))
+
+    @property
+    def notes(self) -> list[str]:
+        """What the user should know of the file."""
+        return self._table.notes
 
     @property
     def time_type(self) -> Any:
         """Type of the times in a Parquet file, None for CSV."""
-        types = getattr(self._table, "types", None)
-        return types[self._columns.time] if types is not None else None
+        types = self._table.types
+        return types[self.columns.time] if types is not None else None
 
     @property
     def position(self) -> int:
@@ -108,26 +121,32 @@ class RecordReader:
 
     def samples(self, held: Array | None = None) -> Iterator[Measurement]:
         """The samples in order of time; `held` are the inputs before the first one."""
-        before: Measurement | None = None
+        for row, time in self.rows():
+            found = self._sample(row, time, held)
+            held = found.u
+            yield found
+
+    def rows(self) -> Iterator[tuple[TableRow, Time]]:
+        """The rows in order of time."""
+        before: tuple[TableRow, Time] | None = None
         for row in self._table:
             if not "".join(row.fields).strip():
                 self.blank += 1
                 continue
             self.cut = None if row.ended else row.line
-            time = self._value(row, self._columns.time, self._reader.time)
+            time = self.value(row, self.columns.time, self._reader.time)
             if before is not None:
-                if self._skip_repeated and time[:2] == before.time[:2]:
+                if self._skip_repeated and time[:2] == before[1][:2]:
                     self.repeated += 1
                     continue
-                self._check_order(row, time, before)
-            before = self._sample(row, time, held)
-            held = before.u
+                self._check_order(row, time, *before)
+            before = row, time
             yield before
 
     def _sample(self, row: TableRow, time: Time, held: Array | None) -> Measurement:
-        columns, number = self._columns, self._reader.number
-        y = np.array([self._value(row, i, number) if i >= 0 else np.nan for i in columns.outputs])
-        u = np.array([self._value(row, i, number) for i in columns.inputs])
+        columns, number = self.columns, self._reader.number
+        y = np.array([self.value(row, i, number) if i >= 0 else np.nan for i in columns.outputs])
+        u = np.array([self.value(row, i, number) for i in columns.inputs])
         missing = ~np.isfinite(u)
         if missing.any():
             if held is None:
@@ -140,13 +159,14 @@ class RecordReader:
             self.held += int(missing.sum())
         return Measurement(row.line, time, y, u, row.ended)
 
-    def _value(self, row: TableRow, position: int, read: Any) -> Any:
+    def value(self, row: TableRow, position: int, read: Any) -> Any:
+        """A field of a row, read; a `RecordError` where it cannot be."""
         try:
             return read(row.fields[position])
         except ValueError as error:
             field = row.fields[position].strip()
             shown = field if len(field) <= 40 else f"{field[:40]}..."
-            if position != self._columns.time:
+            if position != self.columns.time:
                 remedy = "correct it, or leave it blank if it is missing"
                 if str(error) == "is not a number":
                     remedy += ", or declare it missing with --missing"
@@ -165,23 +185,23 @@ class RecordReader:
                 what += " It is the last line, which has no end and may be cut off."
             raise self.error(what, row.line, self._table.header[position]) from None
 
-    def _check_order(self, row: TableRow, time: Time, before: Measurement) -> None:
-        column, unit = self._table.header[self._columns.time], self._table.unit
-        if time.kind != before.time.kind:
+    def _check_order(self, row: TableRow, time: Time, last: TableRow, before: Time) -> None:
+        column, unit = self._table.header[self.columns.time], self._table.unit
+        if time.kind != before.kind:
             raise self.error(
-                f"its time is a {time.kind}, and in {unit} {before.line} a {before.time.kind}; "
+                f"its time is a {time.kind}, and in {unit} {last.line} a {before.kind}; "
                 "write all times as numbers, or all as dates with or all without a zone.",
                 row.line, column,
             )
-        if time.value > before.time.value:
+        if time.value > before.value:
             return
-        if time.value == before.time.value:
+        if time.value == before.value:
             raise self.error(
-                f"time {time.text} is in {unit} {before.line} already; keep one of the two, or "
+                f"time {time.text} is in {unit} {last.line} already; keep one of the two, or "
                 "give --skip-repeated, which keeps the first.", row.line, column,
             )
         raise self.error(
-            f"time {time.text} is before {before.time.text} in {unit} {before.line}; sort the "
+            f"time {time.text} is before {before.text} in {unit} {last.line}; sort the "
             "record by time.", row.line, column,
         )
 
@@ -192,6 +212,24 @@ class Columns(NamedTuple):
     time: int
     outputs: tuple[int, ...]
     inputs: tuple[int, ...]
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """Those besides the time."""
+        return (*self.outputs, *self.inputs)
+
+
+class ColumnFinder(Protocol):
+    """Knows which columns are needed."""
+
+    @property
+    def time(self) -> str | None:
+        """What the user calls the time."""
+        ...
+
+    def find(self, table: Table) -> Columns:
+        """Their positions."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -209,29 +247,20 @@ class ColumnNames:
     input_columns: str | None = None
     option: str = "outputs"
 
-    def find(self, header: Sequence[str], file: str, line: int | None = None) -> Columns:
+    def find(self, table: Table) -> Columns:
         """The columns in a header; RecordError where one is missing or ambiguous."""
-        table = _Header([name.strip() for name in header], file, line)
-        outputs = _find(table, self.option, self.outputs, self.output_columns)
-        inputs = _find(table, "inputs", self.inputs, self.input_columns)
+        header = Header(table)
+        outputs = _find(header, self.option, self.outputs, self.output_columns)
+        inputs = _find(header, "inputs", self.inputs, self.input_columns)
         if all(position < 0 for position in outputs):
             kind = _KINDS[self.option][1]
             raise OptionError(f"--{self.option} leaves out all {kind}s; expected a column for at "
                               "least one.")
-        taken = frozenset((*outputs, *inputs))
-        if self.time is None:
-            return Columns(table.find_time(taken), outputs, inputs)
-        time = table.find((self.time,), _TIME, _NAME_TIME)
-        if time in taken:
-            raise OptionError(
-                f"column {header[time]!r} is both the time and something else; choose a different "
-                f"column for each with --time, --{self.option} and --inputs."
-            )
-        return Columns(time, outputs, inputs)
+        return Columns(header.time(self.time, (*outputs, *inputs), self.option), outputs, inputs)
 
 
 def _find(
-    table: _Header, option: str, names: tuple[str, ...], given: str | None
+    header: Header, option: str, names: tuple[str, ...], given: str | None
 ) -> tuple[int, ...]:
     letter, kind = _KINDS[option]
     chosen = _chosen(option, given, letter, names)
@@ -247,17 +276,39 @@ def _find(
         elif chosen.get(i) == "":
             raise OptionError(f"--inputs gives no column for {name!r}; inputs are needed.")
         wanted = [chosen[i]] if i in chosen else guesses
-        found.append(-1 if wanted == [""] else table.find(wanted, f"{kind} {name!r}", f"{remedy}."))
+        found.append(
+            -1 if wanted == [""] else header.find(wanted, f"{kind} {name!r}", f"{remedy}.")
+        )
     return tuple(found)
 
 
-@dataclass
-class _Header:
-    names: list[str]
-    file: str
-    line: int | None
+class Header:
+    """The names of a table's columns, and which of them is meant."""
 
-    def find_time(self, taken: Iterable[int]) -> int:
+    def __init__(self, table: Table) -> None:
+        self.names = [name.strip() for name in table.header]
+        self._file, self._line = table.name, table.header_line
+        self._has_channels = table.units is not None
+        lower = [name.lower() for name in self.names]
+        #: Without units, which files with channels have apart from the names.
+        self._bare = lower if self._has_channels else [_UNIT.sub("", name) for name in lower]
+        self._lower = lower
+
+    def time(self, given: str | None, taken: Sequence[int], option: str = "outputs") -> int:
+        """The column of the time: the given one, or one with a usual name."""
+        if self._has_channels:  # which have their times
+            return 0
+        if given is None:
+            return self._usual_time(taken)
+        time = self.find((given,), _TIME, _NAME_TIME)
+        if time in taken:
+            raise OptionError(
+                f"column {self.names[time]!r} is both the time and something else; choose a "
+                f"different column for each with --time, --{option} and --inputs."
+            )
+        return time
+
+    def _usual_time(self, taken: Iterable[int]) -> int:
         """The column with one of the usual names; not an output, input or temperature."""
         others = dict.fromkeys(taken, "is used already")
         for i, name in enumerate(self.names):
@@ -270,45 +321,69 @@ class _Header:
                     others[i] = "may be a temperature"
         reasons = "; ".join(
             f"{self.names[i]!r} {reason}" for i, reason in others.items()
-            if _UNIT.sub("", self.names[i]).lower() in _TIMES
+            if _UNIT.sub("", self.names[i]).lower() in TIMES
         )
         remedy = f"{_NAME_TIME} Not taken: {reasons}." if reasons else _NAME_TIME
-        return self.find(_TIMES, _TIME, remedy, others)
+        return self.find(TIMES, _TIME, remedy, others)
 
     def find(
         self, wanted: Sequence[str], what: str, remedy: str, others: Container[int] = ()
     ) -> int:
         """The column of the first of these names; case does not matter, nor a unit behind it.
 
-        Columns in `others` are something else.
+        Of a channel, the last part of its name will do. Columns in `others` are something else.
         """
-        lower = [name.lower() for name in self.names]
-        bare = [_UNIT.sub("", name) for name in lower]
+        if self._has_channels:
+            others = (0,)
         for name in wanted:
             small = name.lower()
-            for names, one in (
-                (self.names, name), (lower, small), (bare, small), (bare, _UNIT.sub("", small)),
-            ):
-                found = [i for i, each in enumerate(names) if each == one and i not in others]
-                if len(found) == 1:
-                    return found[0]
-                if found:
-                    same = ", ".join(repr(self.names[i]) for i in found)
-                    raise RecordError(
-                        f"{len(found)} columns could all be {what}: {same}; rename all but one, "
-                        f"or {remedy}", self.file, self.line,
-                    )
+            bare = _UNIT.sub("", small) or small
+            found = self._matching(name, small, bare, others)
+            if len(found) == 1:
+                return found[0]
+            if found:
+                same = ", ".join(repr(self.names[i]) for i in found[:_NAMES_SHOWN])
+                raise RecordError(
+                    f"{len(found)} columns could all be {what}: {same}; rename all but one, "
+                    f"or {remedy}", self._file, self._line,
+                )
         tried = ", ".join(map(repr, dict.fromkeys(wanted)))
+        names = self.names[self._has_channels:]
+        more = len(names) - _NAMES_SHOWN
+        nearest = ""
+        if more > 0:
+            names = sorted(names, key=lambda name: -SequenceMatcher(
+                None, name.lower(), wanted[0].lower()).ratio())
+            nearest = ", the nearest first,"
         shown = ", ".join(
             repr(name if len(name) <= _LETTERS_SHOWN else f"{name[:_LETTERS_SHOWN]}...")
-            for name in self.names[:_NAMES_SHOWN]
+            for name in names[:_NAMES_SHOWN]
         )
-        if len(self.names) > _NAMES_SHOWN:
-            shown += f" and {len(self.names) - _NAMES_SHOWN} more"
         raise RecordError(
-            f"there is no column for {what} (looked for {tried}); the columns are {shown}. If it "
-            f"is one of them, {remedy}", self.file, self.line,
+            f"there is no column for {what} (looked for {tried}); the columns are{nearest} {shown}"
+            f"{f' and {more} more' if more > 0 else ''}. If it is one of them, {remedy}",
+            self._file, self._line,
         )
+
+    def _matching(self, name: str, small: str, bare: str, others: Container[int]) -> list[int]:
+        """The columns of a name, by the strictest rule that finds any."""
+        rules: list[tuple[Sequence[str], str]] = [
+            (self.names, name), (self._lower, small), (self._bare, small), (self._bare, bare),
+        ]
+        for names, one in rules:
+            found = [i for i, each in enumerate(names) if each == one and i not in others]
+            if found:
+                return found
+        if not self._has_channels:
+            return []
+        ends = (f".{small}", f"/{small}")
+        return [i for i, each in enumerate(self._lower) if each.endswith(ends) and i not in others]
+
+
+def unit_of(name: str) -> str:
+    """The unit behind a column's name, such as V of ``Voltage [V]``; blank without one."""
+    found = _UNIT.search(name)
+    return "" if found is None else found[0].strip().strip("()[]/").strip()
 
 
 def _chosen(

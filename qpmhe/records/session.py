@@ -106,6 +106,8 @@ def estimate_record(
     equal_steps: bool = False,
     max_gap: int | None = None,
     skip_repeated: bool = False,
+    same_time: float | None = None,
+    log_time: bool = False,
     covariances: str = "none",
     step_time: bool = True,
     bound: BoundOptions | bool = False,
@@ -130,8 +132,8 @@ def estimate_record(
     model : str
         Name in the catalogue, ``package.module:function`` or ``path/file.py:function``.
     record, out : str or Path
-        CSV (or gzip of it) or Parquet file with a header, ``-`` is standard input; and a new file
-        in .csv or .parquet, ``-`` is standard output.
+        A file that `qpmhe.records.read` reads, ``-`` is CSV on standard input; and a new file in
+        .csv or .parquet, ``-`` is standard output.
     time, outputs, inputs : str, optional
         Columns of the time, numbers or ISO dates (whose differences count in seconds), and of y
         and u, as ``y1=column,y2=column``, or columns in order.
@@ -149,6 +151,8 @@ def estimate_record(
     equal_steps, skip_repeated : bool
         Whether steps must be equal even if the model takes any; whether to skip lines whose time
         repeats the line before.
+    same_time, log_time : float, bool
+        As for `qpmhe.records.read`, where channels have clocks of their own.
     max_gap : int, optional
         Largest number of samples without measurement in a row, 500 by default.
     covariances, step_time : {"none", "std", "full"}, bool
@@ -209,7 +213,7 @@ def estimate_record(
             str(record), ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs),
             separator=separator, decimal=decimal, encoding=encoding, skip_repeated=skip_repeated,
             missing=(missing,) if isinstance(missing, str) else missing, skip_lines=skip_lines,
-            time_format=time_format,
+            time_format=time_format, same_time=same_time, log_time=log_time,
         )
         stack.callback(reader.close)
         identity = plain(loaded.identity | {
@@ -551,6 +555,7 @@ class _Session:
                 f"{summary.inserted} samples were inserted into gaps, more than were measured; "
                 "give --time-scale if the record's unit of time is not the model's."
             )
+        summary.notes += reader.notes
         if self._steps.note:
             summary.notes.append(self._steps.note)
         if reader.cut is not None:

@@ -1,17 +1,11 @@
-"""Tables read row by row: CSV text, gzip of it, or Parquet."""
+"""Tables read row by row: CSV text or Parquet."""
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import gzip
-import io
-import os
 import re
-import stat
-import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import Any, BinaryIO, NamedTuple
 
@@ -23,15 +17,8 @@ _SEPARATORS = {"\t": "tab", ";": "semicolon", "|": "bar", ",": "comma"}
 _SEPARATOR_NAMES = {name: mark for mark, name in _SEPARATORS.items()} | {"space": " "}
 _BATCH = 4096
 
-_GZIP, _PARQUET = b"\x1f\x8b", b"PAR1"
-_ZCAT = "give '{} FILE | qpmhe estimate MODEL -', or compress it by gzip, which qpmhe reads."
-_UNREADABLE = {
-    _PARQUET: "it is a Parquet file, which cannot be read line by line; name the file instead.",
-    b"PK\x03\x04": "it is a zip archive or a spreadsheet; save it as CSV.",
-    b"BZh": f"it is compressed by bzip2; {_ZCAT.format('bzcat')}",
-    b"\xfd7zXZ": f"it is compressed by xz; {_ZCAT.format('xzcat')}",
-    b"\x28\xb5\x2f\xfd": f"it is compressed by zstd; {_ZCAT.format('zstdcat')}",
-}
+#: Usual names of the time, in small letters.
+TIMES = ("time", "t", "timestamp", "datetime", "date_time", "zeit", "zeitstempel")
 
 
 class RecordError(InvalidInputError):
@@ -57,53 +44,44 @@ class TableRow(NamedTuple):
     ended: bool
 
 
-def open_table(
-    record: str, separator: str | None, encoding: str, skip_lines: int = 0
-) -> CsvTable | ParquetTable:
-    """Open a record, a file or ``-`` for standard input; its first bytes show its kind."""
-    piped = record == "-"
-    name = "standard input" if piped else record
-    if piped and sys.stdin is None:
-        raise RecordError("it is closed; pipe a record into it, or name a file.", name)
-    with contextlib.ExitStack() as opened:
-        try:
-            stream: Any = sys.stdin.buffer if piped else opened.enter_context(open(record, "rb"))
-            if not hasattr(stream, "peek"):
-                stream = io.BufferedReader(stream)
-            head, total = stream.peek(6)[:6], None
-            if not piped and stat.S_ISREG((status := os.fstat(stream.fileno())).st_mode):
-                total = status.st_size
-        except OSError as error:
-            raise RecordError(f"it cannot be read ({error.strerror or error}).", name) from error
-        if total is not None and (
-            head.startswith(_PARQUET) or record.lower().endswith((".parquet", ".pq"))
-        ):
-            if skip_lines:
-                raise OptionError(
-                    f"--skip-lines is {skip_lines}, but {name} is a Parquet file, which has no "
-                    "lines; leave it out."
-                )
-            return ParquetTable(name)
-        for magic, remedy in _UNREADABLE.items():
-            if head.startswith(magic):
-                raise RecordError(remedy, name)
-        if head.startswith(_GZIP):
-            stream, total = gzip.GzipFile(fileobj=stream), None
-        table = CsvTable(stream, name, separator, encoding, total, skip_lines)
-        table.close = opened.pop_all().close
-        return table
+class Table:
+    """What all tables share: a header, and rows below it.
 
-
-class CsvTable:
-    """A header, and rows below it, each available as soon as its line arrives."""
+    ``unit`` says what a row is called, ``hint`` what an error about the columns adds, ``notes``
+    what the user should know of the file once it is read.
+    """
 
     unit = "line"
+    header: list[str]
+    header_line: int | None = None
+    total: int | None = None
+    types: Any = None
+    hint = ""
+    #: Of each column, where they stand apart from the names.
+    units: list[str] | None = None
+    close: Callable[[], None]
+
+    def __init__(self, name: str) -> None:
+        self.name, self.position = name, 0
+        self.notes: list[str] = []
+
+    def __iter__(self) -> Iterator[TableRow]:
+        raise NotImplementedError
+
+    def select(self, columns: Sequence[int], held: Sequence[int]) -> dict[int, int]:
+        """The positions in a row of the columns that are needed; some hold their last value."""
+        return {i: i for i in range(len(self.header))}
+
+
+class CsvTable(Table):
+    """Lines of text, each available as soon as it arrives."""
 
     def __init__(
         self, stream: BinaryIO, name: str, separator: str | None, encoding: str, total: int | None,
         skip_lines: int = 0,
     ) -> None:
-        self._stream, self.name, self._encoding, self.total = stream, name, encoding, total
+        super().__init__(name)
+        self._stream, self._encoding, self.total = stream, encoding, total
         self._separator = _SEPARATOR_NAMES.get(separator or "", separator)
         if self._separator is not None and (
             len(self._separator) != 1 or self._separator in '"\r\n'
@@ -121,8 +99,8 @@ class CsvTable:
                 f"--encoding is {encoding!r}; expected one that contains ASCII, such as utf-8, "
                 "latin-1 or cp1252."
             )
-        self.position = self.line = 0
-        self.close: Callable[[], None] = stream.close
+        self.line = 0
+        self.close = stream.close
         self._lines = filter(str.strip, islice(self._read_lines(), skip_lines, None))
         text = next(self._lines, None)
         note = re.fullmatch(r"\s*sep=(.)\s*", text or "", re.IGNORECASE)
@@ -144,7 +122,6 @@ class CsvTable:
                 name, self.line,
             )
         word = _SEPARATORS.get(self._separator, repr(self._separator))
-        #: What an error of the columns adds.
         self.hint = (
             f" The separator is taken to be {word}; choose another one with --separator. Skip "
             "lines above the header with --skip-lines N, and delete comments."
@@ -216,26 +193,24 @@ class CsvTable:
         )
 
 
-class ParquetTable:
+class ParquetTable(Table):
     """The columns of a Parquet file, read batch by batch."""
 
     unit = "row"
-    header_line = None
-    hint = ""
 
     def __init__(self, name: str) -> None:
         self._arrow = need("pyarrow", "a Parquet file")
         parquet = need("pyarrow.parquet", "a Parquet file")
-        self.name, self.position = name, 0
+        super().__init__(name)
         try:
             self._file = parquet.ParquetFile(name)
         except (self._arrow.ArrowException, OSError) as error:
-            raise RecordError(f"it cannot be read as Parquet ({_first_line(error)}).", name) from (
+            raise RecordError(f"it cannot be read as Parquet ({first_line(error)}).", name) from (
                 error
             )
-        self.close: Callable[[], None] = self._file.close
+        self.close = self._file.close
         self.types = self._file.schema_arrow.types
-        self.header: list[str] = list(self._file.schema_arrow.names)
+        self.header = list(self._file.schema_arrow.names)
         self.total = int(self._file.metadata.num_rows)
 
     def __iter__(self) -> Iterator[TableRow]:
@@ -247,7 +222,7 @@ class ParquetTable:
                 return
             except (self._arrow.ArrowException, OSError, ValueError) as error:
                 raise RecordError(
-                    f"it cannot be read any further ({_first_line(error)}).", self.name,
+                    f"it cannot be read any further ({first_line(error)}).", self.name,
                     self.position + 1, unit=self.unit,
                 ) from error
             for values in zip(*columns, strict=True):
@@ -271,5 +246,6 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _first_line(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
+    """What an exception says, on one line."""
     return str(error).partition("\n")[0].rstrip(".")

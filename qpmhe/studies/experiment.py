@@ -57,12 +57,16 @@ class Source:
 
 
 def _digest(name: str, place: Path) -> str:
+    found = hashlib.sha256()
     try:
-        return hashlib.sha256(place.read_bytes()).hexdigest()[:16]
+        # A ROS bag is a folder.
+        for each in sorted(place.iterdir()) if place.is_dir() else (place,):
+            found.update(each.read_bytes())
+        return found.hexdigest()[:16]
     except OSError as error:
         raise InvalidInputError(
             f"the record {name!r} cannot be read ({error.strerror or error}); give the name of a "
-            "CSV or Parquet file."
+            "file that qpmhe.records.read reads."
         ) from error
 
 

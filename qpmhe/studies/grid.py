@@ -41,7 +41,7 @@ WORDS = {"qps": "none", "solver_iterations": "none", "horizons": "default"}
 READING = {
     **dict.fromkeys(("time", "outputs", "inputs", "truth", "dt", "separator", "time_format")),
     "time_scale": 1.0, "decimal": "auto", "encoding": "utf-8", "missing": (),
-    "skip_repeated": False, "skip_lines": 0,
+    "skip_repeated": False, "skip_lines": 0, "same_time": None, "log_time": False,
 }
 
 
@@ -67,13 +67,14 @@ class Study:
         ``path/file.py:function``. With ``records``, a dict of options may stand in for the
         scenario, as for ``qpmhe estimate``.
     records : sequence of str or Path
-        Measured records, CSV or Parquet files, to run each model on; seeds and noise levels do
-        not apply. J and J / converged J judge the configurations, and errors where true states
-        are known.
+        Measured records, files that `qpmhe.records.read` reads, to run each model on; seeds and
+        noise levels do not apply. J and J / converged J judge the configurations, and errors where
+        true states are known.
     reading : mapping
         How records are read: ``time``, ``outputs``, ``inputs``, ``truth`` (columns), ``dt``,
         ``time_scale``, ``separator``, ``decimal``, ``encoding``, ``missing``, ``skip_repeated``,
-        ``skip_lines`` and ``time_format``, as the options of ``qpmhe estimate``.
+        ``skip_lines``, ``time_format``, ``same_time`` and ``log_time``, as the options of
+        ``qpmhe estimate``.
     backends : sequence of str, optional
         QP backends; by default all that are installed, without the forms ``qpsolvers:...``.
     qps, solver_iterations, horizons : sequence of int or None
