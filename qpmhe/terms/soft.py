@@ -254,7 +254,7 @@ class Softened:
 
         self._dpbtrf, self._dpbtrs = dpbtrf, dpbtrs
         self._n, self._penalties, self._size = n, penalties, penalties.size
-        self._least = _CURVATURE / penalties.scale
+        self._scale = penalties.scale
         self._qp: QP | None = None
         #: The same in other unknowns, see `along`.
         self.stacked: Softened | None = None
@@ -294,7 +294,7 @@ class Softened:
         if stacked is None or stacked._n != size or stacked._size != self.values.size:
             self.stacked = stacked = copy(self)
             stacked._n, stacked._size, stacked._qp = size, self.values.size, None
-            stacked._least = np.tile(self._least, len(step))
+            stacked._scale = np.tile(self._scale, len(step))
         own = self._own @ directions
         own[:-1] += self._following[:-1] @ directions[1:]
         stacked._own = own.reshape(1, -1, size)
@@ -330,10 +330,10 @@ class Softened:
         panel = np.append(base.band.reshape(base.stages, -1), np.zeros((base.stages, 1)), axis=1)
         panel.take(self._index, axis=1, out=qp.band, mode="clip")
         half = 0.5 * window.linear
-        curvature = np.maximum(window.quadratic, half * self._least)
+        own, following, lower, upper = self._usable()
+        curvature = np.maximum(window.quadratic, half * self._least(base, own, following))
         qp.band[:, n:, 0] = curvature
         present = np.nan_to_num(window.misses(self.values), nan=0.0, posinf=0.0)
-        own, following, lower, upper = self._usable()
         qp.gradient[:, :n] = base.gradient
         # What the curvature exceeds the quadratic penalty by acts on the slack's change alone.
         needed = np.isfinite(lower) | np.isfinite(upper)
@@ -349,6 +349,19 @@ class Softened:
             qp.row_own[:, place, :n], qp.row_next[:, place, :n] = own, following
         qp.row_lower[:, rows : rows + size], qp.row_upper[:, rows + size :] = lower, upper
         return qp
+
+    def _least(self, base: QP, own: Array, following: Array) -> Array:
+        """The least curvature of a slack, as a share of its linear penalty.
+
+        Beside a vague prior, the scale of a row on states is far longer than any step: the
+        Hessian's diagonal says how far the row would give way.
+        """
+        inverse_diagonal = 1.0 / base.band[:, :, 0]
+        pliancy = np.matmul(own**2, inverse_diagonal[:, :, None])[:, :, 0]
+        pliancy[:-1] += np.matmul(following[:-1] ** 2, inverse_diagonal[1:, :, None])[:, :, 0]
+        deviation, scale = np.sqrt(pliancy), self._scale
+        shorter = (deviation > 0.0) & (deviation < scale)
+        return np.asarray(_CURVATURE / np.where(shorter, deviation, scale))
 
     def _usable(self) -> tuple[Array, Array, Array, Array]:
         """Derivatives by the state and the next, and sides, of rows that can be linearised."""

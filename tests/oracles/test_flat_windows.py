@@ -18,13 +18,16 @@ A, C, NOISE = np.array([[1.0, 0.1], [0.0, 0.98]]), np.array([[1.0, 0.0]]), 0.1
 LOW, DISTURBANCE, HORIZON = np.array([0.0, -0.2]), np.array([0.05, 0.1]), 10
 
 
-def estimator(engine, ratio, units, kind, **options):
+def estimator(engine, ratio, units, kind, penalties=None, **options):
     """A linear model in units, which stays at its bounds; the prior has ``ratio`` noises."""
     of_A, of_C = units[:, None] * A / units, C / units
     low, open_end = LOW * units, np.full(2, np.inf)
     states = qpmhe.Box(low, open_end)
     if kind == "polytope":
         states = qpmhe.Polytope(-np.diag(1.0 / units), -LOW)
+    if penalties is not None:
+        linear, quadratic = penalties
+        states = states.soften(linear=linear / units, quadratic=quadratic / units**2)
     system = qpmhe.System(
         lambda x: of_A @ x, lambda x: of_C @ x, n=2, p=1, states=states,
         disturbance_matrix=np.diag(units)[:, 1:] if kind == "matrix" else None,
@@ -42,8 +45,8 @@ def estimator(engine, ratio, units, kind, **options):
     )
 
 
-def best(ratio, mean, Y):
-    """The least J of a window, without units."""
+def terms_of(ratio, mean, Y):
+    """The rows M and sides b of J = |M x - b|^2, without units."""
     count = len(Y)
     rows, sides = [], []
 
@@ -60,9 +63,14 @@ def best(ratio, mean, Y):
         for j in range(2):
             add([(i + 1, np.eye(2)[j]), (i, -A[j])], 0.0, DISTURBANCE[j])
         add([(i, C[0])], y[0], NOISE)
-    rows, sides = np.array(rows), np.array(sides)
+    return np.array(rows), np.array(sides)
+
+
+def best(ratio, mean, Y):
+    """The least J of a window, without units, and where it is."""
+    rows, sides = terms_of(ratio, mean, Y)
     scale = np.linalg.norm(rows, axis=0)
-    found = lsq_linear(rows / scale, sides, (np.tile(LOW, count + 1) * scale, np.inf),
+    found = lsq_linear(rows / scale, sides, (np.tile(LOW, len(Y) + 1) * scale, np.inf),
                        method="bvls", tol=1e-15, max_iter=1000)
     return 2.0 * found.cost, (found.x / scale).reshape(-1, 2)
 
@@ -152,3 +160,37 @@ def test_active_rows_cost_no_digits(flat):
         lost = np.finfo(float).eps * np.linalg.cond(H / np.sqrt(np.outer(*[np.diag(H)] * 2)))
         assert np.abs(d - x).max() < (1e-10 + 10.0 * lost) * np.abs(x).max()
     assert active > 5
+
+
+@pytest.mark.parametrize("ratio", [1e10, 1e6, 1e3])
+@pytest.mark.parametrize(("linear", "quadratic"), [(50.0, 0.0), (0.5, 0.0), (5.0, 2.0)])
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e6, 1e-3)])
+def test_soft_bounds_beside_a_vague_prior(units, linear, quadratic, ratio):
+    piqp = pytest.importorskip("piqp")
+    units, missed = np.array(units), 0
+    mhe = estimator("python", ratio, units, "box", max_qps=None, penalties=(linear, quadratic))
+    Y = 0.05 * np.random.default_rng(1).normal(size=(20, 1)) - 0.05
+    for t, y in enumerate(Y):
+        estimate = mhe.update(y)
+        rows, sides = terms_of(ratio, estimate.candidate[0] / units,
+                               Y[t + 2 - len(estimate.trajectory) : t + 1])
+        size, solver = rows.shape[1], piqp.DenseSolver()
+        for name in ("eps_abs", "eps_rel", "eps_duality_gap_abs", "eps_duality_gap_rel"):
+            setattr(solver.settings, name, 1e-12)
+        # In x and in its misses, which are not negative.
+        H = np.diag(np.repeat([0.0, 2.0 * quadratic], size))
+        H[:size, :size] = 2.0 * rows.T @ rows
+        low, eye = np.tile(LOW, size // 2), np.eye(size)
+        solver.setup(
+            H, np.append(-2.0 * rows.T @ sides, np.full(size, linear)), None, None,
+            np.hstack((eye, eye)), low, np.full(size, np.inf),
+            np.append(np.full(size, -np.inf), np.zeros(size)), np.full(2 * size, np.inf),
+        )
+        assert solver.solve() == piqp.Status.PIQP_SOLVED
+        x = solver.result.x[:size]
+        misses = np.maximum(low - x, 0.0)
+        J = np.sum((rows @ x - sides) ** 2) + misses @ (linear + quadratic * misses)
+        assert estimate.cost <= J * (1.0 + 1e-9)
+        assert qpmhe.Status.CONVERGED in estimate.status
+        missed += misses.max() > 1e-6
+    assert missed > (5 if linear < 50.0 else -1)
