@@ -5,7 +5,7 @@ when its memory and its data change in their last digits; by the tolerance of th
 where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
 where it differs as much from itself when the QPs change in their last digits; by a cap or
 by a QP that a method has not solved, mostly since it has no feasible point. What is left is a
-fault.
+fault. `docs/how-to/speed.md` lists these reasons.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ CLOSE = 1e-6  # of two estimates in units, and of their J as a share
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
-# Differences of a kind that are explained, of each estimator.
-_MEASURED = {"quiet": 20, "active": 4}
+# Differences of a kind that are explained, of each estimator: all without an active row.
+_MEASURED = {"quiet": np.inf, "active": 8}
 _TRIES = 6
 _TIGHT = (
     {"solver_tolerance": 1e-12}, {"backend": "daqp", "solver_tolerance": 1e-12},
