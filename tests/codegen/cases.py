@@ -714,6 +714,10 @@ FEATURES = {
         "soft states, hard noises": (lambda: _inputs(
             states=NARROW.soften(linear=20.0), noises=Box([-0.2, -0.1], [0.2, 0.1]),
         ), gaps, AGAIN),
+        # Of a row that is missed, both penalties push back.
+        "soft states, narrow noises": (lambda: _inputs(
+            states=NARROW.soften(linear=2.0, quadratic=400.0), noises=Box([-0.02] * 2, [0.02] * 2),
+        ), MANY),
         "soft noises, hard states": (lambda: _inputs(
             states=NARROW, noises=Box([-0.05, -0.1], [0.1, 0.1]).soften(linear=1.0, quadratic=5.0),
         ), MANY),
