@@ -134,7 +134,7 @@ def hand_over(
     """Let a new Python engine continue where an ``mhe_estimator`` stands; see its `adopt`."""
     stages, n = memory["stages"][_in_order(memory)], layout.nx
     metric = None
-    if layout.sets[SET_NAMES.index("states")][0]:
+    if layout.projects:
         metric = memory["metric"].reshape(n, n).copy(), bool(memory["metric_settled"])
     engine.adopt(
         usual, record_of(memory, layout, directions), np.hstack((stages["w"], stages["v"])),

@@ -112,6 +112,8 @@ class Layout:
     numbers: tuple[int, ...] | None = None
     #: Directions in which there are disturbances, where not all have some; else None.
     free: int | None = None
+    #: Whether the set of states is soft.
+    soft_states: bool = False
     #: States that are held where the window does not see them.
     held: int = 0
     #: The terms of J that not every estimator has, by their names in C.
@@ -132,7 +134,7 @@ class Layout:
         losses = () if form is None else form.losses
         sets = tuple(
             (one is not None, 0 if one is None else one.matrix.shape[0])
-            for one in (getattr(system, name) for name in SET_NAMES)
+            for one in map(system.set_of, SET_NAMES)
         )
         numbers: tuple[int, ...] | None = None
         if cost.space is not None:
@@ -157,7 +159,7 @@ class Layout:
             restores=restores and any(there for there, _ in sets), restarts=restarts,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
-            free=directions.free, held=len(system.held),
+            free=directions.free, soft_states="states" in system.soft, held=len(system.held),
             terms=tuple(term.name for term in terms),
             numbers_of=tuple(
                 (name, tuple(
@@ -204,6 +206,7 @@ class Layout:
         for letter, (there, rows) in zip("wvx", self.sets, strict=True):
             values[f"{letter}_set"] = int(there)
             values[f"{letter}_rows"] = rows
+        values["x_hard"] = int(self.projects)
         return values
 
     def _part_types(self, prefix: str) -> tuple[str, str]:
@@ -282,6 +285,11 @@ class Layout:
         """``mhe_sample``."""
         pointers = ("y", "u", "noise_weight", "disturbance_weight", *SET_NAMES, "sampled")
         return _struct([*((name, np.uintp) for name in pointers), ("step", self.number)])
+
+    @property
+    def projects(self) -> bool:
+        """Whether there is a set of states in which the observer may be kept: no soft one."""
+        return self.sets[2][0] and not self.soft_states
 
     @property
     def metric_size(self) -> int:
@@ -477,7 +485,7 @@ def _filled(
     regular = prior(observer.initial_covariance()).distance
     weights = form.disturbance, form.noise, regular
     for name, weight in zip(SET_NAMES, weights, strict=True):
-        one: ConvexSet | None = getattr(system, name)
+        one: ConvexSet | None = system.set_of(name)
         if name == "disturbances" and cost.space is not None:
             _fill_rows(record[name], directions.constraints_of(system, cost).disturbances)
             continue

@@ -48,10 +48,12 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"{name}, a function, has no C form ({residual.expression.reason}); take "
                 "qpmhe.angles, or engine='python'."
             )
-    if system.extensions:
+    if system.constraints:
+        return "engine='compiled' does not have nonlinear constraints; take engine='python'."
+    if system.soft and Directions(system, observer, cost).free is not None:
         return (
-            f"engine='compiled' does not have {' and '.join(system.extensions)}; take "
-            "engine='python'."
+            "engine='compiled' does not have soft sets where disturbances have fewer directions "
+            "than the state; take engine='python'."
         )
     form = observer.c_form
     if form is None:

@@ -18,6 +18,7 @@ from ..errors import CompilationError
 from ..model.algebraic import CURVED, MOST_HALVINGS, MOST_ITERATIONS, ROUNDING, SMALL
 from ..model.expressions import CasadiModel, import_casadi
 from ..model.implicit_steps import COLLOCATIONS
+from ..terms.soft import SOFT
 from .layout import SET_NAMES, TERMS, Layout
 from .single import in_single_precision
 
@@ -319,7 +320,9 @@ def _declared(parts: list[str]) -> list[str]:
 def _header(name: str, values: dict[str, Any], members: dict[str, str]) -> str:
     """The estimator's header with its sizes filled in, and with what the parts add to it."""
     places = ("types", "functions", *(
-        f"mhe_{one}" for one in ("settings", "terms", "estimate", "prior", "workspace", "log")
+        f"mhe_{one}" for one in (
+            "settings", "terms", "estimate", "prior", "trial", "side", "rows", "workspace", "log",
+        )
     ))
     unknown = members.keys() - set(places)
     assert not unknown, unknown
@@ -337,7 +340,7 @@ def _parts(layout: Layout) -> list[str]:
         *_own_sets(layout),
         *_texts(("conditions", _or_none("losses", layout.loss), "cost")),
         layout.sizes.c_functions(),
-        *_texts((*_observer_parts(layout), "window", *_prior_parts(layout), *layout.terms)),
+        *_texts((*_observer_parts(layout), "window", *_prior_parts(layout), *_first_terms(layout))),
         _further_terms(layout.terms),
         *_texts([] if layout.held else ["hold_none"]),
         *_texts((*_search_parts(layout), "step")),
@@ -360,7 +363,7 @@ def _observer_parts(layout: Layout) -> list[str]:
     if layout.covariance and not layout.deviations:
         parts += ["kalman_none"]
     parts += [_or_none("following", layout.covariance)]
-    if not layout.sets[2][0]:
+    if not layout.projects:
         return [*parts, "inside_none"]
     metric = "metric_covariance" if layout.covariance else "metric_own"
     return [*parts, "projection", metric, "inside"]
@@ -409,7 +412,8 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
         factor, blocks = "factor", ["factor_lapack" if layout.lapack else "factor_loops"]
     else:
         factor, blocks = "elimination", []
-    rows = f"rows_{factor}", "rows", "active_set", "interior_point", "constrained", "curved"
+    soft = _or_none("soft", SOFT in layout.terms)
+    rows = f"rows_{factor}", "rows", "active_set", "interior_point", soft, "constrained", "curved"
     constrained = layout.has_rows
     return (
         *(["sets"] if constrained else []), "trial", "damping", factor, *blocks,
@@ -419,6 +423,11 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
         "optimizer", _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet),
         "improve", _or_none("restarting", layout.restarts),
     )
+
+
+def _first_terms(layout: Layout) -> list[str]:
+    """The terms in the first state; soft rows are among the parts with rows."""
+    return [name for name in layout.terms if name != SOFT]
 
 
 def _further_terms(names: tuple[str, ...]) -> str:
@@ -432,11 +441,11 @@ def _further_terms(names: tuple[str, ...]) -> str:
         "/* Before a step. */\n"
         "static void mhe_begin_further(mhe_estimator *e, mhe_workspace *k)\n"
         f"{{\n    (void)e; (void)k;\n{body('mhe_{}_begin(e, k)')}}}\n\n"
-        "/* What they add to J of a trajectory that starts at x. */\n"
-        "static real mhe_further_cost(const mhe_estimator *e, const mhe_workspace *k, "
-        "const real *x)\n"
-        "{\n    real cost = 0;\n    (void)e; (void)k; (void)x;\n"
-        f"{body('cost += mhe_{}_cost(e, k, x)')}    return cost;\n}}\n\n"
+        "/* What they add to J of a trial. */\n"
+        "static real mhe_further_cost(mhe_estimator *e, const mhe_workspace *k, "
+        "mhe_trial *trial)\n"
+        "{\n    real cost = 0;\n    (void)e; (void)k; (void)trial;\n"
+        f"{body('cost += mhe_{}_cost(e, k, trial)')}    return cost;\n}}\n\n"
         "/* Add them to the first state's matrix, by rows of this width, and to the gradient. */\n"
         "static void mhe_add_further(const mhe_estimator *e, mhe_workspace *k, real factor,\n"
         "                            real *matrix, int width)\n"

@@ -16,11 +16,22 @@ from qpmhe_solvers import QP, Solution, SolveStatus
 from .._linalg import inverse, solve, unit_diagonal
 from ..costs import Cost
 from ..model.system import System
-from .base import QuadraticModel, SoftRows, Term, Trial, WindowData, WindowView
+from .base import (
+    QuadraticModel,
+    SoftRows,
+    Term,
+    TermForm,
+    Trial,
+    WindowData,
+    WindowView,
+)
 from .rows import Rows, function_rows
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+#: Their name in C, where they are rows of QPs and not terms in the first state.
+SOFT = "soft"
 
 #: A second-order correction is lengthened by this share of itself, to end inside the set.
 BEYOND = 0.1
@@ -59,6 +70,7 @@ class Penalties:
     def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
         self.parts: list[_Part] = []
         self.size, self._n, self._discounted = 0, system.n, cost.discount < 1.0
+        self._system = system
         for name, covariance in (
             ("states", prior_covariance), ("disturbances", inverse(cost.disturbance)),
             ("noises", inverse(cost.noise)),
@@ -106,8 +118,18 @@ class Penalties:
         return found if found.size else None
 
     @property
-    def c_form(self) -> None:
-        """None: the step in C has no soft rows."""
+    def c_form(self) -> TermForm:
+        """The penalties of all rows of a stage: of W, V and X, infinite for hard ones."""
+        penalties = []
+        for name in ("disturbances", "noises", "states"):
+            one, soft = self._system.set_of(name), self._system.soft.get(name)
+            if soft is not None:
+                penalties.append((soft.linear, soft.quadratic))
+            elif one is not None:
+                count = one.dimension + len(one.matrix)
+                penalties.append((np.full(count, np.inf), np.zeros(count)))
+        linear, quadratic = (np.concatenate(one) for one in zip(*penalties, strict=True))
+        return TermForm(SOFT, {"linear": linear, "quadratic": quadratic})
 
     def of_window(self, window: WindowData, view: WindowView) -> Penalty:
         """The soft rows of a window."""
@@ -463,7 +485,9 @@ class Softened:
             if not (np.isfinite(step).all() and np.isfinite(forces).all()):
                 return None
             gap = rows @ step - sides
-            rounding = _ROUNDING * (magnitudes @ np.abs(step) + np.abs(sides))
+            # The step is a difference of these, and may vanish.
+            terms = np.abs(free) + np.abs(step)
+            rounding = _ROUNDING * (magnitudes @ terms + np.abs(sides))
             # Solved rows are met, or missed by what their force says.
             off = gap - np.where(violated, soft * (forces - most), 0.0)
             if (np.abs(off) > _ACCURACY * rounding)[solved].any():

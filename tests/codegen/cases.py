@@ -580,6 +580,8 @@ def _held(hold=0.2, bounds=None, **options):
 
 OTHER_GAIN = [[0.2, 0.0], [0.1, 0.05], [0.0, 0.2]]
 POSITIVE = Box([0.0, 0.0], [INF, INF])
+SMALLER = Box([-0.05] * 3, [0.05] * 3) & Polytope([[1.0, 1.0, -1.0]], [0.06])
+NARROW = Box([0.0, -INF, -0.2], [0.6, 0.4, INF])
 WEDGE = Polytope([[-1.0, 0.1], [0.1, -1.0], [1.0, 1.0]], [0.0, 0.0, 4.2])
 SMALL = {"disturbances": Box([-0.05, -0.08], [0.1, 0.06])}
 SINGULAR = {"prior": np.diag([1.0, 0.0, 0.5]), "disturbance": np.diag([0.02, 0.0, 0.0])}
@@ -695,6 +697,48 @@ FEATURES = {
         "extended in states": ("states in a polytope", filtered(), gaps, ONE),
         "unscented in states": ("states in a box", filtered(UKF, np.eye(2)), gaps, AGAIN),
         "steady in states": (lambda: _steady(_reaction_in(WEDGE, (2.0, 1.5))), gaps),
+    },
+    "soft": {
+        "soft states": (
+            lambda: _reaction_in(POSITIVE.soften(linear=0.5, quadratic=2.0)),
+            gaps, conditions, AGAIN,
+        ),
+        "soft states in a polytope": (lambda: _reaction_in(WEDGE.soften(linear=3.0)), WARM),
+        "soft states by squares": (
+            lambda: _inputs(states=NARROW.soften(quadratic=30.0)), gaps, conditions, MANY,
+        ),
+        "soft disturbances and noises": (lambda: _inputs(
+            disturbances=SMALLER.soften(linear=4.0, quadratic=1.0),
+            noises=Box([-0.2, -0.1], [0.2, 0.1]).soften(linear=2.0),
+        ), gaps, conditions, WARM, MANY),
+        "soft states, hard noises": (lambda: _inputs(
+            states=NARROW.soften(linear=20.0), noises=Box([-0.2, -0.1], [0.2, 0.1]),
+        ), gaps, AGAIN),
+        # Of a row that is missed, both penalties push back.
+        "soft states, narrow noises": (lambda: _inputs(
+            states=NARROW.soften(linear=2.0, quadratic=400.0), noises=Box([-0.02] * 2, [0.02] * 2),
+        ), MANY),
+        "soft noises, hard states": (lambda: _inputs(
+            states=NARROW, noises=Box([-0.05, -0.1], [0.1, 0.1]).soften(linear=1.0, quadratic=5.0),
+        ), MANY),
+        "soft equations": (lambda: _inputs(
+            states=Polytope([[1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]], [0.5, -0.5]).soften(linear=0.3),
+            disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]).soften(linear=1.0, quadratic=2.0),
+        ), gaps, ONE),
+        "soft angles": (lambda: _ship(
+            disturbances=Box([-0.02, -0.01], [0.05, 0.01]).soften(linear=20.0),
+            noises=Box([-3.0, -0.2], [3.0, 0.2]).soften(quadratic=0.5),
+        ), conditions, WARM),
+        "soft, extended": (
+            lambda: _inputs(states=NARROW.soften(linear=2.0)),
+            filtered(), outliers, gaps, AGAIN, looser,
+        ),
+        "soft, graduated": (lambda: _inputs(states=NARROW.soften(linear=2.0)), losses(
+            disturbance=qpmhe.Cauchy, noise=partial(qpmhe.GemanMcClure, graduation=30.0)
+        ), WARM),
+        "soft, unscented": (
+            lambda: _reaction_in(POSITIVE.soften(linear=0.5)), filtered(UKF), gaps,
+        ),
     },
     "equations": {
         "noise-free reinitialized": (lambda: _inputs(

@@ -99,7 +99,7 @@ def test_the_compiled_step_is_clean(part, tmp_path):
 
 @pytest.mark.parametrize("name", [
     "inputs", "euler", "extended", "unscented", "mixed losses", "states in a polytope",
-    "fewer disturbances in sets", "held with gaps", "restored",
+    "fewer disturbances in sets", "held with gaps", "soft states", "restored",
     "restarted extended",
 ])
 def test_the_written_code_is_the_python_step(name, tmp_path):

@@ -77,6 +77,7 @@ static void mhe_set_stiffness(mhe_estimator *e, mhe_workspace *k)
             if (place[r] != BETWEEN) weight[r] = STIFFER / mhe_max(weight[r], least * least);
         }
     }
+    mhe_soften(e, k);
 }
 
 /* Rows of X that are missed by a share of the prior's deviation may be missed by much where the prior
@@ -154,6 +155,7 @@ static int mhe_first_guess(mhe_rows *q, int rows, int limit)
         if (q->low[i] == q->high[i]) q->place[i] = EQUATION;
         else if (!(fabs(mhe_limit_of(q, i)) <= FARTHEST * q->deviation[i])) q->place[i] = BETWEEN;
         if (limit == 0) q->place[i] = BETWEEN;
+        mhe_guess_soft(q, i, place);
         active += q->place[i] != BETWEEN;
     }
     return active;
@@ -178,6 +180,7 @@ static void mhe_compare(mhe_rows *q, int rows, real tolerance, mhe_guess *guess)
             if (above > little) next = AT_UPPER;
         } else if (next != EQUATION && (next < 0 ? -q->force[i] : q->force[i]) < 0)
             next = BETWEEN;
+        mhe_compare_soft(q, i, &next);
         q->next[i] = (int8_t)next;
         guess->wrong += next != q->place[i];
     }
@@ -195,10 +198,12 @@ static int mhe_next_guess(mhe_rows *q, int rows, mhe_guess *guess)
     else
         all = guess->patience-- > 0;
     if (!all && guess->fewest > FEW) return 0;
+    if (guess->wrong > guess->fewest && mhe_is_lost(guess->wrong)) return 0;
     for (int i = rows - 1; i >= 0; i--) {
         if (q->next[i] == q->place[i]) continue;
         q->place[i] = q->next[i];
         if (q->place[i] == BETWEEN) q->force[i] = 0;
+        mhe_enter_soft(q, i);
         if (!all) break;
     }
     return 1;
@@ -218,8 +223,9 @@ static real mhe_push_back(mhe_rows *q, int rows, real *energy)
         }
         const real limit = mhe_limit_of(q, i), gap = q->value[i] - limit;
         const real force = q->weight[i] * gap;
-        q->force[i] += force;
         q->load[i] = -force;
+        if (mhe_is_violated(q, i)) continue;
+        q->force[i] += force;
         *energy += force * gap;
         open = mhe_max((fabs(gap) - 64 * EPSILON * fabs(limit)) / q->scale[i], open);
     }
@@ -233,8 +239,13 @@ static int mhe_exclude(mhe_rows *q, int rows, real open)
     int changes = 0;
     for (int i = 0; i < rows; i++) {
         q->next[i] = q->place[i];
-        if (q->place[i] == BETWEEN || q->place[i] == EQUATION) continue;
+        if (q->place[i] == BETWEEN || mhe_is_violated(q, i)) continue;
         const real gap = -q->load[i] / q->weight[i];
+        if (mhe_give_way(q, i, gap, STUCK * open * q->scale[i])) {
+            changes++;
+            continue;
+        }
+        if (q->place[i] == EQUATION) continue;
         if (gap * q->place[i] < -STUCK * open * q->scale[i]) q->next[i] = BETWEEN, changes++;
     }
     return changes;

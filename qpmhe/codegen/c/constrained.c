@@ -5,6 +5,7 @@ static int mhe_solve_rows(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, co
                           int nearest, int again)
 {
     const int limit = e->settings->max_iterations;
+    mhe_begin_soft(e, k, nearest, again);
     int guesses = 0, iterations = 0;
     int status = mhe_active_set(e, k, offset, nearest, limit, again && o->factorised, &guesses);
     o->factorised = status == SOLVED;
@@ -12,15 +13,20 @@ static int mhe_solve_rows(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, co
         if (!mhe_solve_free(e, k, offset, nearest)) return FAILED;
         if (guesses < limit && !mhe_time_is_up(k))
             status = mhe_interior_point(e, k, offset, nearest, limit - guesses, &iterations);
-        if (status == SOLVED && guesses + iterations < limit) {
+        if ((status == SOLVED || status == NEARLY) && guesses + iterations < limit) {
             /* Its active set gives the solution up to rounding. */
             const int left = limit - guesses - iterations;
             int more = 0;
             memcpy(k->residual, k->step, sizeof k->step);
             o->factorised = mhe_active_set(e, k, offset, nearest, left, 0, &more) == SOLVED;
-            if (!o->factorised) memcpy(k->step, k->residual, sizeof k->step);
+            if (!o->factorised) {
+                memcpy(k->step, k->residual, sizeof k->step);
+                mhe_recall_forces(e, k);
+            } else
+                status = SOLVED;
             guesses += more;
         }
+        if (status == NEARLY) status = STOPPED;
     }
     if (status != SOLVED) memset(k->rows.place, 0, sizeof k->rows.place);
     o->iterations += guesses + iterations;
@@ -36,6 +42,7 @@ static void mhe_clip_trial(mhe_estimator *e, const mhe_workspace *k, mhe_trial *
         real *x = trial->x + i * NX;
         mhe_enter_turn(e->settings, x);
         for (int j = 0; j < NX; j++) {
+            if (mhe_is_soft(e->settings, W_COUNT + V_COUNT + j)) continue;
             if (x[j] < set->lower[j] && !(out[j] & MHE_LOWER)) x[j] = set->lower[j];
             if (x[j] > set->upper[j] && !(out[j] & MHE_UPPER)) x[j] = set->upper[j];
         }

@@ -54,6 +54,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
         }
         (void)value;
     }
+    mhe_bend_soft(e, k);
     for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
         rows->load[i] += MHE_BEYOND * fabs(rows->value[i]);
         if (rows->high[i] - rows->low[i] > 4 * rows->load[i]) {
@@ -72,7 +73,8 @@ static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         o->corrections++;
         if (failed) break;
         mhe_try(e, k, o, 1);
-        if (isfinite(o->spare->cost) || !isfinite(o->spare->violation)) break;
+        if (!isfinite(o->spare->violation)) break;
+        if (isfinite(o->spare->cost) && mhe_is_within(o)) break;
     }
 }
 
@@ -122,6 +124,11 @@ static int mhe_try_curved(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, re
         }
         if (o->spare->cost < target) return 1;
     }
+    if (!o->is_curved && mhe_is_bent(o) && !useless) {
+        mhe_correct(e, k, o);
+        memcpy(k->step, k->bent.x, sizeof k->step);
+        if (o->spare->cost < target) return 1;
+    }
     /* Between two infeasible points there is no feasible one of a convex set. */
     return o->best->violation > MHE_FEASIBLE;
 }
@@ -131,10 +138,12 @@ static int mhe_try_curved(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, re
 static void mhe_try_along(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real target)
 {
     const int along = (int)(sizeof mhe_along / sizeof *mhe_along);
-    for (int i = 0; i < along && o->is_curved; i++) {
+    const int is_bent = mhe_is_bent(o); /* of the shortest step so far */
+    for (int i = 0; i < along && (o->is_curved || is_bent); i++) {
         memcpy(k->step, k->bent.x, sizeof k->step);
         mhe_try(e, k, o, mhe_along[i]);
-        if (!isfinite(o->spare->cost)) mhe_feasible_near(e, k, o, o->spare);
+        if (!o->is_curved) mhe_correct(e, k, o);
+        else if (!isfinite(o->spare->cost)) mhe_feasible_near(e, k, o, o->spare);
         if (o->spare->cost < target) return;
     }
 }

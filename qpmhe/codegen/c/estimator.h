@@ -41,6 +41,7 @@ typedef $real mhe_real;
 #define MHE_W_SET $w_set   /* whether there is a set of disturbances, noises, states */
 #define MHE_V_SET $v_set
 #define MHE_X_SET $x_set
+#define MHE_X_HARD $x_hard    /* whether the set of states is no soft one */
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_X_ROWS $x_rows
@@ -180,7 +181,7 @@ $in_estimate} mhe_estimate;
 typedef struct {
     mhe_real x[(MHE_HORIZON + 1) * MHE_NX], w[MHE_HORIZON * MHE_NX], v[MHE_HORIZON * MHE_NY];
     mhe_real cost, violation;
-} mhe_trial;
+$in_trial} mhe_trial;
 
 /* The interior point's variables on one side of the rows. A side that is not there has a slack
  * of 1 and zeros in all else, so that no loop has to ask. */
@@ -188,7 +189,7 @@ typedef struct {
     mhe_real there[MHE_ROWS], limit[MHE_ROWS], slack[MHE_ROWS], dual[MHE_ROWS];
     mhe_real residual[MHE_ROWS], correction[MHE_ROWS], inverse[MHE_ROWS];
     mhe_real slack_change[MHE_ROWS], dual_change[MHE_ROWS];
-} mhe_side;
+$in_side} mhe_side;
 
 /* Rows of a constrained QP: low <= value <= high. */
 typedef struct {
@@ -197,7 +198,7 @@ typedef struct {
     mhe_real force[MHE_ROWS], missed[MHE_ROWS];
     int8_t place[MHE_ROWS], next[MHE_ROWS];
     mhe_side sides[2];
-} mhe_rows;
+$in_rows} mhe_rows;
 
 $in_types
 /* The prior of the present window: its mean, its weight, and one to judge distances by. */

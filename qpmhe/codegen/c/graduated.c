@@ -27,7 +27,7 @@ static void mhe_weigh(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
     for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - k->prior.mean[j];
     mhe_wrap_state(e->settings, trial->x, offset);
     cost += k->factors[0] * mhe_prior_cost(e->settings, k, offset);
-    cost += mhe_further_cost(e, k, trial->x);
+    cost += mhe_further_cost(e, k, trial);
     trial->cost = cost >= 0 && isfinite(cost) ? cost : INFINITY;
 }
 

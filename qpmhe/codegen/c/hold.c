@@ -128,11 +128,11 @@ static void mhe_trust_start(mhe_estimator *e)
         e->trusted[j] = e->z_end[e->settings->hold.components[j % MHE_HELD]];
 }
 
-/* What the hold adds to J of a trajectory that starts at x. */
-static real mhe_hold_cost(const mhe_estimator *e, const mhe_workspace *k, const real *x)
+/* What the hold adds to J of a trial. */
+static real mhe_hold_cost(const mhe_estimator *e, const mhe_workspace *k, const mhe_trial *trial)
 {
     real offset[MHE_HELD];
-    mhe_held_offset(e, x, offset);
+    mhe_held_offset(e, trial->x, offset);
     return k->factors[0] * mhe_form(MHE_HELD, k->prior.held, offset);
 }
 

@@ -15,9 +15,9 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
     }
     /* No cost is NaN, but 0 times infinity is where a discount underflows. */
     if (isnan(trial->cost)) trial->cost = INFINITY;
-    trial->cost += mhe_further_cost(e, k, trial->x);
-    trial->cost += mhe_move_prior(e, k);
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
+    trial->cost += mhe_further_cost(e, k, trial);
+    trial->cost += mhe_move_prior(e, k);
     trial->violation = mhe_violation(e, trial, mhe_candidate_disturbances(e, k), 0, 0);
 }
 

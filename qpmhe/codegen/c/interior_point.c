@@ -20,7 +20,8 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real reach, real produc
         for (int i = 0; i < rows; i++) {
             const real limit = side ? q->high[i] : -q->low[i];
             const real unit = mhe_max(reach * q->scale[i], q->deviation[i]);
-            const int there = q->low[i] < q->high[i] && limit <= FARTHEST * unit;
+            const int is_side = q->low[i] < q->high[i] || mhe_is_elastic(q, i);
+            const int there = is_side && limit <= FARTHEST * unit;
             p->there[i] = there ? 1 : 0;
             p->limit[i] = there ? limit : 0;
             p->slack[i] = there ? mhe_max(limit, missed * q->scale[i]) : 1;
@@ -28,7 +29,14 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real reach, real produc
             sides += there;
         }
     }
+    sides += mhe_start_soft(q, rows, missed, product);
     return sides;
+}
+
+/* Whether both limits of a row are one, which it has to keep. */
+static int mhe_is_equation(const mhe_rows *q, int i)
+{
+    return q->low[i] == q->high[i] && !mhe_is_elastic(q, i);
 }
 
 /* Residuals, weights and loads where rows.value = c(d). Returns the sum of the products, and
@@ -37,8 +45,9 @@ static int mhe_start(mhe_rows *q, int rows, real missed, real reach, real produc
 static real mhe_set_residuals(mhe_rows *q, int rows, real stiffer, real *infeasible)
 {
     real products = 0, worst[STRANDS] = {0};
+    mhe_raise_limits(q, rows);
     for (int i = 0; i < rows; i++) {
-        const int s = i % STRANDS, equation = q->low[i] == q->high[i];
+        const int s = i % STRANDS, equation = mhe_is_equation(q, i);
         q->missed[i] = equation ? q->value[i] - q->high[i] : 0;
         q->weight[i] = equation ? stiffer * q->weight[i] : 0;
         q->load[i] = -q->force[i];
@@ -60,6 +69,7 @@ static real mhe_set_residuals(mhe_rows *q, int rows, real stiffer, real *infeasi
         }
         products += mhe_product(rows, p->slack, p->dual);
     }
+    products += mhe_soften_weights(q, rows);
     *infeasible = worst[0];
     for (int s = 1; s < STRANDS; s++) *infeasible = mhe_max(worst[s], *infeasible);
     return products;
@@ -80,6 +90,7 @@ static int mhe_set_direction(mhe_estimator *e, mhe_workspace *k, real target)
             q->load[i] += sign * ((target - p->correction[i] - p->dual[i] * p->residual[i]) *
                                       p->inverse[i] - (MHE_ROLLED ? 0 : p->dual[i]));
     }
+    mhe_soften_loads(q, rows, target);
     return mhe_solve_direction(e, k);
 }
 
@@ -98,6 +109,7 @@ static real mhe_set_changes(mhe_rows *q, int rows, real target)
             p->dual_change[i] =
                 (target - p->correction[i] - p->dual[i] * change) * p->inverse[i] - p->dual[i];
         }
+        mhe_change_soft(q, rows, side, target);
         for (int i = 0; i < rows; i++) {
             const int s = i % STRANDS;
             const real dual = p->dual[i] + (1 - p->there[i]);
@@ -106,6 +118,7 @@ static real mhe_set_changes(mhe_rows *q, int rows, real target)
         }
     }
     for (int s = 0; s < STRANDS; s++) largest = mhe_max(worst[s], largest);
+    mhe_shorten_soft(q, rows, &largest);
     return 1 / largest;
 }
 
@@ -124,6 +137,7 @@ static real mhe_set_corrections(mhe_rows *q, int rows, real length)
         for (int i = 0; i < rows; i++)
             p->correction[i] = length * length * p->slack_change[i] * p->dual_change[i];
     }
+    after += mhe_correct_soft(q, rows, length);
     return mhe_max(after, 0);
 }
 
@@ -136,7 +150,17 @@ static void mhe_set_places(mhe_rows *q, int rows)
         q->place[i] = BETWEEN;
         if (lower->there[i] != 0 && lower->slack[i] < square * lower->dual[i]) q->place[i] = AT_LOWER;
         if (upper->there[i] != 0 && upper->slack[i] < square * upper->dual[i]) q->place[i] = AT_UPPER;
+        mhe_place_soft(q, i);
     }
+}
+
+/* What becomes of a QP from which rounding keeps the next step. */
+static int mhe_give_up(mhe_rows *q, int rows, real products, real scale)
+{
+    (void)products; (void)scale;
+    if (!mhe_is_nearly_solved(products, scale)) return STOPPED;
+    mhe_set_places(q, rows);
+    return NEARLY;
 }
 
 /* Solve the QP whose limits and terms are in place; `step` is that of the minimiser without
@@ -172,7 +196,8 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         const real products = mhe_set_residuals(q, rows, stiffer, &infeasible);
         stiffer = mhe_max(stiffer, scale / products);
         if (!(stiffer < STIFFNESS)) stiffer = STIFFNESS;
-        const real unbalanced = mhe_unbalanced(e, k, nearest);
+        real unbalanced = mhe_unbalanced(e, k, nearest);
+        mhe_balance_soft(q, rows, &unbalanced);
         if (infeasible <= s->solver_tolerance / 100 &&
             unbalanced <= s->solver_tolerance * s->solver_tolerance * scale &&
             products <= s->solver_tolerance / 1000 * scale) {
@@ -185,9 +210,11 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
             if (infeasible > SMALL && infeasible > SHARE * far) return STOPPED;
             far = infeasible;
         }
-        if (!mhe_factorise_rows(e, k)) return *iterations ? STOPPED : FAILED;
+        if (!mhe_factorise_rows(e, k))
+            return *iterations ? mhe_give_up(q, rows, products, scale) : FAILED;
         for (int corrector = 0; corrector < 2; corrector++) {
-            if (!mhe_set_direction(e, k, target)) return *iterations ? STOPPED : FAILED;
+            if (!mhe_set_direction(e, k, target))
+                return *iterations ? mhe_give_up(q, rows, products, scale) : FAILED;
             mhe_rows_times(e, k, k->direction);
             length = mhe_set_changes(q, rows, target);
             if (corrector) break;
@@ -195,10 +222,10 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
             target = ratio * ratio * ratio * products / (real)sides;
         }
         length *= (real)0.995;
-        if (!(length > 1e-10)) return STOPPED;
+        if (!(length > 1e-10)) return mhe_give_up(q, rows, products, scale);
         for (int j = 0; j < size; j++) k->step[j] += length * k->direction[j];
         for (int i = 0; i < rows; i++)
-            if (q->low[i] == q->high[i])
+            if (mhe_is_equation(q, i))
                 q->force[i] += length * q->weight[i] * (q->missed[i] + q->value[i]);
         for (int side = 0; side < 2; side++) {
             mhe_side *p = q->sides + side;
@@ -207,5 +234,6 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
                 p->dual[i] += length * p->dual_change[i];
             }
         }
+        mhe_move_soft(q, rows, length);
     }
 }

@@ -61,7 +61,7 @@ static void mhe_sigma_points(const mhe_settings *s, const mhe_stage *stage, cons
     }
     for (int k = 0; k < NX; k++) {
         real share = 1;
-        if (MHE_X_SET)
+        if (MHE_X_HARD)
             share = mhe_draw_inside(mhe_x_set_at(s, stage), stage->z, moves + k * NX,
                                     moves + (NX + k) * NX);
         sigma->roots[k] = 1 / (sqrt((real)2) * s->observer.spread * share);

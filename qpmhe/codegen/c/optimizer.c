@@ -51,7 +51,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
     const real before = mhe_best_cost(o), target = mhe_target(o);
     /* Where the cost is infinite, no decrease is negligible. */
     const real negligible = isfinite(before) ? e->settings->tolerance * before : -1;
-    const real promised = fabs(mhe_dot((e->length + 1) * NX, k->gradient, k->step));
+    const real promised = mhe_promised(e, k, o);
     mhe_lower(e, k, o, solved && promised <= negligible);
     if (o->spare->cost < target) {
         const real lowered = before - o->spare->cost;

@@ -3,7 +3,7 @@
 #define CONSTRAINED (MHE_STAGE_ROWS > 0)
 
 /* What becomes of a QP. */
-enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED };
+enum { SOLVED, STOPPED, UNCONSTRAINED, FAILED, EXCLUDED, NEARLY };
 
 typedef struct {
     mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */

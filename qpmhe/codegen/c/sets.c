@@ -101,7 +101,7 @@ static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const re
 /* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
  * differences the rows are of, for rounding. `missed` gets the sides that are, but for
  * components without width in the usual set and other rows that are not dropped. */
-static real mhe_missed(int n, int count, const real *low, const real *high, const real *lower,
+static real mhe_missed(const mhe_settings *s, int first, int n, int count, const real *low, const real *high, const real *lower,
                        const real *upper, const uint8_t *row_fixed, const real *rows,
                        const real *scale, const real *row_scale, const real *sizes,
                        const uint8_t *left_out, uint8_t *missed)
@@ -110,7 +110,7 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
     for (int r = 0; r < n + count; r++) {
         const int side = low[r] > 0 ? MHE_LOWER : high[r] < 0 ? MHE_UPPER : 0;
         if (isnan(low[r]) || isnan(high[r])) return INFINITY;
-        if (!side || (left_out && left_out[r] & side)) continue;
+        if (!side || mhe_is_soft(s, first + r) || (left_out && left_out[r] & side)) continue;
         real size = 0;
         if (r < n)
             size = fabs(sizes[r]);
@@ -123,11 +123,12 @@ static real mhe_missed(int n, int count, const real *low, const real *high, cons
         worst = mhe_max(share, worst);
         if (missed && !fixed && share > MHE_FEASIBLE) missed[r] = (uint8_t)side;
     }
+    (void)s; (void)first;
     return worst;
 }
 
-#define MISSED(set, usual, n, count, low, high, sizes, left_out, missed) \
-    mhe_missed(n, count, low, high, (usual).lower, (usual).upper, (usual).row_fixed, \
+#define MISSED(set, usual, first, n, count, low, high, sizes, left_out, missed) \
+    mhe_missed(s, first, n, count, low, high, (usual).lower, (usual).upper, (usual).row_fixed, \
                (set).rows, (set).scale, (set).row_scale, sizes, left_out, missed)
 
 /* The largest miss of a trial with disturbances w in the rows' scales, without the sides that are
@@ -143,7 +144,7 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const real *
         const mhe_stage *stage = mhe_stage_of_state(e, i);
         mhe_stage_distances(e, i, trial->x, w, trial->v, low, high);
         if (MHE_X_SET) {
-            worst = mhe_max(worst, MISSED(*mhe_x_set_at(s, stage), s->states, NX, MHE_X_ROWS,
+            worst = mhe_max(worst, MISSED(*mhe_x_set_at(s, stage), s->states, W_COUNT + V_COUNT, NX, MHE_X_ROWS,
                                           low + W_COUNT + V_COUNT, high + W_COUNT + V_COUNT,
                                           trial->x + i * NX,
                                           out ? out + W_COUNT + V_COUNT : 0,
@@ -151,11 +152,11 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const real *
             if (i == e->length) break;
         }
         if (MHE_W_SET) {
-            worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), s->disturbances, NX, MHE_W_ROWS,
+            worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), s->disturbances, 0, NX, MHE_W_ROWS,
                                           low, high, trial->x + (i + 1) * NX, out, in));
         }
         if (MHE_V_SET) {
-            worst = mhe_max(worst, MISSED(*mhe_v_set_at(s, stage), s->noises, NY, MHE_V_ROWS,
+            worst = mhe_max(worst, MISSED(*mhe_v_set_at(s, stage), s->noises, W_COUNT, NY, MHE_V_ROWS,
                                           low + W_COUNT, high + W_COUNT, stage->y,
                                           out ? out + W_COUNT : 0, in ? in + W_COUNT : 0));
         }
@@ -169,7 +170,7 @@ static void mhe_keep_equations(const mhe_settings *s, const real *predicted, rea
     const mhe_w_set *set = &s->disturbances;
     if (!MHE_W_SET) return;
     for (int j = 0; j < NX; j++)
-        if (set->lower[j] == set->upper[j]) next[j] = predicted[j] + set->lower[j];
+        if (set->lower[j] == set->upper[j] && !mhe_is_soft(s, j)) next[j] = predicted[j] + set->lower[j];
     mhe_enter_turn(s, next);
 }
 

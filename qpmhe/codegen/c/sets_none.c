@@ -67,3 +67,10 @@ static void mhe_clip_trial(mhe_estimator *e, const mhe_workspace *k, mhe_trial *
 {
     (void)e; (void)k; (void)trial;
 }
+
+/* The decrease of J that the QP promises. */
+static real mhe_promised(const mhe_estimator *e, const mhe_workspace *k, const mhe_outcome *o)
+{
+    (void)o;
+    return fabs(mhe_dot((e->length + 1) * NX, k->gradient, k->step));
+}

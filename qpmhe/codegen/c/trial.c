@@ -26,7 +26,7 @@ static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
     for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - prior[j];
     mhe_wrap_state(s, trial->x, offset);
     cost += factors[0] * mhe_prior_cost(s, k, offset);
-    cost += mhe_further_cost(e, k, trial->x);
+    cost += mhe_further_cost(e, k, trial);
     trial->cost = cost;
     trial->violation = 0;
     if (!(cost >= 0 && isfinite(cost))) { /* below 0 with a weight that is indefinite */

@@ -188,7 +188,9 @@ class Case:
         self.given = dict(self.sets)
         # Of each soft set: the set, its linear and its quadratic penalties.
         self.soft = {}
-        if self.engine == "python" and r.random() < 0.25:
+        w = self.sets["w"]
+        everywhere = self.G is None and (w is None or not len(w.fixed_components))
+        if (self.engine == "python" or everywhere) and r.random() < 0.25:
             self._soften(r)
 
     def _soften(self, r):
