@@ -6,6 +6,9 @@ ARGS ?=
 
 export OMP_NUM_THREADS ?= 1
 
+# Tests start many processes: without bytecode, each of them would compile the package again.
+test test-all test-rest: export PYTHONDONTWRITEBYTECODE =
+
 .PHONY: reproduce test test-all test-rest lint types examples gallery benchmarks comparison choice certificates docs release-check minimal-versions clean
 
 # One stamp for each set of extras, renewed when the project's requirements change.

@@ -378,7 +378,12 @@ def imported(place: str) -> tuple[ModuleType, str]:
 def _files(path: Path) -> list[Path]:
     """A file, first, and those of its folder that it imports, at whatever depth."""
     top = next(one for one in path.parents if not (one / "__init__.py").is_file())
-    finder = ModuleFinder([str(top), str(path.parent)])
+    # These packages import no model: in a checkout of them, they would be read for nothing.
+    others = [
+        one.name for one in _PACKAGES
+        if not (path.is_relative_to(one) or one.is_relative_to(path.parent))
+    ]
+    finder = ModuleFinder([str(top), str(path.parent)], excludes=others)
     *packages, _ = parts = path.relative_to(top).with_suffix("").parts
     for depth in range(1, len(packages) + 1):  # whose own code is not the model's
         package: Any = finder.add_module(".".join(packages[:depth]))

@@ -62,7 +62,7 @@ def test_a_study_runs_once_and_more_cells_are_added(path, handed):
     (environment,) = store.meta()["environments"]
     assert (environment["threads"], "git" in environment) == ("1", True)
     handed.clear()
-    more = run(Study(**{**SMALL, "seeds": 3}), store, progress=out).frame()
+    more = run(Study(**{**SMALL, "seeds": 3}), store, jobs=1, progress=out).frame()
     assert [key[-6:] for key in handed] == ["seed=2"] * 2
     assert "4 of 6 cells were there already" in out.file.getvalue()
     assert list(more["finished"])[:4] == list(frame["finished"])
@@ -80,10 +80,10 @@ def test_a_full_disk_is_reported_and_the_same_call_goes_on(path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(store_module, "_create", small)
         with pytest.raises(StoreError, match="disk is full; all cells that were stored are safe"):
-            run(study, path, progress=False)
+            run(study, path, jobs=1, progress=False)
     before = Store(path).frame()
     assert 0 < len(before) < 40
-    after = run(study, path, progress=False).frame()
+    after = run(study, path, jobs=1, progress=False).frame()
     assert sorted(after["key"]) == sorted(cell.key for cell in study.cells())
     assert list(after["finished"][: len(before)]) == list(before["finished"])
 
@@ -194,7 +194,8 @@ def test_cells_that_fail_or_end_their_process_are_rows_and_can_be_tried_again(pa
 def test_accuracy_and_time_are_measured_apart_and_whole_turns_are_no_errors(path):
     """Two crossings of a heading that wraps are no errors, nor jumps in the figures."""
     options = {"models": ["vehicle"], "backends": ["banded"], "qps": [0, 1], "steps": 100}
-    run(Study(**options, seeds=1, measure="accuracy", covariances=True), path, progress=False)
+    study = Study(**options, seeds=1, measure="accuracy", covariances=True)
+    run(study, path, jobs=1, progress=False)
     store = Store(path)
     frame = store.frame()
     assert frame["times"].isna().all()
