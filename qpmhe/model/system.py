@@ -529,6 +529,7 @@ class System:
         p: int,
         m: int = 0,
         algebraic_guess: ArrayLike,
+        algebraic_set: ConvexSet | SoftSet | None = None,
         method: str = "radau",
         steps: int = 1,
         **options: Unpack[SystemOptions],
@@ -560,6 +561,9 @@ class System:
         algebraic_guess : (k,) array_like
             Where z is looked for, in its units; it picks one of several solutions. Its magnitudes
             are those of z for derivatives by differences.
+        algebraic_set : Box or Polytope, optional
+            A set of z at every sample, hard or soft: nonlinear constraints of x and u, which only
+            the Python step has.
         method : {"radau", "midpoint"}
             As for `from_ode`.
         steps : int
@@ -592,7 +596,7 @@ class System:
         return made_from_dae(
             cls, rate, algebraic, h, dt=dt, n=n, k=k, p=p, m=m,
             how=checked_discretization(method, steps, tuple(COLLOCATIONS)),
-            guess=algebraic_guess, options=options,
+            guess=algebraic_guess, options=options, algebraic_set=algebraic_set,
         )
 
     @classmethod
