@@ -21,6 +21,7 @@ from ..codegen.folders import cache_directory, cache_folders, refusal
 from ..costs import QuadraticCost
 from ..errors import QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.step_length import step_error
 from ..models import catalogue
 from ..observers import Luenberger
 from ..records.record_model import load_record_model
@@ -46,22 +47,31 @@ def doctor(
     for name in ("model", "n", "form", "engine"):
         table.add_column(name, no_wrap=name != "model", overflow="fold")
     table.add_column("because")
+    steps = _plain("Steps of models in continuous time, and their errors in sigma of w")
+    for name in ("model", "method", "substeps", "error", "expected"):
+        steps.add_column(name, no_wrap=name != "model", overflow="fold")
     for model in models or catalogue():
         with console.status(f"trying {escape(model)}"):
-            table.add_row(*_row(model))
+            try:
+                estimator = load_record_model(model).estimator
+            except QpmheError as error:
+                table.add_row(escape(model), "", "", "[red]none[/]", escape(str(error)))
+                continue
+            table.add_row(escape(model), *_row(estimator))
+            if estimator.system.dt is not None:
+                steps.add_row(escape(model), *_step(estimator))
     console.print(table)
+    if steps.row_count:
+        console.print()
+        console.print(steps)
 
 
 def _plain(title: str) -> Table:
     return Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0))
 
 
-def _row(model: str) -> tuple[str, ...]:
-    """Name, size, form, engine and reason of a model."""
-    try:
-        estimator = load_record_model(model).estimator
-    except QpmheError as error:
-        return escape(model), "", "", "[red]none[/]", escape(str(error))
+def _row(estimator: MovingHorizonEstimator) -> tuple[str, ...]:
+    """Size, form, engine and reason of a model."""
     system = estimator.system
     engine, reason = codegen.engine_choice(
         system, estimator.observer, estimator.cost, estimator.settings
@@ -70,7 +80,21 @@ def _row(model: str) -> tuple[str, ...]:
     if system.symbolic is not None:
         form = "CasADi" if system.tracing is None else "traced"
     color = "green" if engine == "compiled" else "default"
-    return escape(model), str(system.n), form, f"[{color}]{engine}[/]", escape(reason)
+    return str(system.n), form, f"[{color}]{engine}[/]", escape(reason)
+
+
+def _step(estimator: MovingHorizonEstimator) -> tuple[str, ...]:
+    """Method, substeps, error and the largest one that does no harm."""
+    system = estimator.system
+    error = step_error(
+        system, estimator.cost, estimator.observer.initial_covariance(), estimator.initial_state,
+        np.zeros(system.m),
+    )
+    found = f"{system.method}", f"{system.steps}"
+    if error is None:
+        return (*found, "unknown", "")
+    color = "yellow" if error.deviations > error.most else "default"
+    return (*found, f"[{color}]{error.deviations:.2g}[/]", f"at most {error.most:g}")
 
 
 def _machine() -> Table:

@@ -40,11 +40,14 @@ class StepError:
         The state in which it is so large.
     point : (n,) array
         Where it is so large.
+    most : float
+        The largest difference that does no harm, for this method.
     """
 
     deviations: float
     component: int
     point: Array
+    most: float
 
 
 class StepComparison:
@@ -112,7 +115,7 @@ class StepComparison:
         k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
         if shares[k, j] < 0.0:
             return None
-        return StepError(float(shares[k, j]), int(j), self._points[k])
+        return StepError(float(shares[k, j]), int(j), self._points[k], self.most)
 
 
 def step_error(

@@ -16,6 +16,8 @@ from qpmhe_solvers.values import shown
 from .._checks import dimension, numbers, positive, vector
 from ..errors import InvalidInputError, ModelError, ShapeError
 from .algebraic import AlgebraicStates
+from .algebraic_set import AlgebraicSet
+from .constraints import checked_constraints
 from .derivatives import Jacobian
 from .discretize import Discretization, of_any_shape
 from .functions import BatchedFunction, Trusted
@@ -24,7 +26,7 @@ from .index import check_index, unsolved
 from .model import Origin
 from .ode import timed_by_input, without_last
 from .points import FEW, Magnitude, Points, points
-from .sets import ConvexSet
+from .sets import ConvexSet, SoftSet
 from .system_arguments import SystemOptions, checked_scales, checked_set, timed_options
 
 if TYPE_CHECKING:
@@ -99,6 +101,7 @@ def made_from_dae(
     cls: type[System], rate: Function | Trusted, algebraic: Function | Trusted,
     h: Function | Trusted, *, dt: float, n: int, k: int, p: int, m: int, how: Discretization,
     guess: ArrayLike, options: SystemOptions,
+    algebraic_set: ConvexSet | SoftSet | None = None,
 ) -> System:
     """The system that `System.from_dae` describes."""
     n, k, m = dimension("n", n, 1), dimension("k", k, 1), dimension("m", m, 0)
@@ -170,7 +173,13 @@ def made_from_dae(
             steps=how.steps, n=change.n, k=k, p=p, m=change.m, algebraic_guess=start, **others,
         )
 
-    return cls.made(
+    checked_set("algebraic_set", algebraic_set, k, ", the number of algebraic states")
+    bounded, own = None, options
+    if algebraic_set is not None:
+        bounded = AlgebraicSet(algebraic_set, solver, m)
+        others = checked_constraints(options.get("constraints"))
+        own = {**options, "constraints": [*others, bounded.constraint]}
+    made = cls.made(
         Trusted(partial(step, length)), Trusted(output),
         Origin(
             dt=length, how=how, rate=joint, equations=equations, jacobians="finite differences",
@@ -178,12 +187,15 @@ def made_from_dae(
             recipe=(cls.from_dae, {
                 "rate": rate, "algebraic": algebraic, "h": h, "dt": dt, "n": n, "k": k, "p": p,
                 "m": m, "method": how.method, "steps": how.steps, "algebraic_guess": start,
-                **options,
+                "algebraic_set": algebraic_set, **options,
             }),
         ),
         n=n, p=p, m=m, f_jacobian=Trusted(partial(slope, length)),
-        h_jacobian=Trusted(output_slope), **options,
+        h_jacobian=Trusted(output_slope), **own,
     )
+    if bounded is not None:
+        bounded.system = made
+    return made
 
 
 def made_from_implicit(

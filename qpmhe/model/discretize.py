@@ -17,6 +17,8 @@ Function = Callable[..., Any]
 #: Explicit methods, which need no Jacobian of the rate, and implicit ones.
 EXPLICIT = ("euler", "rk4")
 METHODS = (*EXPLICIT, *COLLOCATIONS)
+#: Method and substeps are chosen when a system is made: see `qpmhe.model.accuracy`.
+AUTO = "auto"
 
 
 class Discretization(NamedTuple):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
+from .accuracy import Choice
 from .derivatives import Jacobian
 from .discretize import Discretization
 from .evaluation import Evaluator
@@ -174,6 +175,8 @@ class Origin:
         The Jacobian of the rate, where the user gave it.
     equations : Equations, optional
         The functions of a DAE: ``rate`` then is the joint function of states and algebraic states.
+    choice : Choice, optional
+        Which discretisations were tried, where the method was to be chosen.
     sources : dict, optional
         Functions of x and u, named ``f`` and ``h``, which are traced in the place of f and h.
     kernel : ModelKernel, optional
@@ -206,6 +209,7 @@ class Origin:
     rate: BatchedFunction | None = None
     rate_jacobian: Jacobian | None = None
     equations: Equations | None = None
+    choice: Choice | None = None
     sources: dict[str, Callable[[Array, Array], Any]] | None = None
     kernel: ModelKernel | None = None
     jacobians: str = "given"

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import dimension, positive
+from .accuracy import TOLERANCE, TRIED, Choice, choice
 from .derivatives import Jacobian
-from .discretize import Discretization, discretize
+from .discretize import AUTO, Discretization, discretize
 from .functions import BatchedFunction, Trusted
 from .model import Origin
 from .points import FEW, points
@@ -28,7 +29,7 @@ Function = Callable[..., Any]
 def made_from_ode(
     cls: type[System], rate: Function | Trusted, h: Function | Trusted, *, dt: float, n: int,
     p: int, m: int, how: Discretization, rate_jacobian: Function | Trusted | None,
-    h_jacobian: Function | Trusted | None, options: SystemOptions,
+    h_jacobian: Function | Trusted | None, options: SystemOptions, tolerance: float = TOLERANCE,
 ) -> System:
     """The system that `System.from_ode` describes."""
     n, m = dimension("n", n, 1), dimension("m", m, 0)
@@ -40,14 +41,26 @@ def made_from_ode(
         compared = Jacobian(batched, rate_jacobian, m, probes, states)
         given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
     slope = given and _over_leading(given)
-    if how.is_implicit and slope is None:
+    sizes = options.get("scales")
+    scales = None if sizes is None else checked_scales(sizes, n)
+    if (how.is_implicit or how.method == AUTO) and slope is None:
         differences = Jacobian(batched, None, m, probes, states)
-        sizes = options.get("scales")
-        if sizes is not None:  # else steps are shares of 1 and of the states
-            differences.use_scales(checked_scales(sizes, n), None, ())
+        if scales is not None:  # else steps are shares of 1 and of the states
+            differences.use_scales(scales, None, ())
         slope = partial(_of_inputs, differences.batch, m)
-    step, step_jacobian = discretize(_over_leading(batched), slope, how)
-    length = positive("dt", dt)
+    length, over_leading = positive("dt", dt), _over_leading(batched)
+    chosen: Choice | None = None
+    if how.method == AUTO:
+        def stepper(how: Discretization) -> Callable[[Array, Array, Array], Array]:
+            tried = discretize(over_leading, slope, how)[0]
+            return lambda dt, x, u: tried(dt, x, *([u] if m else []))
+
+        chosen = choice(
+            stepper, tuple(TRIED), length, n, m, states, scales, positive("tolerance", tolerance)
+        )
+        how = chosen.how
+    step, step_jacobian = discretize(over_leading, slope if how.is_implicit else (
+        given and _over_leading(given)), how)
 
     def timed(system: System) -> System:
         return cls.made(
@@ -69,7 +82,7 @@ def made_from_ode(
     system = cls.made(
         Trusted(partial(step, length)), h,
         Origin(
-            dt=length, how=how, rate=batched, rate_jacobian=compared,
+            dt=length, how=how, rate=batched, rate_jacobian=compared, choice=chosen,
             make_timed=timed, make_augmented=augmented,
             recipe=(cls.from_ode, {
                 "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": how.method,

@@ -14,11 +14,12 @@ from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import shown
 
 from .._checks import dimension
-from ..errors import InvalidInputError, ModelError
+from ..errors import InvalidInputError, ModelError, OptionError
+from .accuracy import TOLERANCE
 from .constraints import Constraint, ConstraintFunctions, checked_constraints
 from .dae import made_from_dae, made_from_implicit
 from .derivatives import Jacobian
-from .discretize import checked_discretization
+from .discretize import AUTO, METHODS, checked_discretization
 from .functions import BatchedFunction, Trusted
 from .implicit_steps import COLLOCATIONS
 from .model import Model, ModelCache, Origin, check_at
@@ -454,6 +455,7 @@ class System:
         m: int = 0,
         method: str = "rk4",
         steps: int = 1,
+        tolerance: float | None = None,
         rate_jacobian: Function | Trusted | None = None,
         h_jacobian: Function | Trusted | None = None,
         **options: Unpack[SystemOptions],
@@ -472,14 +474,19 @@ class System:
             Sampling time, in the time unit of the rate.
         n, p, m : int
             Numbers of states, outputs and inputs; m is 0 for a system without inputs.
-        method : {"rk4", "euler", "radau", "midpoint"}
+        method : {"rk4", "euler", "radau", "midpoint", "auto"}
             Explicit: Runge-Kutta of order 4, or Euler. Implicit, for stiff rates: Radau IIA of
             order 5, which damps what decays within a step, or the implicit midpoint rule of order
             2, which keeps quadratic invariants. Implicit steps are solved by Newton's method to
             rounding; where that fails, the model fails at this state. Where a step is too long for
             the disturbance's size, the estimator warns; see `qpmhe.MovingHorizonEstimator`.
+            ``"auto"`` chooses between substeps of ``"rk4"`` and of ``"radau"``, once, now;
+            `explain` shows what was tried.
         steps : int
-            Number of substeps of equal length in each sample.
+            Number of substeps of equal length in each sample; left out with ``"auto"``.
+        tolerance : float, optional
+            With ``"auto"``: the largest error of a sample's step, as a share of the states or of
+            their ``scales``, at states of these magnitudes within X; 1e-6 if left out.
         rate_jacobian : callable, optional
             Derivative of the rate with respect to x, (n, n).
         h_jacobian, **options
@@ -488,14 +495,25 @@ class System:
         Raises
         ------
         OptionError
-            If dt is not positive, the method unknown, or steps no integer from 1 on.
+            If dt is not positive, the method unknown, steps no integer from 1 on, or a tolerance is
+            given without ``"auto"``, or steps with it.
         ModelError, SetError
-            As for `System`.
+            As for `System`; also if ``"auto"`` finds no step that is accurate enough.
         """
+        how = checked_discretization(method, steps, (*METHODS, AUTO))
+        if tolerance is not None and method != AUTO:
+            raise OptionError(
+                f"tolerance is {shown(tolerance)}, but method is {method!r}, whose steps are as "
+                "many as steps says; leave it out, or take method='auto'."
+            )
+        if steps != 1 and method == AUTO:
+            raise OptionError(
+                f"steps is {steps}, but method='auto' chooses steps; leave steps out."
+            )
         return made_from_ode(
-            cls, rate, h, dt=dt, n=n, p=p, m=m, how=checked_discretization(method, steps),
-            rate_jacobian=rate_jacobian,
+            cls, rate, h, dt=dt, n=n, p=p, m=m, how=how, rate_jacobian=rate_jacobian,
             h_jacobian=h_jacobian, options=options,
+            tolerance=TOLERANCE if tolerance is None else tolerance,
         )
 
     @classmethod
@@ -511,6 +529,7 @@ class System:
         p: int,
         m: int = 0,
         algebraic_guess: ArrayLike,
+        algebraic_set: ConvexSet | SoftSet | None = None,
         method: str = "radau",
         steps: int = 1,
         **options: Unpack[SystemOptions],
@@ -542,6 +561,9 @@ class System:
         algebraic_guess : (k,) array_like
             Where z is looked for, in its units; it picks one of several solutions. Its magnitudes
             are those of z for derivatives by differences.
+        algebraic_set : Box or Polytope, optional
+            A set of z at every sample, hard or soft: nonlinear constraints of x and u, which only
+            the Python step has.
         method : {"radau", "midpoint"}
             As for `from_ode`.
         steps : int
@@ -574,7 +596,7 @@ class System:
         return made_from_dae(
             cls, rate, algebraic, h, dt=dt, n=n, k=k, p=p, m=m,
             how=checked_discretization(method, steps, tuple(COLLOCATIONS)),
-            guess=algebraic_guess, options=options,
+            guess=algebraic_guess, options=options, algebraic_set=algebraic_set,
         )
 
     @classmethod
@@ -744,6 +766,8 @@ class System:
                 found = (own.trace or self.tracing.now).found[name]
                 text = "traced" if found.function else f"not traced: {found.reason}"
             lines.append(f"{name}: {text}. Jacobian: {_METHODS.get(method, method)}.")
+        if self.origin.choice is not None:
+            lines.append(str(self.origin.choice))
         if own.no_symbolic and self.has_other_steps:
             lines.append(f"No C code: {own.no_symbolic}.")
         return "\n".join(lines)

@@ -140,6 +140,7 @@ def test_doctor_says_what_there_is_and_what_each_model_runs(here, monkeypatch):
         "nothing none model 'nothing' is not known",
     ):
         assert text in output, text
+    assert "Steps of models in continuous time" not in output  # these are maps
     command("compile", "model.py:make")
     text = "model.py:make 2 CasADi compiled its library is in the cache: mhe-"
     assert text in command("doctor", *models)[1]
@@ -148,6 +149,9 @@ def test_doctor_says_what_there_is_and_what_each_model_runs(here, monkeypatch):
     answer = CliRunner().invoke(app, ["doctor", "model.py:make", "cstr"])
     assert "QPMHE_ENGINE" in answer.output
     assert max(map(len, answer.output.splitlines())) <= 80
+    (row,) = [one.split() for one in answer.output.splitlines() if "at most" in one]
+    assert row[:3] == ["cstr", "rk4", "1"]
+    assert 0.0 <= float(row[3]) < 0.1
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell script")

@@ -56,7 +56,7 @@ class Unit:
         return self.get("state")
 
 
-@pytest.mark.parametrize("name", ["reactor with gaps", "inputs converged"])
+@pytest.mark.parametrize("name", ["reactor with gaps", "inputs converged", "algebraic substeps"])
 def test_it_is_the_python_step_from_any_state(name, tmp_path):
     one = case(name)
     reference = one.estimator("python")

@@ -13,7 +13,7 @@ from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import ModelError, OptionError, ShapeError
 from qpmhe.model.implicit_steps import COLLOCATIONS
 
-NONE = np.zeros(0)
+INF, NONE = np.inf, np.zeros(0)
 ENGINES = ["python", pytest.param("compiled", marks=pytest.mark.skipif(
     not find_compiler(), reason="there is no C compiler"))]
 
@@ -448,6 +448,34 @@ def test_estimates_equal_those_of_the_ode_without_the_algebraic_state(engine):
     np.testing.assert_allclose(mine.states, other.states, rtol=0, atol=1e-8)
     np.testing.assert_allclose(mine.costs, other.costs, rtol=1e-8)
     assert (mine.costs <= mine.candidate_costs + 1e-12).all()
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_set_of_algebraic_states_is_a_constraint_of_the_solution(soft):
+    """Against the ODE without the algebraic state, with the same inequality written out."""
+    Y, U = record()
+    penalty = {"linear": 20.0, "quadratic": 5.0}
+    box = Box([-INF], [0.15])
+    constraint = qpmhe.Constraint(
+        lambda x, u: solved_force(x) - 0.15 + 0.0 * u[..., 0], **(penalty if soft else {})
+    )
+    mine = cubic_system(algebraic_set=box.soften(**penalty) if soft else box)
+    other = reduced_system(constraints=[constraint])
+    observer, cost = weights(2, 1)
+    options = {"horizon": 4, "initial_state": [0.5, 0.0], "max_qps": 3, "engine": "python"}
+    free, one, two = (
+        MovingHorizonEstimator(made, observer, cost, **options).run(Y[:10], U[:10])
+        for made in (cubic_system(), mine, other)
+    )
+    np.testing.assert_allclose(one.states, two.states, rtol=0, atol=1e-6)
+    assert np.abs(one.states - free.states).max() > 1e-3
+    with pytest.raises(qpmhe.errors.SetError, match="algebraic_set has dimension 2; expected 1"):
+        cubic_system(algebraic_set=Box([0.0, 0.0], [1.0, 1.0]))
+    if not soft:
+        with pytest.raises(OptionError, match="nonlinear constraints"):
+            MovingHorizonEstimator(
+                mine, observer, cost, **options | {"engine": "compiled"}
+            )
 
 
 @pytest.mark.parametrize("engine", ENGINES)

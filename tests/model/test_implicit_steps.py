@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import qpmhe
-from qpmhe.errors import OptionError
+from qpmhe.errors import ModelError, OptionError
 from qpmhe.model.discretize import METHODS
 from qpmhe.model.implicit_steps import COLLOCATIONS, ImplicitStep
 
@@ -187,6 +187,43 @@ def test_an_iteration_that_fails_is_a_failed_stage(engine):
     failed = mhe.update([2.2], [50.0])
     assert qpmhe.Status.MODEL_FAILED in failed.status
     assert np.isfinite(mhe.update([1.5], [0.0]).state).all()
+
+
+@pytest.mark.parametrize(("rate", "n", "options", "method"), [
+    (pendulum, 2, {"m": 1, "dt": 0.2}, "rk4"),
+    (robertson, 3, {"dt": 1.0, "scales": [1.0, 3e-5, 1.0]}, "radau"),
+])
+def test_auto_chooses_the_cheapest_step_that_is_accurate(rate, n, options, method):
+    made = system(rate, n, method="auto", **options)
+    assert made.method == method
+    other = system(rate, n, method=method, steps=made.steps, **options)
+    x, u = np.array([0.9, 0.4, 0.1])[:n], np.full(options.get("m", 0), 0.2)
+    np.testing.assert_array_equal(made.f(x, u), other.f(x, u))
+    words = made.explain().split("step: ")[1].splitlines()
+    assert words[0].startswith(f"{method} with {made.steps} substep")
+    assert len(words) == 12
+    loose = system(rate, n, method="auto", tolerance=0.1, **options)
+    assert loose.steps < made.steps
+    again = pickle.loads(pickle.dumps(qpmhe.System.from_ode(
+        van_der_pol, np.positive, dt=0.1, n=2, p=2, method="auto", tolerance=1e-3
+    )))
+    assert again.method == "radau"
+
+
+@pytest.mark.parametrize(("options", "error", "words"), [
+    ({"method": "auto", "steps": 2}, OptionError, "method='auto' chooses steps"),
+    ({"tolerance": 1e-3}, OptionError, "tolerance is 0.001, but method is 'rk4'"),
+    ({"method": "auto", "tolerance": 0.0}, OptionError, "tolerance is 0.0"),
+    ({"method": "auto", "tolerance": 1e-16}, ModelError, "no discretisation|no step that it could"),
+])
+def test_bad_arguments_of_auto(options, error, words):
+    with pytest.raises(error, match=words):
+        system(pendulum, 2, 1, dt=0.5, **options)
+
+
+def test_auto_where_the_rate_has_no_value():
+    with pytest.raises(ModelError, match="finds no step that it could compare"):
+        system(lambda x: np.log(x - 100.0), 2, dt=0.5, method="auto")
 
 
 @pytest.mark.parametrize(("options", "words"), [

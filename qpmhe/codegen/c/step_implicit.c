@@ -76,6 +76,7 @@ static real mhe_stage_moves(const mhe_reduced *r, const real *W, const real *siz
                             const real *step, real *moves)
 {
     real length = 0;
+    (void)r; (void)W;
     for (int i = 0; i < MHE_STAGES; i++) {
         for (int a = 0; a < NX; a++) {
             const real moved = (real)fabs(step[i * NX + a]);

@@ -1,0 +1,89 @@
+"""A set of algebraic states, as nonlinear constraints of x and u."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .algebraic import AlgebraicStates
+from .constraints import Constraint
+from .evaluation import Evaluator, VirtualMachine
+from .sets import ConvexSet, SoftSet
+
+if TYPE_CHECKING:
+    from .system import System
+
+Array = NDArray[np.float64]
+
+
+class AlgebraicSet:
+    """The inequalities of a set of z, evaluated at z(x, u).
+
+    Parameters
+    ----------
+    one : ConvexSet or SoftSet
+        The set, with its penalties where it is soft.
+    written : AlgebraicStates
+        Solves the equations as they are written: until `system` is set, and where they cannot be
+        traced.
+    m : int
+        Number of inputs.
+    """
+
+    def __init__(self, one: ConvexSet | SoftSet, written: AlgebraicStates, m: int) -> None:
+        hard = one.convex if isinstance(one, SoftSet) else one
+        matrix = np.vstack((np.eye(hard.dimension), hard.matrix))
+        lower = np.append(hard.lower, hard.row_lower)
+        upper = np.append(hard.upper, hard.row_upper)
+        above, below = np.isfinite(upper), np.isfinite(lower)
+        #: The inequalities ``matrix z <= limit``.
+        self.matrix: Array = np.vstack((matrix[above], -matrix[below]))
+        self.limit: Array = np.append(upper[above], -lower[below])
+        self.penalties: dict[str, Array] = {}
+        if isinstance(one, SoftSet):
+            for name in ("linear", "quadratic"):
+                given = getattr(one, name)
+                self.penalties[name] = np.append(given[above], given[below])
+        self._written, self._m = written, m
+        #: The system, whose trace then solves the equations.
+        self.system: System | None = None
+        self._traced: tuple[Any, AlgebraicStates] | None = None
+
+    @property
+    def constraint(self) -> Constraint:
+        """The inequalities as a constraint of a system."""
+        function: Callable[..., Array] = self._of_state
+        if self._m:
+            function = self._of_both
+        return Constraint(function, len(self.limit), **self.penalties)
+
+    def _of_state(self, x: Array) -> Array:
+        return self._of_both(x, np.empty(0))
+
+    def _of_both(self, x: Array, u: Array) -> Array:
+        states = np.asarray(x, np.float64)[None]  # raises for symbols: a solution is no expression
+        inputs = np.asarray(u, np.float64)[None]
+        z = self._solver().complete(states, inputs)[0, states.shape[1] :]
+        found: Array = self.matrix @ z - self.limit
+        return found
+
+    def _solver(self) -> AlgebraicStates:
+        tracing = None if self.system is None else self.system.tracing
+        if tracing is None:
+            return self._written
+        now = tracing.now
+        if self._traced is None or self._traced[0] is not now:
+            solver, model = self._written, now.model
+            if model is not None:
+                parts = replace(model, n=model.width, guess=(), dt=None, how=None)
+                one = Evaluator(VirtualMachine(parts, False)).one
+                solver = AlgebraicStates(
+                    partial(one, "f"), partial(one, "f_jacobian"), self._written.guess
+                )
+            self._traced = now, solver
+        return self._traced[1]
