@@ -500,7 +500,9 @@ def _row(
                 if not judged.kind and kind:
                     counts["none"] += 1
                     others[f"{model}: none"] -= 1
-                    shown = judge(healthy(model, seed)).likelihood - judged.likelihood
+                    usual = healthy(model, seed)
+                    usual = with_gaps(usual, seed) if given.gaps else usual
+                    shown = judge(usual).likelihood - judged.likelihood
                     is_hidden = len(case.states) == len(healthy(model, seed).states) and (
                         shown < HIDDEN)
                     counts["hidden"] += is_hidden

@@ -58,7 +58,10 @@ def tune(
     horizons: Annotated[
         str | None, typer.Option(help="Horizons to compare afterwards, separated by commas.")
     ] = None,
-    starts: Annotated[int, typer.Option(min=1, help="Starting points of the search.")] = 1,
+    starts: Annotated[
+        int | None, typer.Option(min=1, help="Starting points of the search; 2 if the likelihood "
+                                             "alone is searched, else 1.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the starting points.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Searches to run in parallel.")] = 1,
     engine: options.Engine = None,

@@ -243,7 +243,8 @@ def _words(fault: Fault, names: Names, deviations: Array, outlying: Array) -> di
     grows, count = value > 1.0, round(abs(value))
     return {
         "of": of, "sensors": sensors, "s": "s" * bool(subject),
-        "value": number(value) if fault.is_wrong_unit or kind != "gain" else f"{value:.3g}",
+        "value": f"{value:.3g}" if kind in ("gain", "step") and not fault.is_wrong_unit
+                 else number(value),
         "factor": number(float(f"{max(value, 1.0 / value):.2g}")) if value > 0.0 else "",
         "about": "about" if fault.upper else "a factor of more than",
         "or_more": "" if fault.upper else " or more",

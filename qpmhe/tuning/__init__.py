@@ -2,11 +2,12 @@
 
 from .answer import HorizonScore, Tuning
 from .data import TuningRecord
+from .innovations import Innovations
 from .search import TuningCheckpointError
 from .tune import tune
 from .weights import Weights, WeightsError, load
 
 __all__ = [
-    "HorizonScore", "Tuning", "TuningCheckpointError", "TuningRecord", "Weights", "WeightsError",
-    "load", "tune",
+    "HorizonScore", "Innovations", "Tuning", "TuningCheckpointError", "TuningRecord", "Weights",
+    "WeightsError", "load", "tune",
 ]

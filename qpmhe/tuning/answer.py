@@ -21,6 +21,7 @@ from ..diagnosis.findings import listed
 from ..errors import OptionError
 from ..observers import Observer
 from ..plots.style import STYLES, panels
+from .innovations import innovations_of
 from .likelihood import Likelihood
 from .score import Score
 from .search import NORMAL, limit
@@ -87,6 +88,9 @@ class Tuning:
         What the records do not determine, in words.
     judgement : str
         Whether the search on the estimator's own error was used, and why.
+    innovations : Innovations or None
+        Whether the innovations of the filter with the likeliest weights are white, and of the size
+        that these say: if not, the intervals are too narrow. None where this filter fails.
     seconds : dict
         How long each search took.
     notes : tuple of str
@@ -94,9 +98,9 @@ class Tuning:
     """
 
     def __init__(
-        self, likelihood: Likelihood, score: Score, theta: Array, hessian: Array,
-        refined: Array | None, seconds: dict[str, float], labels: Mapping[str, Sequence[str]],
-        constant: list[int],
+        self, likelihood: Likelihood, score: Score, theta: Array, refined: Array | None,
+        again: tuple[Array, Array], seconds: dict[str, float],
+        labels: Mapping[str, Sequence[str]], constant: list[int],
     ) -> None:
         self._likelihood, self._structure, self._score = likelihood, likelihood.structure, score
         self._data, self._labels, self.seconds = likelihood.data, labels, seconds
@@ -106,15 +110,18 @@ class Tuning:
         every = not any(held for _, _, held in self._blocks)
         self._judges = "all blocks" if every else "held-out blocks"
         self._judged = [one.held | every for one in self._data]
-        self._theta, self.judgement = (
+        judged, self.judgement = (
             (theta, "by the likelihood alone.") if refined is None else self._judge(theta, refined)
         )
-        structure, self._likeliest = self._structure, theta
+        structure, (self._likeliest, hessian) = self._structure, again
+        #: What the held-out blocks have judged, which is not yet tuned on them.
+        self._judged_theta = judged
+        self._theta = self._likeliest if judged is theta else judged
         self.weights = structure.weights(self._theta)
         self.start, self.values, self.likeliest = map(
-            structure.values, (structure.start, self._theta, theta)
+            structure.values, (structure.start, self._theta, self._likeliest)
         )
-        self._find_intervals(theta, hessian)
+        self._find_intervals(self._likeliest, hessian)
         outside = [
             name for name, (low, high) in self.intervals.items()
             if self._theta is refined and not low <= self.values[name] <= high
@@ -129,6 +136,11 @@ class Tuning:
             "it." for j in constant
         ) + ((f"the model failed at some points of the search ({likelihood.failure}), which were "
               "avoided.",) if likelihood.failure else ())
+        likeliest = structure.weights(self._likeliest)
+        self.innovations = innovations_of(
+            likelihood.system(likeliest), likeliest, self._data, labels["noise"])
+        if self.innovations is not None:
+            self.notes += tuple(self.innovations.notes(likeliest.threshold))
 
     @property
     def prior(self) -> Array:
@@ -152,7 +164,7 @@ class Tuning:
 
     @property
     def cost_per_sample(self) -> float:
-        """The negative log likelihood per sample at ``likeliest``, of the blocks that tune.
+        """The negative log likelihood per sample at ``likeliest``, of all blocks.
 
         Of several starts or models for the same records, the one with the least cost is the
         likeliest.
@@ -305,17 +317,17 @@ class Tuning:
         """(before, after) on the blocks held out, or on all if none are.
 
         The negative log likelihood per sample, and root mean square errors in units of output or
-        state.
+        state. Those after are of the weights before the last search, which uses these blocks, too.
         """
         structure, ahead = self._structure, self._score.ahead
         samples = sum(int(mask.sum()) for mask in self._judged)
         before, after = (
             self._likelihood.value(at, self._judged) / samples
-            for at in (structure.start, self._theta)
+            for at in (structure.start, self._judged_theta)
         )
         found = {"negative log likelihood per sample": (before, after)}
         sizes = []
-        for weights in (structure.first, self.weights):
+        for weights in (structure.first, structure.weights(self._judged_theta)):
             errors = self._score.errors(weights)
             every = np.concatenate(
                 [one[mask] for one, mask in zip(errors, self._judged, strict=True)]
@@ -387,7 +399,8 @@ class Tuning:
             console.print(_table(heading, ["", "before", "after", *last], rows))
             console.print()
         for text in (
-            f"Chosen {self.judgement}", *(f"Not identified: {one}" for one in self.unidentified),
+            f"Chosen {self.judgement}", *([self.innovations.text] if self.innovations else []),
+            *(f"Not identified: {one}" for one in self.unidentified),
             *(f"Note: {one}" for one in self.notes),
         ):
             console.print(text, highlight=False, markup=False)
@@ -459,7 +472,7 @@ class Tuning:
 
         means = np.array([
             self._block_means(self._score.samples(weights))
-            for weights in (self._structure.first, self.weights)
+            for weights in (self._structure.first, self._structure.weights(self._judged_theta))
         ])
         shown = np.isfinite(means[0])
         held = np.array([held for _, _, held in self._blocks])[shown]

@@ -56,6 +56,10 @@ class Likelihood:
         #: The first thing that a model has raised far from the start; blank if none did.
         self.failure = ""
 
+    def system(self, weights: Weights) -> System:
+        """The system with the parameters of these weights."""
+        return self._make(weights.parameters)
+
     def value(self, theta: Array, chosen: list[Mask] | None = None) -> float:
         """The value at theta, over each record's chosen samples; infinite where the model fails."""
         return float(self._values([self.structure.weights(theta)], chosen or self.tuned)[0])

@@ -208,6 +208,18 @@ def polish(likelihood: Likelihood, theta: Array) -> tuple[Array, Array]:
     return theta, H
 
 
+def refit(likelihood: Likelihood, theta: Array, hessian: Array) -> tuple[Array, Array]:
+    """The minimum near theta over all samples, also those that have judged; and the Hessian there.
+
+    From here on, the likelihood is that of all samples.
+    """
+    every = [np.ones_like(mask) for mask in likelihood.tuned]
+    if all(mask.all() for mask in likelihood.tuned):
+        return theta, hessian
+    likelihood.tuned = every
+    return polish(likelihood, search_likelihood(likelihood, theta, lambda *_: None)[0])
+
+
 def limit(
     likelihood: Likelihood, theta: Array, hessian: Array, k: int, sign: float
 ) -> float | None:

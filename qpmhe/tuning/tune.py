@@ -24,7 +24,7 @@ from .answer import Tuning
 from .data import Data, check_enough, checked_data, constant_inputs, hold_out
 from .likelihood import Likelihood
 from .score import Score
-from .search import SearchProgress, identity_of, polish, refine, search_all
+from .search import SearchProgress, identity_of, polish, refine, refit, search_all
 from .structures import Structure, checked_start
 from .weights import ARRIVALS, Weights
 
@@ -57,7 +57,7 @@ def tune(
     ahead: int = 5,
     held_out: float = 0.25,
     names: Mapping[str, Sequence[str]] | None = None,
-    starts: int = 1,
+    starts: int | None = None,
     seed: int = 0,
     jobs: int = 1,
     checkpoint: str | Path | None = None,
@@ -72,6 +72,8 @@ def tune(
     records have the truth; what this hardly depends on, as a factor of all covariances, stays as
     likely as it was. Some blocks of the records are held out of both; they judge: the second
     search must improve on them by two standard errors, and the start stays if it is better by one.
+    Once they have judged, the likelihood is maximised once more over all blocks: that gives the
+    weights, where the likelihood was chosen, and the intervals. The scores are those before that.
 
     Parameters
     ----------
@@ -117,9 +119,11 @@ def tune(
         Share of the blocks that judge; 0 for none.
     names : dict, optional
         Names of ``"states"`` and ``"outputs"``.
-    starts, seed : int
-        Number of starts of the search, the first one at the covariances given, and the seed of
-        the others.
+    starts : int, optional
+        Number of starts of the search, the first one at the covariances given; if left out, 2 with
+        ``objective="likelihood"``, else 1.
+    seed : int
+        Of the other starts.
     jobs : int
         Processes for several starts.
     checkpoint : str or Path, optional
@@ -156,7 +160,8 @@ def tune(
     choice("objective", objective, _OBJECTIVES)
     choice("arrival", arrival, ARRIVALS)
     for name, value in (
-        ("horizon", horizon), ("ahead", ahead), ("starts", starts), ("jobs", jobs)
+        ("horizon", horizon), ("ahead", ahead), ("starts", 1 if starts is None else starts),
+        ("jobs", jobs),
     ):
         dimension(name, value, 1)
     count("seed", seed, 0)
@@ -177,6 +182,8 @@ def tune(
     check_enough(data, plan.names, noises)
     constant, objective = constant_inputs(data, bool(started)), _aim(objective, data)
     options = {"max_qps": 2, **options}
+    if starts is None:  # a further one costs little where the filter alone is searched
+        starts = 2 if objective == "likelihood" else 1
     likelihood = Likelihood(plan, data, make, remade, judged)
     at_start = _likelihood_at_start(likelihood)
     score = Score(
@@ -198,7 +205,9 @@ def tune(
         if objective != "likelihood":
             refined = refine(score, likelihood, found, kept, advance)
             seconds["estimator"] = perf_counter() - began - seconds["likelihood"]
-        tuning = Tuning(likelihood, score, found, hessian, refined, seconds, labels, constant)
+        advance("all blocks")
+        again = refit(likelihood, found, hessian)
+        tuning = Tuning(likelihood, score, found, refined, again, seconds, labels, constant)
     kept.remove()
     return tuning
 

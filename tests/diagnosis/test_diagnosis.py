@@ -319,6 +319,40 @@ def test_filters_of_sensors_with_memory_are_filters_of_the_augmented_system():
     assert rivals.run(tried).likelihoods == pytest.approx(expected, rel=1e-9)
 
 
+def test_rows_that_are_missing_or_twice_and_noise_that_changes_against_the_whole_record():
+    generator, total = np.random.default_rng(5), 40
+    y = generator.standard_normal((total, 2))
+    system = qpmhe.System(lambda x: x @ SPRING.T, lambda x: x, n=2, p=2)
+    bank, nothing = FilterBank(system, None), np.zeros((total, 0))
+
+    def base(rows, **changes):
+        given = {"noise": np.diag([0.3, 0.5]), "disturbance": np.diag([0.1, 0.2])}
+        return Hypothesis(
+            rows, nothing[: len(rows)], start=np.zeros(2), prior=np.eye(2), **given | changes)
+
+    gone = y.copy()
+    gone[[9, 10, 25]] = np.nan
+    kept = np.delete(y, [9, 10, 25], axis=0)
+    repeats = np.ones(len(kept), int)
+    repeats[[8, 22]] = 3, 2
+    whole, short = bank.run([base(gone)]), bank.run([base(kept, repeats=repeats)])
+    assert short.likelihoods == pytest.approx(whole.likelihoods, rel=1e-10)
+    again = np.insert(y, 7, np.nan, axis=0)
+    nothing, repeats = np.zeros((total + 1, 0)), np.ones(total + 1, int)
+    repeats[6] = 0
+    twice = bank.run([base(again, repeats=repeats)])
+    assert twice.likelihoods == pytest.approx(bank.run([base(y)]).likelihoods, rel=1e-10)
+    same = bank.run([base(y), base(y, noise=np.tile(np.diag([0.3, 0.5]), (total, 1, 1)))])
+    assert same.likelihoods[1] == pytest.approx(same.likelihoods[0], rel=1e-12)
+    # No measurement is one of infinite variance.
+    wide = np.tile(np.diag([0.3, 0.5]), (total, 1, 1))
+    wide[20:, 1] *= 1e12
+    half = y.copy()
+    half[20:, 1] = np.nan
+    found = bank.run([base(y, noise=wide)]), bank.run([base(half)])
+    assert found[0].corrected == pytest.approx(found[1].corrected, rel=1e-8)
+
+
 def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_noted():
     system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
     y = 0.5 * np.round(3.0 * 0.8 ** np.arange(100) / 0.5)

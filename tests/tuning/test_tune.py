@@ -242,6 +242,34 @@ def test_outliers_tune_little_where_a_threshold_or_the_observer_doubts_them(rule
     assert isinstance(tuning.cost(), qpmhe.RobustCost) == (rule == "threshold")
 
 
+def test_innovations_that_are_not_white_or_outlying_are_told():
+    (y, u), generator = simulated(5, 400), np.random.default_rng(6)
+    plain = tuned([(y, u)], structure="scalar")
+    assert not plain.notes
+    low, high = plain.innovations.nis_limits
+    assert low < plain.innovations.nis < high
+    assert f"mean NIS is {plain.innovations.nis:.3g}" in " ".join(str(plain).split())
+    hit = generator.random(y.shape) < 0.03
+    (note,) = tuned([(y + 10.0 * hit, u)], structure="scalar").notes
+    assert note.startswith("there are outliers, ")
+    assert note.endswith("tune with threshold=1.5.")
+    assert not tuned([(y + 10.0 * hit, u)], structure="scalar", threshold=1.5).notes
+    other = simulated(5, 400, f=lambda x, u: line(x, u) + 1.0)[0]  # a bias that the model lacks
+    notes = tuned([(other, u)], structure="scalar").notes
+    assert any(one.startswith("the intervals are too narrow: the innovations of y1 are not white")
+               for one in notes)
+
+
+def test_weights_and_intervals_are_of_all_blocks_once_some_have_judged():
+    record = simulated(7, 300)
+    some, every = tuned([record], structure="scalar"), tuned(
+        [record], structure="scalar", held_out=0.0)
+    for name, value in every.values.items():
+        assert some.values[name] == pytest.approx(value, rel=1e-3)
+        assert some.intervals[name] == pytest.approx(every.intervals[name], rel=2e-2)
+    assert some.cost_per_sample == pytest.approx(every.cost_per_sample, rel=1e-6)
+
+
 def test_parameters_of_a_model():
     record = simulated(1, 400, f=make(0.9).f, noise=(0.1, 0.1, 0.3), m=2)
     structure = {"disturbance": {"x1": [0]}, "noise": "scalar"}
