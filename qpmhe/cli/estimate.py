@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +19,7 @@ from . import options
 from .values import read_box, read_numbers, read_state, with_arguments
 
 if TYPE_CHECKING:
+    from ..records import Latency
     from ..records.bounds import BoundOptions
 
 
@@ -24,10 +28,10 @@ def estimate(
     model: options.Model,
     record: Annotated[
         str,
-        typer.Argument(help=f"{options.KINDS}, with times; - is CSV on standard input."),
+        typer.Argument(help=f"{options.KINDS}, with times; - is standard input."),
     ],
     out: Annotated[
-        str, typer.Option(help="File to write, .csv or .parquet; - is standard output.")
+        str, typer.Option(help="File to write, .csv, .parquet or .jsonl; - is standard output.")
     ] = "-",
     horizon: options.Horizon = None,
     backend: Annotated[str | None, typer.Option(help="QP backend.")] = None,
@@ -90,6 +94,18 @@ def estimate(
         bool,
         typer.Option("--equal-steps", help="Require equal steps; each row is written at once."),
     ] = False,
+    format: Annotated[  # noqa: A002
+        Literal["auto", "csv", "jsonl"],
+        typer.Option(help="Lines on standard input and output: CSV, or JSON objects."),
+    ] = "auto",
+    latency: Annotated[
+        bool,
+        typer.Option("--latency", help="Report the time from a line in to a line out, at the end "
+                                       "and on the signal USR1."),
+    ] = False,
+    deadline: Annotated[
+        float | None, typer.Option(help="For --latency: seconds after which a line is late.")
+    ] = None,
     diagnose: Annotated[
         str | None,
         typer.Option(metavar="FILE.html", help="Look for faults of sensors, model and weights, "
@@ -116,6 +132,11 @@ def estimate(
         given["bound"] = bound_options(**bounds)
     if weights is not None:
         given = _weighted(given)
+    given.pop("deadline", None)
+    if given.pop("latency") or deadline is not None:
+        from ..records import Latency
+
+        given["latency"] = Latency(deadline)
     run(Console(stderr=True), **given)
 
 
@@ -172,7 +193,7 @@ def _weighted(given: dict[str, Any]) -> dict[str, Any]:
 
 def run(
     console: Console, model: str, record: str, out: str, *, diagnose: str | None = None,
-    quiet: bool = False, **options: Any,
+    quiet: bool = False, latency: Latency | None = None, **options: Any,
 ) -> None:
     """Call `qpmhe.records.estimate_record` with the options, and print what happened."""
     from ..records import estimate_record
@@ -183,14 +204,14 @@ def run(
     # A bar would stand among the rows.
     mixed = out == "-" and sys.stdout is not None and sys.stdout.isatty()
     try:
-        with Progress(
+        with _reported(console, latency), Progress(
             TextColumn("estimating"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
             console=console, transient=True, redirect_stdout=False,  # it holds the rows
             disable=quiet or mixed or not console.is_terminal,
         ) as bar:
             task = bar.add_task("", total=None)
             summary = estimate_record(
-                model, record, out, keep_run=diagnose is not None, **options,
+                model, record, out, keep_run=diagnose is not None, latency=latency, **options,
                 progress=lambda done, total: bar.update(task, completed=done, total=total),
                 report=None if quiet else lambda text: _warn(console, text),
             )
@@ -210,6 +231,26 @@ def run(
         _warn(console, summary.failure)
     if is_broken:
         raise SystemExit(3)
+
+
+@contextmanager
+def _reported(console: Console, latency: Latency | None) -> Iterator[None]:
+    """Print the latency at the end, however that comes, and on a signal."""
+    if latency is None:
+        yield
+        return
+
+    def show(*_: Any) -> None:
+        console.print(str(latency), highlight=False, soft_wrap=True)
+
+    number = getattr(signal, "SIGUSR1", None)  # Windows has none
+    before = None if number is None else signal.signal(number, show)
+    try:
+        yield
+    finally:
+        if number is not None:
+            signal.signal(number, before)
+        show()
 
 
 def _check_page(path: str) -> None:

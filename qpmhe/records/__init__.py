@@ -2,7 +2,10 @@
 
 from .checkpoints import CheckpointError, WriteError
 from .frame import read
+from .latency import Latency
 from .session import Summary, estimate_record
 from .tables import RecordError
 
-__all__ = ["CheckpointError", "RecordError", "Summary", "WriteError", "estimate_record", "read"]
+__all__ = [
+    "CheckpointError", "Latency", "RecordError", "Summary", "WriteError", "estimate_record", "read",
+]

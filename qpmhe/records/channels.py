@@ -74,15 +74,20 @@ class ChannelTable(Table):
     """
 
     unit = "sample"
+    has_clocks = True
 
     def __init__(self, name: str, channels: Channels, tolerance: float | None = None) -> None:
         super().__init__(name)
         self._channels, self._tolerance = channels, tolerance
         self.header = [channels.time, *channels.names]
-        self.units = ["", *channels.units]
         self.close, self.hint, self.notes = channels.close, channels.hint, channels.notes
         self._chosen = list(range(len(channels.names)))
         self._held: list[int] = []
+
+    @property
+    def units(self) -> list[str]:
+        """Units of the time and of the channels; blank where the file does not say."""
+        return ["", *(self._channels.units[i] for i in self._chosen)]
 
     def select(self, columns: Sequence[int], held: Sequence[int]) -> dict[int, int]:
         """Read these columns alone."""

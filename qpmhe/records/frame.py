@@ -23,10 +23,10 @@ def read(
 ) -> DataFrame:
     """Read a file of measurements of any kind that qpmhe knows.
 
-    CSV, gzip of it and Parquet have one row for each time. The channels of other files have clocks
-    of their own; a row of the frame then has the values of all channels at one time, NaN where a
-    channel has none: nothing is interpolated, so held inputs are ``frame[inputs].ffill()``. By the
-    end of the name:
+    CSV, JSON lines (.jsonl), gzip of both and Parquet have one row for each time. The channels of
+    other files have clocks of their own; a row of the frame then has the values of all channels at
+    one time, NaN where a channel has none: nothing is interpolated, so held inputs are
+    ``frame[inputs].ffill()``. By the end of the name:
 
     ====================== ======================================= ===========================
     .mf4, .mdf             MDF of measurement systems              ``pip install 'qpmhe[mf4]'``

@@ -9,6 +9,7 @@ from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from difflib import SequenceMatcher
+from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -27,8 +28,8 @@ _TIME_UNITS = frozenset((
 _KINDS = {
     "outputs": ("y", "output"), "inputs": ("u", "input"), "truth": ("x", "true state"),
 }
-# "Voltage (V)", "Voltage [V]", "Voltage / V"
-_UNIT = re.compile(r"\s*(\([^()]*\)|\[[^\[\]]*\]|/\s*\S+)$")
+# "Voltage (V)", "Voltage [V]", "Voltage / V", but "Voltage[0]"
+_UNIT = re.compile(r"\s*(\([^()]*\)|\[(?!\d+\])[^\[\]]*\]|/\s*\S+)$")
 _TIME, _NAME_TIME = "the time", "name it with --time COLUMN."
 # An error shows so many names, and so much of each.
 _NAMES_SHOWN, _LETTERS_SHOWN = 40, 60
@@ -45,7 +46,7 @@ class Measurement:
     """One sample: y is NaN where it is missing, u holds its last value there.
 
     `complete` says that no later line of the record can change it or its step; `line` is 0 if it
-    comes from a checkpoint.
+    comes from a checkpoint; `arrived` is the time of `perf_counter` at which its line came in.
     """
 
     line: int
@@ -53,6 +54,7 @@ class Measurement:
     y: Array
     u: Array
     complete: bool = True
+    arrived: float = 0.0
 
 
 class RecordReader:
@@ -66,7 +68,7 @@ class RecordReader:
         self, path: str, names: ColumnFinder, *, separator: str | None = None,
         encoding: str = "utf-8", decimal: str = "auto", missing: Sequence[str] = (),
         skip_repeated: bool = False, skip_lines: int = 0, time_format: str | None = None,
-        same_time: float | None = None, log_time: bool = False,
+        same_time: float | None = None, log_time: bool = False, format: str = "auto",  # noqa: A002
     ) -> None:
         self.is_stream = path == "-"
         self.held = self.repeated = self.blank = 0
@@ -75,7 +77,7 @@ class RecordReader:
         self._reader = FieldReader(decimal, missing, time_format)
         self._table = table = open_table(
             path, separator, encoding, count("--skip-lines", skip_lines, 0), time=names.time,
-            same_time=same_time, log_time=log_time,
+            same_time=same_time, log_time=log_time, kind=format,
         )
         self.name, self.total = table.name, table.total
         try:
@@ -157,7 +159,9 @@ class RecordReader:
                 )
             u[missing] = held[missing]
             self.held += int(missing.sum())
-        return Measurement(row.line, time, y, u, row.ended)
+        return Measurement(
+            row.line, time, y, u, row.ended, self._table.arrived or perf_counter()
+        )
 
     def value(self, row: TableRow, position: int, read: Any) -> Any:
         """A field of a row, read; a `RecordError` where it cannot be."""
@@ -286,17 +290,20 @@ class Header:
     """The names of a table's columns, and which of them is meant."""
 
     def __init__(self, table: Table) -> None:
-        self.names = [name.strip() for name in table.header]
+        self._table = table
         self._file, self._line = table.name, table.header_line
-        self._has_channels = table.units is not None
-        lower = [name.lower() for name in self.names]
-        #: Without units, which files with channels have apart from the names.
-        self._bare = lower if self._has_channels else [_UNIT.sub("", name) for name in lower]
-        self._lower = lower
+        self._look()
+
+    def _look(self) -> None:
+        self.names = [name.strip() for name in self._table.header]
+        self._lower = [name.lower() for name in self.names]
+        self._is_plain = self._table.units is not None
+        self._bare = self._lower if self._is_plain else [
+            _UNIT.sub("", name) for name in self._lower]
 
     def time(self, given: str | None, taken: Sequence[int], option: str = "outputs") -> int:
         """The column of the time: the given one, or one with a usual name."""
-        if self._has_channels:  # which have their times
+        if self._table.has_clocks:
             return 0
         if given is None:
             return self._usual_time(taken)
@@ -331,9 +338,9 @@ class Header:
     ) -> int:
         """The column of the first of these names; case does not matter, nor a unit behind it.
 
-        Of a channel, the last part of its name will do. Columns in `others` are something else.
+        Of names that are paths, the last part will do. Columns in `others` are something else.
         """
-        if self._has_channels:
+        if self._table.has_clocks:
             others = (0,)
         for name in wanted:
             small = name.lower()
@@ -347,8 +354,13 @@ class Header:
                     f"{len(found)} columns could all be {what}: {same}; rename all but one, "
                     f"or {remedy}", self._file, self._line,
                 )
+        # Of several usual names nobody knows which one will come.
+        later = self._table.expect(wanted[0]) if len(wanted) == 1 and what != _TIME else None
+        if later is not None:
+            self._look()
+            return later
         tried = ", ".join(map(repr, dict.fromkeys(wanted)))
-        names = self.names[self._has_channels:]
+        names = self.names[self._table.has_clocks:]
         more = len(names) - _NAMES_SHOWN
         nearest = ""
         if more > 0:
@@ -374,7 +386,7 @@ class Header:
             found = [i for i, each in enumerate(names) if each == one and i not in others]
             if found:
                 return found
-        if not self._has_channels:
+        if not self._is_plain:
             return []
         ends = (f".{small}", f"/{small}")
         return [i for i, each in enumerate(self._lower) if each.endswith(ends) and i not in others]

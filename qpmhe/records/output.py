@@ -6,7 +6,9 @@ import contextlib
 import csv
 import ctypes
 import hashlib
+import json
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,12 +21,15 @@ from ..errors import InvalidInputError, OptionError
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from .checkpoints import CheckpointError, WriteError
+from .readers import is_json
 
 if TYPE_CHECKING:
     from .bounds import RowBounds
 
 _COVARIANCES = ("none", "std", "full")
 _PIECE = 1 << 20
+_JSON_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?")
+_NO_JSON = frozenset(("", "inf", "-inf", "nan"))
 _STANDARD_OUTPUT = 1  # the number of its file descriptor
 
 
@@ -90,6 +95,48 @@ class _Echo:
         return text
 
 
+class _CsvLines:
+    """Rows as lines of a CSV file, whose first line has the names."""
+
+    has_header = True
+
+    def __init__(self) -> None:
+        self._writer: Any = csv.writer(cast(Any, _Echo()), lineterminator="\n")
+
+    def header(self, names: Sequence[str]) -> str:
+        return self.line(names)
+
+    def line(self, fields: Sequence[str]) -> str:
+        return str(self._writer.writerow(fields))
+
+    def time(self, line: str) -> str:
+        return next(csv.reader([line]))[0]
+
+
+class _JsonLines:
+    """Rows as JSON objects; blank fields, and those that JSON has no number for, are null."""
+
+    has_header = False
+
+    def header(self, names: Sequence[str]) -> str:
+        self._names = [json.dumps(name) for name in names]
+        return ""
+
+    def line(self, fields: Sequence[str]) -> str:
+        values = map(self._value, fields)
+        pairs = (f"{name}: {value}" for name, value in zip(self._names, values, strict=True))
+        return f"{{{', '.join(pairs)}}}\n"
+
+    def time(self, line: str) -> str:
+        return str(json.loads(line, parse_float=str, parse_int=str)["time"])
+
+    @staticmethod
+    def _value(text: str) -> str:
+        if text in _NO_JSON:
+            return "null"
+        return text if _JSON_NUMBER.fullmatch(text) else json.dumps(text)
+
+
 class Output:
     """Rows to a file or standard output, each written whole and at once.
 
@@ -98,23 +145,23 @@ class Output:
     standard output both and `checkpoint` are None. `offset` counts the bytes of the results.
     """
 
-    def __init__(self, out: str | Path) -> None:
+    def __init__(self, out: str | Path, kind: str = "auto") -> None:
         self.path: Path | None = None
         self.target: Path | None = None
         self.checkpoint: Path | None = None
         self.offset = 0
         self._stream: BinaryIO | None = None
         self._hash = hashlib.sha256()
-        self._rows: Any = csv.writer(cast(Any, _Echo()), lineterminator="\n")
+        self._lines = _JsonLines() if is_json(str(out), kind) else _CsvLines()
         if str(out) == "-":
             if sys.stdout is None:
                 raise OptionError("standard output is closed; name a file with --out.")
             return
         self.path = self.target = path = Path(out)
-        if path.suffix not in (".csv", ".parquet"):
+        if path.suffix not in (".csv", ".parquet", ".jsonl"):
             raise OptionError(
-                f"--out is {str(out)!r}; expected a name in .csv or .parquet, or - for standard "
-                "output."
+                f"--out is {str(out)!r}; expected a name in .csv, .parquet or .jsonl, or - for "
+                "standard output."
             )
         if path.suffix == ".parquet":
             need("pyarrow", "a Parquet file")
@@ -136,6 +183,10 @@ class Output:
     def use(self, stream: BinaryIO) -> None:
         """Write to this stream, which leads to standard output."""
         self._stream = stream
+
+    def name_columns(self, names: Sequence[str]) -> str:
+        """Say what each field of a row is; the line to write at the beginning, if there is one."""
+        return self._lines.header(names)
 
     def begin(self) -> None:
         """Open a new file, and remove its old checkpoint."""
@@ -180,18 +231,22 @@ class Output:
         try:
             with self.path.open("rb") as file:
                 file.seek(offset)
-                if offset == 0:
-                    file.readline()  # the header
+                if offset == 0 and self._lines.has_header:
+                    file.readline()
                 lines = [file.readline().decode() for _ in range(2)]
         except OSError:  # opening it to write reports the error
             return []
-        return [next(csv.reader([line]))[0] for line in lines if line.endswith("\n")]
+        return [self._lines.time(line) for line in lines if line.endswith("\n")]
 
     def write(self, fields: Sequence[str]) -> None:
         """Write a row at once; if that fails, the file still ends with a whole row."""
+        self.write_line(self._lines.line(fields))
+
+    def write_line(self, text: str) -> None:
+        """Write a line likewise."""
         stream = self._stream
         assert stream is not None
-        line = self._rows.writerow(fields).encode()
+        line = text.encode()
         try:
             done = 0
             while done < len(line):

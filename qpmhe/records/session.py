@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from time import monotonic
+from time import monotonic, perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..estimation.run import Run
 from ..estimation.steps import MAX_GAP, Step, Steps
 from .checkpoints import Checkpoint, CheckpointError, WriteError, load, plain, save, versions
 from .kept_run import KeptRun
+from .latency import Latency
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
 from .record_model import RecordModel, load_record_model
@@ -108,6 +109,8 @@ def estimate_record(
     skip_repeated: bool = False,
     same_time: float | None = None,
     log_time: bool = False,
+    format: str = "auto",  # noqa: A002
+    latency: Latency | None = None,
     covariances: str = "none",
     step_time: bool = True,
     bound: BoundOptions | bool = False,
@@ -133,7 +136,7 @@ def estimate_record(
         Name in the catalogue, ``package.module:function`` or ``path/file.py:function``.
     record, out : str or Path
         A file that `qpmhe.records.read` reads, ``-`` is CSV on standard input; and a new file in
-        .csv or .parquet, ``-`` is standard output.
+        .csv, .parquet or .jsonl, ``-`` is standard output.
     time, outputs, inputs : str, optional
         Columns of the time, numbers or ISO dates (whose differences count in seconds), and of y
         and u, as ``y1=column,y2=column``, or columns in order.
@@ -153,6 +156,11 @@ def estimate_record(
         repeats the line before.
     same_time, log_time : float, bool
         As for `qpmhe.records.read`, where channels have clocks of their own.
+    format : {"auto", "csv", "jsonl"}
+        Lines on standard input and output: CSV, or a JSON object each. In JSON, a column that is
+        named may be missing in any line, the first one included; it is missing there.
+    latency : Latency, optional
+        Counts the times from a line in to its line out, on the way.
     max_gap : int, optional
         Largest number of samples without measurement in a row, 500 by default.
     covariances, step_time : {"none", "std", "full"}, bool
@@ -191,7 +199,7 @@ def estimate_record(
     InvalidInputError
         If model, options or files do not fit, or a file exists already.
     """
-    output = Output(out)
+    output = Output(out, format)
     _check_files(str(record), output)
     found = _found(output, resume, overwrite)
     every = found.every if found is not None else _EVERY
@@ -214,6 +222,7 @@ def estimate_record(
             separator=separator, decimal=decimal, encoding=encoding, skip_repeated=skip_repeated,
             missing=(missing,) if isinstance(missing, str) else missing, skip_lines=skip_lines,
             time_format=time_format, same_time=same_time, log_time=log_time,
+            format=format,
         )
         stack.callback(reader.close)
         identity = plain(loaded.identity | {
@@ -224,6 +233,7 @@ def estimate_record(
         session = _Session(
             loaded, rows, steps, reader, output, Checkpoint(identity, every), bounds,
             seconds=checkpoint_seconds, report=report, progress=progress, keep=keep_run,
+            latency=latency,
         )
         return session.run(found)
 
@@ -293,8 +303,9 @@ class _Session:
         self, model: RecordModel, rows: RowFormat, steps: Steps, reader: RecordReader,
         output: Output, checkpoint: Checkpoint, bounds: RowBounds | None, *, seconds: float,
         report: Callable[[str], None] | None, progress: Callable[[int, int | None], None] | None,
-        keep: bool,
+        keep: bool, latency: Latency | None,
     ) -> None:
+        self._latency, self._header = latency, output.name_columns(rows.header)
         self._model, self._keep = model, keep
         self._kept: KeptRun | None = None
         self._mhe, self._rows, self._steps = model.estimator, rows, steps
@@ -336,7 +347,7 @@ class _Session:
         self._output.begin()
         try:
             self._save()  # no row is in the file without a checkpoint beside it
-            self._output.write(self._rows.header)
+            self._output.write_line(self._header)
         except WriteError as error:
             raise WriteError(f"{error} Make room, or name another place with --out.") from error
         return self._reader.samples(), None
@@ -498,6 +509,8 @@ class _Session:
         self._output.write(
             self._rows.row(sample.time.text, estimate, self._mhe, self._inserted)
         )
+        if self._latency is not None:
+            self._latency.add(perf_counter() - sample.arrived)
         summary = self._summary
         summary.samples += 1
         summary.improved += estimate.improved

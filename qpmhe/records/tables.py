@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from itertools import chain, islice
+from time import perf_counter
 from typing import Any, BinaryIO, NamedTuple
 
 from .._checks import need
@@ -48,7 +50,8 @@ class Table:
     """What all tables share: a header, and rows below it.
 
     ``unit`` says what a row is called, ``hint`` what an error about the columns adds, ``notes``
-    what the user should know of the file once it is read.
+    what the user should know of the file once it is read, ``arrived`` the time of `perf_counter`
+    at which the newest row came in, 0 where rows do not come one by one.
     """
 
     unit = "line"
@@ -57,9 +60,10 @@ class Table:
     total: int | None = None
     types: Any = None
     hint = ""
-    #: Of each column, where they stand apart from the names.
-    units: list[str] | None = None
+    #: Whether the first column is the time, which channels with clocks of their own share.
+    has_clocks = False
     close: Callable[[], None]
+    arrived = 0.0
 
     def __init__(self, name: str) -> None:
         self.name, self.position = name, 0
@@ -72,24 +76,24 @@ class Table:
         """The positions in a row of the columns that are needed; some hold their last value."""
         return {i: i for i in range(len(self.header))}
 
+    @property
+    def units(self) -> list[str] | None:
+        """Units of the columns where they stand apart from the names, which are paths then."""
+        return None
 
-class CsvTable(Table):
+    def expect(self, name: str) -> int | None:
+        """The position of a column that may come later, None where none can."""
+        return None
+
+
+class LineTable(Table):
     """Lines of text, each available as soon as it arrives."""
 
     def __init__(
-        self, stream: BinaryIO, name: str, separator: str | None, encoding: str, total: int | None,
-        skip_lines: int = 0,
+        self, stream: BinaryIO, name: str, encoding: str, total: int | None, skip_lines: int
     ) -> None:
         super().__init__(name)
         self._stream, self._encoding, self.total = stream, encoding, total
-        self._separator = _SEPARATOR_NAMES.get(separator or "", separator)
-        if self._separator is not None and (
-            len(self._separator) != 1 or self._separator in '"\r\n'
-        ):
-            raise OptionError(
-                f"--separator is {separator!r}; expected one character, or one of "
-                f"{', '.join(_SEPARATOR_NAMES)}."
-            )
         try:
             is_usable = b"1,\n".decode(encoding) == "1,\n"  # lines are split before decoding
         except (LookupError, UnicodeError):
@@ -102,6 +106,50 @@ class CsvTable(Table):
         self.line = 0
         self.close = stream.close
         self._lines = filter(str.strip, islice(self._read_lines(), skip_lines, None))
+
+    def _read_lines(self) -> Iterator[str]:
+        while True:
+            try:
+                raw = self._stream.readline()
+            except (OSError, EOFError, zlib.error) as error:
+                raise RecordError(
+                    f"it cannot be read any further ({getattr(error, 'strerror', None) or error}).",
+                    self.name, self.line + 1,
+                ) from error
+            if not raw:
+                return
+            self.arrived = perf_counter()
+            self.line += 1
+            self.position += len(raw)
+            if self.line == 1:
+                if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+                    raise RecordError("it is in UTF-16; save it as UTF-8.", self.name)
+                raw = raw.removeprefix(b"\xef\xbb\xbf")
+            try:
+                yield raw.decode(self._encoding)
+            except UnicodeDecodeError as error:
+                raise RecordError(
+                    f"byte {error.start + 1} of the line is not {self._encoding}; save the "
+                    "record as UTF-8, or give --encoding (cp1252 is usual in Western Europe).",
+                    self.name, self.line,
+                ) from None
+
+class CsvTable(LineTable):
+    """Fields between separators, below a header."""
+
+    def __init__(
+        self, stream: BinaryIO, name: str, separator: str | None, encoding: str, total: int | None,
+        skip_lines: int = 0,
+    ) -> None:
+        super().__init__(stream, name, encoding, total, skip_lines)
+        self._separator = _SEPARATOR_NAMES.get(separator or "", separator)
+        if self._separator is not None and (
+            len(self._separator) != 1 or self._separator in '"\r\n'
+        ):
+            raise OptionError(
+                f"--separator is {separator!r}; expected one character, or one of "
+                f"{', '.join(_SEPARATOR_NAMES)}."
+            )
         text = next(self._lines, None)
         note = re.fullmatch(r"\s*sep=(.)\s*", text or "", re.IGNORECASE)
         if note:  # a spreadsheet writes its separator above the header
@@ -135,32 +183,6 @@ class CsvTable(Table):
                 fields = self._fitted(fields, ended)
             yield TableRow(self.line, fields, ended)
 
-    def _read_lines(self) -> Iterator[str]:
-        while True:
-            try:
-                raw = self._stream.readline()
-            except (OSError, EOFError, zlib.error) as error:
-                raise RecordError(
-                    f"it cannot be read any further ({getattr(error, 'strerror', None) or error}).",
-                    self.name, self.line + 1,
-                ) from error
-            if not raw:
-                return
-            self.line += 1
-            self.position += len(raw)
-            if self.line == 1:
-                if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-                    raise RecordError("it is in UTF-16; save it as UTF-8.", self.name)
-                raw = raw.removeprefix(b"\xef\xbb\xbf")
-            try:
-                yield raw.decode(self._encoding)
-            except UnicodeDecodeError as error:
-                raise RecordError(
-                    f"byte {error.start + 1} of the line is not {self._encoding}; save the "
-                    "record as UTF-8, or give --encoding (cp1252 is usual in Western Europe).",
-                    self.name, self.line,
-                ) from None
-
     def _split(self, text: str) -> list[str]:
         assert self._separator is not None
         try:
@@ -191,6 +213,82 @@ class CsvTable(Table):
             f"it has {found} field{'s' if found > 1 else ''}, and the header {width}; {remedy}",
             self.name, self.line,
         )
+
+
+class JsonTable(LineTable):
+    """A JSON object on each line; the first one names the columns, those that are named may follow.
+
+    Fields of objects in objects are ``a.b``, items of lists ``a[0]``.
+    """
+
+    hint = (
+        " The first line has these; a column that comes later needs its name in --outputs or "
+        "--inputs. Of objects within objects, it is outer.inner, of lists name[0]."
+    )
+
+    def __init__(
+        self, stream: BinaryIO, name: str, encoding: str, total: int | None, skip_lines: int = 0
+    ) -> None:
+        super().__init__(stream, name, encoding, total, skip_lines)
+        first = next(self._lines, None)
+        if first is None:
+            raise RecordError("it is empty; expected a JSON object on each line.", name)
+        self._first = first, self.line
+        self.header = list(self._parsed(first))
+        self.header_line = self.line
+        self._expected: set[str] = set()
+
+    @property
+    def units(self) -> list[str]:
+        """Blank for each column."""
+        return [""] * len(self.header)
+
+    def expect(self, name: str) -> int:
+        """A column that the first line does not have."""
+        if name not in self.header:
+            self.header.append(name)
+            self._expected.add(name)
+        return self.header.index(name)
+
+    def __iter__(self) -> Iterator[TableRow]:
+        for text in chain((self._first[0],), self._lines):
+            found = self._parsed(text)
+            if self._expected:
+                self._expected -= found.keys()
+            yield TableRow(
+                self.line, [found.get(name, "") for name in self.header],
+                text.endswith(("\n", "\r")),
+            )
+        self.notes += [f"no line of {self.name} has {name!r}." for name in sorted(self._expected)]
+
+    def _parsed(self, text: str) -> dict[str, str]:
+        try:
+            content = json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
+        except (ValueError, RecursionError) as error:
+            is_ended = text.endswith(("\n", "\r"))
+            cut = "" if is_ended else " The last line has no end, and may be cut off."
+            raise RecordError(
+                f"it is no JSON ({first_line(error)}); expected an object on each line.{cut}",
+                self.name, self.line,
+            ) from None
+        if not isinstance(content, dict):
+            raise RecordError(
+                f"it is {text.strip()[:40]!r}; expected a JSON object, such as "
+                '{"time": 0.1, "y": 2.5}.', self.name, self.line,
+            )
+        return dict(_flat("", content))
+
+
+def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:
+    """Names and values as a CSV file would have them."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flat(f"{name}.{key}" if name else key, item)
+    elif isinstance(value, list):
+        for k, item in enumerate(value):
+            yield from _flat(f"{name}[{k}]", item)
+    else:
+        yield name, "" if value is None else str(int(value)) if isinstance(value, bool) else value
 
 
 class ParquetTable(Table):

@@ -24,6 +24,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the backgrou
 from rich.console import Console
 from qpmhe.cli.estimate import run
 from qpmhe.errors import QpmheError
+from qpmhe.records import Latency
 
 try:
     run(Console(stderr=True, width=1000), *sys.argv[1:4], **eval(sys.argv[4]))
