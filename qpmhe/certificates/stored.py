@@ -198,7 +198,7 @@ def _encoded(bound: ObserverBound) -> dict[str, Any]:
         "region": _region(bound.region), "certified_region": _region(found.region or bound.region),
         "sizes": {
             "disturbance": _size(sizes.disturbance), "noise": _size(sizes.noise),
-            "source": sizes.source,
+            "source": sizes.source, "deviations": sizes.deviations,
         },
         "invariance": _invariance(bound.invariance), "inner": _invariance(bound.inner),
     }
@@ -225,6 +225,9 @@ def _decoded(given: Mapping[str, Any], content: Content, system: System) -> Obse
     sizes = given["sizes"]
     return ObserverBound(
         stability, _read_region(given["region"]),
-        Sizes(_read_size(sizes["disturbance"]), _read_size(sizes["noise"]), sizes["source"]),
+        Sizes(
+            _read_size(sizes["disturbance"]), _read_size(sizes["noise"]), sizes["source"],
+            sizes["deviations"],
+        ),
         invariance=_read_invariance(given["invariance"]), inner=_read_invariance(given["inner"]),
     )
