@@ -27,7 +27,7 @@ from .regions import Region
 from .sizes import Sizes
 
 #: Of the file; a new one wherever what was proved before would not be proved today, too.
-VERSION = 1
+VERSION = 2
 _KIND = "qpmhe certificate"
 _AGAIN = "Certify again: qpmhe certify --out."
 _ARRAYS = ("P", "W", "V", "gain", "Q", "R", "room")
