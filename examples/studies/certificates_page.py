@@ -28,6 +28,7 @@ from adversary import Array, Setting, Signals, against_estimates, against_observ
 import qpmhe
 from qpmhe.certificates import Certificate, Design, Sizes, certify, design, synthesise_gain
 from qpmhe.certificates.evidence import at_most
+from qpmhe.certificates.guard import Guard
 
 DOCS = Path(__file__).parents[2] / "docs"
 STEPS = (5, 10, 20, 40, 80)
@@ -44,14 +45,17 @@ adversary found who knows the model, chooses every disturbance and every noise a
 observer at the true state. `make certificates` makes it.
 
 | system | region | \\|w\\|, \\|v\\| | time | observer: bound | worst | factor \
-| around it: x̂ within | worst | factor |
-|---|---|---|---|---|---|---|---|---|---|
+| around it: x̂ within | worst | factor | guarded x̂ in advance: bound | worst | factor |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|
 {first}
 
 *Observer*: |x - z| in the limit, from `certificate.observer_bound`. *Around it*: the farthest point
 from x̂ of the set around z that holds the true state, at the time of the worst |x - x̂|, from
-`certificate.bound(run)`; the estimator has two QPs a sample. Lengths are Euclidean, in the units of
-the states; *time* is that of `certify`, and of finding the gain where it was synthesised (†).
+`certificate.bound(run)`; the estimator has two QPs a sample. *Guarded x̂*: with a guard in
+`Monitor`, the bound that is known before any measurement; the worst error is that of hostile
+estimates, far beyond the observer's state as seen from the truth, in the same runs. Lengths are
+Euclidean, in the units of the states; *time* is that of `certify`, and of finding the gain where it
+was synthesised (†).
 
 | system | Lyapunov: N | bound | worst | paper's theorem: N | bound | region's diameter |
 |---|---|---|---|---|---|---|
@@ -104,6 +108,7 @@ class Row:
     observed: float = 0.0
     around: float = np.nan
     estimated: float = 0.0
+    hostile: float = 0.0
     plan: Design | None = None
     designed: float = 0.0
     compared: int = 0
@@ -166,7 +171,11 @@ def prepared(case: Case) -> Row:
     seconds = time.perf_counter() - began
     proved = certificate.observer_bound
     assert proved is not None
-    bound = float(proved.farthest(proved.limit(), np.zeros(system.n)))
+    settled = proved.settled
+    bound = min(
+        float(proved.farthest(settled.radius, np.zeros(system.n))),
+        float(np.linalg.norm(settled.box)),
+    )
     return Row(case, certificate, seconds, bound)
 
 
@@ -186,6 +195,7 @@ def attack(row: Row) -> None:
     found.sort(key=lambda one: -one[0])
     row.observed, row.attacks = found[0][0], [signals for _, signals in found[:CLIMBS]]
     compare(np.array([row.observed]), np.array([row.bound]))
+    guarded(row, setting)
 
     def estimator(start: Array, **options: Any) -> qpmhe.MovingHorizonEstimator:
         given = {"horizon": case.horizon, "cost": certificate.cost} | options
@@ -256,6 +266,28 @@ def attack(row: Row) -> None:
     )
 
 
+def guarded(row: Row, setting: Setting) -> None:
+    """Guard estimates that are as wrong as can be, along the worst runs against the observer."""
+    proved = row.certificate.proved
+    guard, entering, added = Guard(proved, setting.system), proved.entering(), proved.added()
+    for signals in row.attacks:
+        x, y = setting.truth(signals)
+        z = setting.observed(x, y)
+        tube = proved.begun(np.zeros(setting.system.n))
+        for t in range(1, setting.inside(x, z)):
+            tube = proved.followed(tube, entering, added, projected=False)
+            for far in (0.0, 1.0, 1e3):
+                moved = guard(z[t] - far * (x[t] - z[t]), z[t], tube)
+                if moved.reason:
+                    raise SystemExit(f"{row.case.name}: {moved.reason}")
+                error, e = float(np.linalg.norm(x[t] - moved.point)), x[t] - moved.point
+                compare(np.append(np.abs(e), proved.length(e)),
+                        2.0 * np.append(tube.box, tube.radius))
+                row.compared += 1
+                row.hostile = max(row.hostile, error)
+    compare(np.array([row.hostile]), np.array([2.0 * row.bound]))
+
+
 def compare(errors: Array, bound: Array) -> None:
     """Stop where an error is above its bound."""
     above = errors > bound * (1.0 + 1e-9) + 1e-12
@@ -293,7 +325,9 @@ def first_line(row: Row) -> str:
         f"| {case.name}{own} | {sides} | {sizes.disturbance:g}, {sizes.noise:g} "
         f"| {row.seconds:.1f} s | {short(row.bound, bound=True)} | {short(row.observed)} "
         f"| **{row.bound / row.observed:.1f}** | {short(row.around, bound=True)} "
-        f"| {short(row.estimated)} | **{row.around / row.estimated:.1f}** |"
+        f"| {short(row.estimated)} | **{row.around / row.estimated:.1f}** "
+        f"| {short(2.0 * row.bound, bound=True)} | {short(row.hostile)} "
+        f"| **{2.0 * row.bound / row.hostile:.1f}** |"
     )
 
 

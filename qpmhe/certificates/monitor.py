@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array
+from .._checks import Array, flag
 from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
@@ -20,6 +20,7 @@ from .certificate import Certificate
 from .content import Content
 from .events import CONTRADICTION, REINITIALIZED
 from .evidence import MismatchError
+from .guard import Guard, check_guarded
 from .measured_cost import MeasuredCost
 from .norms import largest_ratio
 from .observer_bound import ObserverBound, Tube
@@ -33,6 +34,7 @@ _MOVED = (
     "the observer's state before was changed, by a late measurement (amend), by set or by a "
     "sample's own bounds"
 )
+_NO_GUARD = "the monitor has no guard"
 _RESTORED = (
     "the candidate violated a set and was restored into it (RESTORED): the estimate's cost may be "
     "above the candidate's"
@@ -57,6 +59,13 @@ class Reading:
         The source of ``error``: ``observer``, or ``measured`` where the measured cost gives less.
     lost, reason : int or None, and str
         The sample after which the bound no longer holds, and why.
+    state, filtered : (n,) array
+        The estimates of x(t+1) and x(t): with ``guard=True`` within the set around the observer,
+        else those of the estimate.
+    guarded : tuple of str
+        Which of the two the guard has moved.
+    unguarded : str
+        Why the guard is off; empty while it is on.
     """
 
     time: int
@@ -67,6 +76,10 @@ class Reading:
     kind: str = "observer"
     lost: int | None = None
     reason: str = ""
+    state: Array = field(default_factory=lambda: np.zeros(0))
+    filtered: Array = field(default_factory=lambda: np.zeros(0))
+    guarded: tuple[str, ...] = ()
+    unguarded: str = _NO_GUARD
 
 
 class Monitor:
@@ -87,6 +100,11 @@ class Monitor:
         Bound on x - z there; see `ObserverBound.along`.
     sizes : Sizes, optional
         Bounds on w and v at all times; those of the bound if left out.
+    guard : bool
+        Whether estimates that are not in the set around the observer are moved into it: then
+        ``reading.state`` and ``reading.filtered`` are within 2 b of the truth, in advance, with any
+        solver, cap and cost. Nothing feeds back: the estimator, its trajectory and J stay as they
+        are. A `CertificateError` says where that is not proved.
 
     Raises
     ------
@@ -125,7 +143,7 @@ class Monitor:
 
     def __init__(
         self, certified: Certificate | ObserverBound, estimator: MovingHorizonEstimator, *,
-        initial_error: Size, sizes: Sizes | None = None,
+        initial_error: Size, sizes: Sizes | None = None, guard: bool = False,
     ) -> None:
         bound = certified.proved if isinstance(certified, Certificate) else certified
         if not isinstance(bound, ObserverBound):
@@ -167,6 +185,11 @@ class Monitor:
         self._before: deque[tuple[Array, float]] = deque(maxlen=estimator.horizon + 1)
         self._before.append((self._z, self._tube.radius))
         self._inputs: deque[Array] = deque(maxlen=estimator.horizon)
+        self._guard: Guard | None = None
+        self.unguarded = _NO_GUARD
+        if flag("guard", guard):
+            check_guarded(self.bound, estimator, self.sizes)
+            self._guard, self.unguarded = Guard(self.bound, self._system), ""
         self._certificate: Certificate | None = None
         self._measured: MeasuredCost | None = None
         self.barred = "the monitor follows the observer's bound alone"
@@ -214,6 +237,7 @@ class Monitor:
         t, z, again = estimate.time, estimate.observer_state, estimate.time == self._time - 1
         if given.shape != (self._system.m,) and not again:
             raise ShapeError(f"u has shape {given.shape}; expected ({self._system.m},).")
+        before, first = self._z, self._tube
         if self.lost is None:
             reason = self._ends or self._order(t)
             if not reason and not again:
@@ -238,14 +262,40 @@ class Monitor:
                 self.barred = f"from sample {t} on: {reason}"
         (radius, box), z = self._tube, self._z
         lower, upper = self.bound.around(radius, z, box)
-        error = float(self.bound.farthest(radius, estimate.state - z, z, box))
+        state, filtered, guarded = self._guarded(estimate, again, before, first)
+        error = float(self.bound.farthest(radius, state - z, z, box))
         kind = "observer"
         if self._measured is not None:
             stages = len(self._before) - 1
             least = self._measured.error(self._before[0][1], stages, estimate.cost)
-            if least < error:
+            if least < error and not guarded:
                 error, kind = least, "measured"
-        return Reading(t, radius, lower, upper, error, kind, self.lost, self.reason)
+        return Reading(
+            t, radius, lower, upper, error, kind, self.lost, self.reason, state, filtered, guarded,
+            self.unguarded,
+        )
+
+    def _guarded(
+        self, estimate: Estimate, again: bool, before: Array, first: Tube
+    ) -> tuple[Array, Array, tuple[str, ...]]:
+        """The estimates of x(t+1) and x(t) that are handed on, and which of them were moved."""
+        state, filtered, moved = estimate.state.copy(), estimate.filtered.copy(), []
+        if not self.unguarded and self.lost is not None:
+            self.unguarded = f"from sample {self.lost} on: {self.reason}"
+        if not self.unguarded and again:
+            self.unguarded = "a sample was estimated again (amend or set)"
+        if self._guard is None or self.unguarded:
+            return state, filtered, ()
+        later = self._guard(state, self._z, self._tube)
+        now = self._guard(filtered, before, first)
+        for name, each in (("state", later), ("filtered", now)):
+            if each.reason:
+                self.unguarded = f"from sample {estimate.time} on: {each.reason}"
+            elif each.acted:
+                moved.append(name)
+        if self.unguarded:
+            return state, filtered, ()
+        return later.point, now.point, tuple(moved)
 
     def _order(self, time: int) -> str:
         """Why an estimate is not the next one; empty if it is, or is the same again."""

@@ -544,7 +544,10 @@ class ObserverBound:
         how = f"{self.evidence}{'' if stays else ' while x stays in the region'}"
         if self.begins_within:
             how = f"{self.evidence} from an initial error within the limit on"
-        return f"{each} in the limit{when} ({how}), on a region {wide} wide{nothing}"
+        guarded = ""
+        if self.evidence is Evidence.PROVED and not self.sizes.deviations:
+            guarded = "; guarded estimates are within twice that"
+        return f"{each} in the limit{when} ({how}), on a region {wide} wide{nothing}{guarded}"
 
     @property
     def condition(self) -> str:

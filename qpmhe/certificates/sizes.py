@@ -44,11 +44,14 @@ class Sizes:
         ``disturbance_matrix`` G, w (r,) is what G multiplies.
     source : str
         The origin of these sizes, for reports.
+    deviations : bool
+        Whether one of them is a number of standard deviations, which Gaussian noise exceeds.
     """
 
     disturbance: float | ConvexSet = 1.0
     noise: float | ConvexSet = 1.0
     source: str = "as stated"
+    deviations: bool = False
 
     def __post_init__(self) -> None:
         for name in ("disturbance", "noise"):
@@ -75,7 +78,9 @@ class Sizes:
                 half = _SIGMAS * np.sqrt(np.diag(covariance))
                 found.append(Box(-half, half))
                 sources.append(f"three standard deviations of {origin}")
-        return cls(found[0], found[1], " and ".join(dict.fromkeys(sources)))._checked(system)
+        text = " and ".join(dict.fromkeys(sources))
+        deviations = any("deviations" in each for each in sources)
+        return cls(found[0], found[1], text, deviations)._checked(system)
 
     @classmethod
     def of(cls, sizes: Any, system: System, cost: Cost | None = None) -> Sizes:

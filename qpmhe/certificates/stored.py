@@ -27,7 +27,7 @@ from .regions import Region
 from .sizes import Sizes
 
 #: Of the file; a new one wherever what was proved before would not be proved today, too.
-VERSION = 1
+VERSION = 2
 _KIND = "qpmhe certificate"
 _AGAIN = "Certify again: qpmhe certify --out."
 _ARRAYS = ("P", "W", "V", "gain", "Q", "R", "room")
@@ -198,7 +198,7 @@ def _encoded(bound: ObserverBound) -> dict[str, Any]:
         "region": _region(bound.region), "certified_region": _region(found.region or bound.region),
         "sizes": {
             "disturbance": _size(sizes.disturbance), "noise": _size(sizes.noise),
-            "source": sizes.source,
+            "source": sizes.source, "deviations": sizes.deviations,
         },
         "invariance": _invariance(bound.invariance), "inner": _invariance(bound.inner),
     }
@@ -225,6 +225,9 @@ def _decoded(given: Mapping[str, Any], content: Content, system: System) -> Obse
     sizes = given["sizes"]
     return ObserverBound(
         stability, _read_region(given["region"]),
-        Sizes(_read_size(sizes["disturbance"]), _read_size(sizes["noise"]), sizes["source"]),
+        Sizes(
+            _read_size(sizes["disturbance"]), _read_size(sizes["noise"]), sizes["source"],
+            sizes["deviations"],
+        ),
         invariance=_read_invariance(given["invariance"]), inner=_read_invariance(given["inner"]),
     )

@@ -73,6 +73,8 @@ class RowBounds:
             _size("--max-noise", options.max_noise, p, usual.noise),
             usual.source if options.max_disturbance is None and options.max_noise is None
             else "as stated",
+            usual.deviations
+            and (options.max_disturbance is None or options.max_noise is None),
         )
         start: Size | None = None if scenario is None else initial_error(scenario)
         if options.initial_error is not None:

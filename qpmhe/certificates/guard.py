@@ -1,0 +1,134 @@
+r"""An output map that moves estimates into the set that is proved to hold the true state.
+
+The true state is in :math:`S = \{\xi \in K : |\xi - z|_P \le b\}`, with K the box of the
+components, the region and X. An estimate outside of S is replaced by the point of S nearest to it
+in P: with a multiplier :math:`\lambda \ge 0` of the ball, it is the projection onto K of
+
+.. math::
+    (\hat x + \lambda z) / (1 + \lambda), \qquad
+    |\xi - \hat x|_P^2 + \lambda |\xi - z|_P^2
+    = (1 + \lambda) \left| \xi - \frac{\hat x + \lambda z}{1 + \lambda} \right|_P^2
+    + \frac{\lambda}{1 + \lambda} |\hat x - z|_P^2 ,
+
+whose distance from z decreases with :math:`\lambda`. So two points of S, the guarded estimate and
+the truth, are at most 2 b apart.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .._checks import Array
+from ..estimation.estimator import MovingHorizonEstimator
+from ..model.sets import ConvexSet
+from ..model.system import System
+from ..observers.projection import NearestPoint
+from .evidence import CertificateError, Evidence
+from .observer_bound import ObserverBound, Tube
+from .sizes import OUTWARD, UNIT, Sizes, weighted_lengths
+
+# Halvings of the interval in which lambda / (1 + lambda) is.
+_HALVINGS = 50
+_EMPTY = (
+    "no state was found in the set around the observer: the disturbances, the noises or the "
+    "initial error were larger than stated, or the model is another one"
+)
+
+
+class Guarded(NamedTuple):
+    """An estimate within the set, whether it was moved, and why there is none."""
+
+    point: Array
+    acted: bool
+    reason: str = ""
+
+
+class Guard:
+    """Moves estimates into the set around the observer.
+
+    Parameters
+    ----------
+    bound : ObserverBound
+        The proved bound.
+    system : System
+        The estimator's system, of which X counts as well.
+    """
+
+    def __init__(self, bound: ObserverBound, system: System) -> None:
+        self._bound = bound
+        self._covariance: Array = np.asarray(np.linalg.inv(bound.metric), np.float64)
+        region = bound.region.states
+        self._states = region if system.states is None else region & system.states
+        self._in_states = NearestPoint(self._states).contains
+
+    def __call__(self, estimate: Array, observer: Array, tube: Tube) -> Guarded:
+        """The estimate itself if it is in the set; else the nearest point that is."""
+        if self._holds(estimate, observer, tube) and self._in_states(estimate):
+            return Guarded(estimate, False)
+        K = self._states
+        # A little narrower, so that points on its sides are in the box in spite of rounding.
+        box = np.maximum((1.0 - 64.0 * UNIT) * tube.box - 4.0 * UNIT * np.abs(observer), 0.0)
+        near = ConvexSet(
+            np.maximum(K.lower, observer - box), np.minimum(K.upper, observer + box), K.matrix,
+            K.row_lower, K.row_upper,
+        )
+        if (near.lower > near.upper).any():
+            return Guarded(estimate, False, _EMPTY)
+        nearest = NearestPoint(near)
+        # The least share of the way to z, lambda / (1 + lambda), of which the projection is in S.
+        found = self._moved(nearest, estimate, observer, 0.0, tube)
+        if found is not None:
+            return Guarded(found, True)
+        best = self._moved(nearest, estimate, observer, 1.0, tube)
+        if best is None:
+            return Guarded(estimate, False, _EMPTY)
+        low, high = 0.0, 1.0
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            found = self._moved(nearest, estimate, observer, middle, tube)
+            low, high = (middle, high) if found is None else (low, middle)
+            best = best if found is None else found
+        return Guarded(best, True)
+
+    def _moved(
+        self, nearest: NearestPoint, estimate: Array, observer: Array, share: float, tube: Tube
+    ) -> Array | None:
+        """The projection of a point between, if it is in the set."""
+        target = estimate + share * (observer - estimate) if share < 1.0 else observer
+        found = target if nearest.contains(target) else nearest(target, self._covariance).point
+        return found if self._holds(found, observer, tube) and self._in_states(found) else None
+
+    def _holds(self, point: Array, observer: Array, tube: Tube) -> bool:
+        """Whether a point is in ball and box, with distances rounded up."""
+        difference = point - observer
+        rounding = UNIT * np.abs(difference)
+        length = weighted_lengths(difference, self._bound.metric) + weighted_lengths(
+            rounding, np.abs(self._bound.metric)
+        )
+        inside = (np.abs(difference) + rounding) * OUTWARD <= tube.box
+        return bool(length * OUTWARD <= tube.radius and inside.all())
+
+
+def check_guarded(bound: ObserverBound, estimator: MovingHorizonEstimator, sizes: Sizes) -> None:
+    """Raise a `CertificateError` where no number is proved for guarded estimates in advance."""
+    settings, system = estimator.settings, estimator.system
+    for refused, text in (
+        (bound.evidence is not Evidence.PROVED,
+         f"the observer's bound is {bound.evidence}, not proved"),
+        (sizes.deviations,
+         f"the sizes are {sizes.source}, and Gaussian noises are not bounded; state bounds, "
+         "sizes=Sizes(disturbance=..., noise=...)"),
+        (settings.candidate != "observer",
+         "candidate='reinitialized' restarts the observer at each sample"),
+        (settings.restart, "restart=True restarts the observer from estimates"),
+        (settings.infeasible == "restore",
+         "infeasible='restore' may leave the cost above the candidate's"),
+        (system.constraints is not None,
+         "the system has nonlinear constraints, whose set need not be convex"),
+        (system.state_residual is not None,
+         "the system has angles among its states, which are no convex set"),
+    ):
+        if refused:
+            raise CertificateError(f"there is no guard: {text}.")

@@ -1,0 +1,206 @@
+"""Guarded estimates: within twice the bound, whatever the estimate is; the nearest such point."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates import CertificateError, Monitor, Sizes
+from qpmhe.certificates.guard import Guard
+from qpmhe.certificates.observer_bound import Tube, bound_observer
+
+from .helpers import box, unit_cost
+
+A = np.array([[0.9, 0.2], [-0.1, 0.7]])
+GAIN = np.array([[0.4], [0.1]])
+REGION = qpmhe.Polytope([[1.0, 1.0]], [3.0]) & box([-2.0, -2.0], [2.0, 2.0])
+W, V = box([-0.02, -0.02], [0.02, 0.02]), box(-0.05, 0.05)
+START = box([-0.3, -0.3], [0.3, 0.3])
+
+
+def plant():
+    """Linear, with a sine of its first state."""
+    return qpmhe.System(
+        lambda x: x @ A.T + 0.05 * np.sin(x[..., :1]) * np.array([0.0, 1.0]),
+        lambda x: x[..., :1], n=2, p=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def bound():
+    system = plant()
+    return bound_observer(
+        system, qpmhe.Luenberger(GAIN), unit_cost(2), REGION, sizes=Sizes(W, V), seconds=300.0)
+
+
+def estimator(bound, **options):
+    usual = {"horizon": 4, "initial_state": [0.0, 0.0], "max_qps": 1}
+    return qpmhe.MovingHorizonEstimator(
+        bound.stability.system, qpmhe.Luenberger(GAIN), unit_cost(2), **(usual | options))
+
+
+def plain(vectors, weight):
+    return np.sqrt(np.einsum("...i,ij,...j->...", vectors, weight, vectors))
+
+
+def in_set(bound, point, z, tube):
+    e = point - z
+    return (
+        np.sqrt(e @ bound.metric @ e) <= tube.radius and (np.abs(e) <= tube.box).all()
+        and bool(bound.region.contains(point - 1e-12 * np.sign(point)))
+    )
+
+
+def test_the_guard_returns_the_nearest_point_of_the_set(bound):
+    """Against a fine grid, where ball, box, the slanted side and corners of them are active."""
+    guard, rng, kinds = Guard(bound, bound.stability.system), np.random.default_rng(0), set()
+    P, angles = bound.metric, np.linspace(0.0, 2.0 * np.pi, 2001)
+    circle = np.column_stack((np.cos(angles), np.sin(angles)))
+    shares = np.linspace(0.0, 1.0, 201)[:, None, None]
+    for k in range(60):
+        z = rng.uniform(-0.5, 1.5, 2)
+        if k % 4 == 0:  # near the slanted side
+            z = np.array([1.2, 1.75]) + rng.uniform(-0.2, 0.2) * np.array([1.0, -1.0])
+        radius = 0.4 * np.sqrt(np.abs(P).max())
+        tube = Tube(radius, bound.components(radius) * rng.uniform(0.5, 1.0, 2))
+        estimate = z + rng.standard_normal(2) * (0.2, 1.0, 100.0)[k % 3]
+        found = guard(estimate, z, tube)
+        assert not found.reason
+        assert in_set(bound, found.point, z, tube)
+        inside = in_set(bound, estimate, z, tube)
+        assert found.acted != inside
+        if inside:
+            np.testing.assert_array_equal(found.point, estimate)
+            continue
+        mine = plain(found.point - estimate, P)
+        # Of all points of a fine grid of the set, none is nearer.
+        grid = z + (tube.radius / plain(circle, P))[:, None] * circle * shares
+        grid = grid.reshape(-1, 2)
+        grid = grid[(np.abs(grid - z) <= tube.box).all(axis=1) & bound.region.contains(grid)]
+        nearest = plain(grid - estimate, P).min()
+        assert mine <= nearest * (1.0 + 1e-9)
+        assert nearest <= mine + 0.02 * tube.radius
+        e = found.point - z
+        kinds.add((bool(plain(e, P) > 0.999 * radius), bool((np.abs(e) > 0.999 * tube.box).any()),
+                   bool(found.point.sum() > 2.999)))
+    assert {(True, False, False), (False, True, False), (False, False, True)} < kinds
+
+
+def test_no_estimate_is_farther_than_twice_the_bound_from_any_state_of_the_set(bound):
+    guard, rng, P = Guard(bound, bound.stability.system), np.random.default_rng(1), bound.metric
+    for size in (1e-9, 0.1, 1.0, 1e3, 1e150):
+        for _ in range(20):
+            z = rng.uniform(-1.0, 1.0, 2)
+            radius = float(10.0 ** rng.uniform(-3.0, 0.5))
+            tube = Tube(radius, bound.components(radius) * rng.uniform(0.3, 1.0, 2))
+            found = guard(z + size * rng.standard_normal(2), z, tube)
+            assert not found.reason
+            directions = rng.standard_normal((200, 2))
+            lengths = np.sqrt(np.einsum("ki,ij,kj->k", directions, P, directions))
+            truth = z + radius * directions / lengths[:, None]
+            truth = truth[(np.abs(truth - z) <= tube.box).all(axis=1)]
+            e = truth - found.point
+            assert (np.sqrt(np.einsum("ki,ij,kj->k", e, P, e)) <= 2.0 * radius * (1 + 1e-12)).all()
+            assert (np.abs(e) <= 2.0 * tube.box * (1.0 + 1e-12)).all()
+
+
+def test_no_state_in_the_set_is_named(bound):
+    guard = Guard(bound, bound.stability.system)
+    tube = Tube(1e-3, np.array([1e-3, 1e-3]))
+    for z in ([5.0, 0.0], [1.6, 1.6]):  # beyond a side, beyond the slanted one
+        found = guard(np.zeros(2), np.array(z), tube)
+        assert not found.acted
+        assert "no state was found in the set" in found.reason
+        np.testing.assert_array_equal(found.point, 0.0)
+
+
+def hostile(estimate, rng):
+    """The same sample with a state that no solver would return."""
+    return np.asarray(estimate.state) + rng.choice([-1.0, 1.0], 2) * 10.0 ** rng.uniform(-3, 3)
+
+
+class Hostile:
+    """Stands for an estimate whose state and filtered state are anything."""
+
+    def __init__(self, estimate, rng):
+        self._estimate = estimate
+        self.state, self.filtered = hostile(estimate, rng), hostile(estimate, rng)
+
+    def __getattr__(self, name):
+        return getattr(self._estimate, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["adjoint", "random"])
+def test_adversaries_and_hostile_estimates_stay_within_twice_the_bound(
+    bound, kind, monkeypatch, pytestconfig
+):
+    """Truths with extreme signals beside estimates that are anything at all."""
+    monkeypatch.setattr(qpmhe.certificates.monitor, "Estimate", object)
+    system, rng, P = bound.stability.system, np.random.default_rng(2), bound.metric
+    acted, runs = 0, 60 if pytestconfig.option.all else 4
+    for _ in range(runs):
+        mhe = estimator(bound, max_qps=0)
+        watch = Monitor(bound, mhe, initial_error=START, guard=True)
+        advance, entering, added = bound.begun(START), bound.entering(), bound.added()
+        x = rng.choice([-0.3, 0.3], 2)
+        direction = rng.standard_normal((30, 2))
+        if kind == "adjoint":
+            row = np.eye(2)[rng.integers(2)]
+            for t in range(29, -1, -1):
+                direction[t], row = row, (A - GAIN @ [[1.0, 0.0]]).T @ row
+        for t in range(30):
+            y = x[:1] + np.where(-direction[t] @ GAIN > 0.0, 0.05, -0.05)
+            now, x = x, system.f(x, np.zeros(0)) + np.where(direction[t] > 0.0, 0.02, -0.02)
+            assert bound.region.contains(x)
+            reading = watch.check(Hostile(mhe.update(y), rng))
+            assert not reading.unguarded
+            acted += len(reading.guarded)
+            errors = x - reading.state, now - reading.filtered
+            boxes = [advance]
+            advance = bound.followed(advance, entering, added, projected=False)
+            for e, tube in zip(errors, (advance, boxes[0]), strict=True):
+                assert np.sqrt(e @ P @ e) <= 2.0 * tube.radius * (1.0 + 1e-9)
+                assert (np.abs(e) <= 2.0 * tube.box * (1.0 + 1e-9)).all()
+            assert np.linalg.norm(x - reading.state) <= reading.error
+    assert acted > 10 * runs
+
+
+def test_usual_estimates_are_not_moved_and_nothing_feeds_back(bound):
+    rng, x = np.random.default_rng(3), np.array([0.1, 0.0])
+    free, watched = estimator(bound), estimator(bound)
+    watch = Monitor(bound, watched, initial_error=START, guard=True)
+    for _ in range(15):
+        y = x[:1] + rng.uniform(-0.05, 0.05, 1)
+        x = bound.stability.system.f(x, np.zeros(0)) + rng.uniform(-0.02, 0.02, 2)
+        estimate = watched.update(y)
+        reading = watch.check(estimate)
+        np.testing.assert_array_equal(free.update(y).state, estimate.state)
+        np.testing.assert_array_equal(reading.state, estimate.state)
+        np.testing.assert_array_equal(reading.filtered, estimate.filtered)
+        assert (reading.guarded, reading.unguarded) == ((), "")
+    reading = watch.check(watched.update([np.nan]))
+    assert reading.unguarded.startswith("from sample 15 on: a measurement was missing")
+    plain = Monitor(bound, estimator(bound), initial_error=START)
+    assert plain.unguarded == "the monitor has no guard"
+
+
+def test_where_nothing_is_proved_in_advance_there_is_no_guard(bound):
+    for options, words in (
+        ({"candidate": "reinitialized"}, "restarts the observer at each sample"),
+        ({"restart": True}, "restart=True"),
+        ({"infeasible": "restore"}, "infeasible='restore'"),
+    ):
+        with pytest.raises(CertificateError, match=f"there is no guard: .*{words}"):
+            Monitor(bound, estimator(bound, **options), initial_error=START, guard=True)
+    gaussian = bound_observer(
+        bound.stability.system, qpmhe.Luenberger(GAIN),
+        qpmhe.QuadraticCost(prior=np.eye(2), disturbance=1e4 * np.eye(2), noise=400.0), REGION,
+        seconds=300.0)
+    assert gaussian.sizes.deviations
+    assert "guarded" in bound.headline
+    assert "guarded" not in gaussian.headline
+    with pytest.raises(CertificateError, match="Gaussian noises are not bounded"):
+        Monitor(gaussian, estimator(bound), initial_error=START, guard=True)
+    stated = Monitor(gaussian, estimator(bound), initial_error=START, guard=True,
+                     sizes=Sizes(W, V))
+    assert stated.unguarded == ""
