@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import _version
 from .._checks import Array
+from .._version import __version__
 from ..errors import OptionError
 from ..model.sets import ConvexSet
 from ..model.system import System, checked_system
@@ -67,7 +67,7 @@ def save(bound: ObserverBound, path: str | Path) -> None:
             "system again; only certificates of traced systems can be stored."
         )
     rest = {
-        "kind": _KIND, "version": VERSION, "qpmhe": _version.__version__,
+        "kind": _KIND, "version": VERSION, "qpmhe": __version__,
         "headline": bound.headline, "content": dict(content.parts), "bound": _encoded(bound),
     }
     text = json.dumps(rest | {"digest": _checksum(rest)}, indent=1, allow_nan=False)
@@ -109,7 +109,7 @@ def load(path: str | Path, system: System, observer: Observer) -> ObserverBound:
     if rest.get("version") != VERSION:
         raise OptionError(
             f"{path} has the version {rest.get('version')!r} (qpmhe {rest.get('qpmhe')}); expected "
-            f"{VERSION}, which qpmhe {_version.__version__} reads. {_AGAIN}"
+            f"{VERSION}, which qpmhe {__version__} reads. {_AGAIN}"
         )
     if rest.pop("digest", None) != _checksum(rest):
         raise OptionError(f"{path} was changed since it was written. {_AGAIN}")
