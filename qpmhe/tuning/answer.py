@@ -366,11 +366,12 @@ class Tuning:
         """
         if not isinstance(horizons, Iterable):
             raise OptionError(f"horizons is {shown(horizons)}; expected several, such as (5, 10).")
-        rows = []
+        # Those that have not seen the blocks which judge.
+        rows, weights = [], self._structure.weights(self._judged_theta)
         for horizon, arrival in product(horizons, arrivals):
             dimension("horizon", horizon, 1)
             began = perf_counter()
-            samples = self._score.samples(replace(self.weights, horizon=horizon, arrival=arrival))
+            samples = self._score.samples(replace(weights, horizon=horizon, arrival=arrival))
             spent = (perf_counter() - began) / sum(map(len, self._data))
             rows.append(HorizonScore(horizon, arrival, self._mean(samples), spent))
         return rows

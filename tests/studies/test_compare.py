@@ -220,7 +220,9 @@ def test_latex_tables_have_means_with_standard_errors_and_say_so(tmp_path):
     assert text.splitlines()[1].startswith("% qpmhe ")
     assert r"3 runs of each configuration; mean \pm standard error of the mean" in text
     assert "proxqp" not in text
-    frame = stored().frame().query("backend == 'osqp' and horizon == 10 and solver_iterations == 2")
+    frame = stored().frame().query(
+        "backend == 'osqp' and horizon == 10 and solver_iterations == 2", engine="python"
+    )
     (line,) = (one for one in text.splitlines() if one.startswith("osqp & 2 & 2 &"))
     assert with_error(frame.rmse.mean(), frame.rmse.std() / 3**0.5) in line
     assert export(stored(), tmp_path / "all.tex").read_text().count(r"\begin{tabular}") == 2
