@@ -94,7 +94,7 @@ def estimate(
         bool,
         typer.Option("--equal-steps", help="Require equal steps; each row is written at once."),
     ] = False,
-    format: Annotated[  # noqa: A002
+    format: Annotated[  # noqa: A002 - as the option
         Literal["auto", "csv", "jsonl"],
         typer.Option(help="Lines on standard input and output: CSV, or JSON objects."),
     ] = "auto",

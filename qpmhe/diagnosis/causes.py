@@ -33,7 +33,7 @@ from .rows import doubled, dropped
 from .sensor_memory import with_coloured_noise, with_lag
 from .signatures import additive
 
-# Places of rows that are told.
+# A finding lists at most so many rows.
 _SHOWN_ROWS = 3
 Maker = Callable[[Evidence], Iterable[Fault]]
 

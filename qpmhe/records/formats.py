@@ -189,7 +189,7 @@ def _of_tree(
                     "variable of the time with --time NAME.", file, column=names[one],
                 )
             times, values = _attempt(file, "HDF5", (OSError, RuntimeError), lambda: (
-                np.asarray(clock[()]), np.asarray(item[index])  # noqa: B023
+                np.asarray(clock[()]), np.asarray(item[index])  # noqa: B023 - called at once
             ))
             loaded.append(_signal(file, names[one], times.reshape(-1), values))
         return loaded

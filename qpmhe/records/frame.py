@@ -52,9 +52,9 @@ def read(
     time_scale : float
         Seconds in the file's unit of time, for times that are numbers.
     same_time : float, optional
-        Times of several channels that differ by at most this are one sample, that of the
-        earliest; in s, or the file's unit. By default 1e-6 of the shortest mean step: only times
-        that differ by rounding are equal.
+        Times of several channels that differ by at most this belong to one sample, which has
+        the earliest of them; in s, or the file's unit. By default 1e-6 of the shortest mean step:
+        only times that differ by rounding are equal.
     log_time : bool
         Of ROS bags, take the times of the log instead of ``header.stamp``. Messages without a
         stamp, or a zero one, have the log's in any case.

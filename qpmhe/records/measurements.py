@@ -68,7 +68,7 @@ class RecordReader:
         self, path: str, names: ColumnFinder, *, separator: str | None = None,
         encoding: str = "utf-8", decimal: str = "auto", missing: Sequence[str] = (),
         skip_repeated: bool = False, skip_lines: int = 0, time_format: str | None = None,
-        same_time: float | None = None, log_time: bool = False, format: str = "auto",  # noqa: A002
+        same_time: float | None = None, log_time: bool = False, format: str = "auto",  # noqa: A002 - as the option
     ) -> None:
         self.is_stream = path == "-"
         self.held = self.repeated = self.blank = 0

@@ -109,7 +109,7 @@ def estimate_record(
     skip_repeated: bool = False,
     same_time: float | None = None,
     log_time: bool = False,
-    format: str = "auto",  # noqa: A002
+    format: str = "auto",  # noqa: A002 - as the option
     latency: Latency | None = None,
     covariances: str = "none",
     step_time: bool = True,

@@ -144,7 +144,7 @@ def test_a_filter_that_works_is_left_alone(seed):
 
 @pytest.mark.parametrize("project", [False, True])
 def test_an_observer_that_is_left_alone_filters_as_ever(project):
-    """Its estimate of x(t) is that of the newest sample, whatever the other one has computed."""
+    """Without a restart, `filtered` equals that of an estimator that has no second observer."""
     rng, found = np.random.default_rng(0), []
     outputs = np.sin(0.3 * np.arange(60)) + 1.5 + 0.05 * rng.standard_normal(60)
     terms = {"prior": [[1.0]], "disturbance": [[0.1]], "noise": [[0.01]]}
