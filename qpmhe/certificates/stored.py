@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array
 from .._version import __version__
 from ..errors import OptionError
@@ -98,6 +100,8 @@ def load(path: str | Path, system: System, observer: Observer) -> ObserverBound:
     checked_system(system)
     try:
         rest = json.loads(Path(path).read_text(encoding="utf-8"))
+    except TypeError as error:
+        raise OptionError(f"path is {shown(path)}; expected the path of a file.") from error
     except OSError as error:
         raise OptionError(f"cannot read {path}: {error.strerror}.") from error
     except ValueError as error:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.values import shown
 
 from .._checks import dimension, numbers, positive, vector
-from ..errors import InvalidInputError, ModelError, ShapeError
+from ..errors import InvalidInputError, ModelError, QpmheError, ShapeError
 from .algebraic import AlgebraicStates
 from .algebraic_set import AlgebraicSet
 from .constraints import checked_constraints
@@ -92,7 +92,15 @@ class Equations(NamedTuple):
 
     def check(self, x: Array, u: Array) -> None:
         """Raise a `ModelError` where no z solves the equations at a state (n,) and input (m,)."""
-        w, found = self.solver.iterated(x[None], u[None])
+        try:
+            w, found = self.solver.iterated(x[None], u[None])
+        except QpmheError:
+            raise
+        except Exception as error:
+            raise ModelError(
+                f"the equations raised {type(error).__name__}: {error} at the initial state "
+                f"{x.tolist()}; they must be defined there."
+            ) from error
         if not found.all():
             raise ModelError(unsolved(self.joint, self.slope, self.guess, x, w[0], u))
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from inspect import signature
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from qpmhe_solvers.errors import report_unknown_options
+from qpmhe_solvers.errors import check_options, report_unknown_options
 from qpmhe_solvers.values import shown
 
 from .._checks import dimension
@@ -167,6 +168,7 @@ class System:
         **options
             The other arguments of `System`.
         """
+        check_options("System", options, list(signature(System).parameters))
         system = object.__new__(cls)
         system._make({"f": f, "h": h, **options}, origin)
         return system

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
@@ -42,15 +43,19 @@ def report_unknown_options(cls: type[T]) -> type[T]:
 
     @functools.wraps(plain)
     def init(self: T, *args: Any, **options: Any) -> None:
-        for name in options:
-            if name not in known:
-                near = get_close_matches(name, known, 1)
-                hint = f" Did you mean {near[0]}?" if near else ""
-                raise UnknownOptionError(
-                    f"{cls.__name__} has no option {name!r}; expected one of "
-                    f"{', '.join(known)}.{hint}"
-                )
+        check_options(cls.__name__, options, known)
         plain(self, *args, **options)
 
     type.__setattr__(cls, "__init__", init)
     return cls
+
+
+def check_options(owner: str, options: Iterable[str], known: Sequence[str]) -> None:
+    """Refuse options that the owner does not have."""
+    for name in options:
+        if name not in known:
+            near = get_close_matches(name, known, 1)
+            hint = f" Did you mean {near[0]}?" if near else ""
+            raise UnknownOptionError(
+                f"{owner} has no option {name!r}; expected one of {', '.join(known)}.{hint}"
+            )

@@ -596,3 +596,30 @@ def test_an_initial_state_without_algebraic_states_is_an_error(algebraic, guess,
     observer, cost = weights(2, 1)
     with pytest.raises(ModelError, match="(?s)" + words), np.errstate(all="ignore"):
         MovingHorizonEstimator(system, observer, cost, horizon=3, initial_state=[0.5, 0.2])
+
+
+@pytest.mark.parametrize("make", [
+    lambda **o: qpmhe.System.from_ode(lambda x: -x, lambda x: x, dt=0.1, n=1, p=1, **o),
+    lambda **o: qpmhe.System.from_implicit(lambda d, x: d + x, lambda x: x, dt=0.1, n=1, p=1, **o),
+    lambda **o: qpmhe.System.from_dae(
+        lambda x, z: z - x, lambda x, z: z - 0.5 * x, lambda x, z: x, dt=0.1, n=1, k=1, p=1,
+        algebraic_guess=[0.0], **o,
+    ),
+])
+def test_an_option_that_does_not_exist_is_refused(make):
+    make(states=qpmhe.Box([0.0], [1.0]))
+    with pytest.raises(qpmhe.errors.OptionError, match="no option 'statess'.*Did you mean states"):
+        make(statess=qpmhe.Box([0.0], [1.0]))
+
+
+def test_equations_that_raise_are_named_at_construction():
+    system = qpmhe.System.from_dae(
+        lambda x, z: z - x, lambda x, z: 1 / 0, lambda x, z: x, dt=0.1, n=1, k=1, p=1,
+        algebraic_guess=[0.0],
+    )
+    terms = {"prior": [[1.0]], "disturbance": [[1.0]], "noise": [[1.0]]}
+    with pytest.raises(qpmhe.errors.ModelError, match="equations raised ZeroDivisionError"):
+        qpmhe.MovingHorizonEstimator(
+            system, qpmhe.ExtendedKalman(**terms), qpmhe.QuadraticCost.from_covariances(**terms),
+            horizon=3, initial_state=[0.0],
+        )
