@@ -608,7 +608,7 @@ def test_an_initial_state_without_algebraic_states_is_an_error(algebraic, guess,
 ])
 def test_an_option_that_does_not_exist_is_refused(make):
     make(states=qpmhe.Box([0.0], [1.0]))
-    with pytest.raises(qpmhe.errors.OptionError, match="no option 'statess'.*Did you mean states"):
+    with pytest.raises(qpmhe.errors.OptionError, match=r"no option 'statess'.*Did you mean states"):
         make(statess=qpmhe.Box([0.0], [1.0]))
 
 
