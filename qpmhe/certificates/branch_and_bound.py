@@ -127,12 +127,14 @@ def cover(
     chunk = int(np.clip(_WORK / size, 1, _CHUNK))
     cells = Cells(region, most_cells, Deadline.of(seconds), chunk)
     nowhere = np.empty((0, region.lower.size)), np.empty((0, 0, 0))
+    proved: list[tuple[Array, Array]] = []
     for low, high in cells:
         enclosure = model.enclose(low, high)
         matrices, count = _at_corners(enclosure)
         with np.errstate(all="ignore"):
             shown = definite(form.matrices(matrices)).reshape(count, -1).all(axis=1)
         left = np.flatnonzero(~shown)
+        proved.append((low[shown], high[shown]))
         low, high, centres = low[left], high[left], enclosure.jacobian[left]
         middle = 0.5 * (low + high)
         broken = _broken(form, centres) & region.contains(middle[:, : region.n])
@@ -140,7 +142,8 @@ def cover(
             return Cover(False, cells.taken, middle[broken], centres[broken])
         if len(left):
             cells.halve(low, high, _scores(enclosure, left))
-    return Cover(cells.done, cells.taken, *nowhere, late=cells.late)
+    done = cells.done and model.agrees(proved)
+    return Cover(done, cells.taken, *nowhere, late=cells.late)
 
 
 def _broken(form: Form, jacobians: Array) -> NDArray[np.bool_]:

@@ -86,7 +86,7 @@ def certify_detectability(
         Detectability(
             form.rate, *euclidean_constants(form.P, form.R, form.rate, W), form=search.kind,
             region=search.region, notes=notes if form.injection is None else (*notes, _NOT_AFFINE),
-            P=P, W=W, V=form.R, cells=found.cells,
+            P=P, W=W, V=form.R, cells=found.cells, compared=found.compared,
         ),
         system, found.evidence,
     )
@@ -252,6 +252,7 @@ def _stability(search: Search, rho: float | None) -> ObserverStability:
             P=P, W=W, V=V,
             Q=embedded(form.Q, search.acting, system.r) if form.Q.size else None,
             R=form.R if form.R.size else None, room=search.room, cells=found.cells,
+            compared=found.compared,
         ),
         system, found.evidence,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,9 @@ _SAMPLES, _SEED = 400, 20210829
 _ROUNDING = 64.0
 # Conditions that change on one cell, of which each combination is enclosed by itself.
 _MOST_KINKS = 3
+# How many points are compared in all cells at least, of each kind; pairs of points in a cell,
+# between which a change of a condition is looked for, in halvings.
+_LEAST, _PAIRS, _HALVINGS = 256, 2, 48
 _TRACEABLE = "Write it with NumPy's functions of x and u, numpy.where in place of branches"
 
 
@@ -141,6 +145,7 @@ class SmoothModel:
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self._programs: dict[str, Program] = {}
         self._unknown: tuple[Array, Array] | None = None
+        self.compared = len(self.points)
         self.reason, output = self._read("h")
         following: list[int] = []
         if not self.reason:
@@ -187,7 +192,7 @@ class SmoothModel:
         roots = read(self._graph, expression.function)
         self._programs[name] = Program(self._graph, roots)
         obstacle = self._programs[name].obstacle(self.points[0], self.points[0])
-        return f"{name} has {obstacle}" if obstacle else self._differs(name), roots
+        return f"{name} has {obstacle}" if obstacle else self._differs(name, self.points), roots
 
     @property
     def unknown(self) -> str:
@@ -209,9 +214,27 @@ class SmoothModel:
                 return f"{words} {found}"
         return ""
 
-    def _differs(self, name: str) -> str:
+    def agrees(self, cells: Sequence[tuple[Array, Array]]) -> bool:
+        """Whether f and h have their expressions' values in each cell; `reason` says where not.
+
+        In cells (B, N) each, at random points, at random corners and, where a condition changes,
+        on both sides of the change.
+        """
+        assert self._plan is not None
+        lower, upper = (np.concatenate([each[k] for each in cells]) for k in range(2))
+        lower, upper = (np.tile(each, (-(-_LEAST // len(lower)), 1)) for each in (lower, upper))
+        rng = np.random.default_rng(_SEED)
+        inner, share = rng.uniform(lower, upper), rng.integers(2, size=lower.shape)
+        corner = np.where(share == 1, upper, lower)
+        points = np.vstack((inner, corner, *self._plan.around_kinks(lower, upper, rng)))
+        points = points[self._region.contains(points[:, : self.n])]
+        self.compared += len(points)
+        self.reason = self._differs("h", points) or self._differs("f", points)
+        return not self.reason
+
+    def _differs(self, name: str, points: Array) -> str:
         """Where a function differs from its expression by more than rounding; blank if nowhere."""
-        points, function, n = self.points, getattr(self._system, name), self.n
+        function, n = getattr(self._system, name), self.n
 
         def values_at(point: Array) -> Any:
             try:
@@ -300,12 +323,38 @@ class _Plan:
         self._depends = np.array([
             [one in each for one in decisions] for each in above
         ], np.bool_).reshape(len(nodes), len(decisions))
-        self._point = Program(graph, roots + nodes + decisions)
+        self._point, self._decided = (
+            Program(graph, each) for each in (roots + nodes + decisions, decisions)
+        )
         self._cell = Program(graph, roots + nodes + [one[-1] for one in second] + decisions)
 
     def obstacle(self, lower: Array, upper: Array) -> str:
         """What is not defined on all of a cell (N,), in words; blank if all is."""
         return self._point.obstacle(lower, upper)
+
+    def around_kinks(
+        self, lower: Array, upper: Array, rng: np.random.Generator
+    ) -> list[Array]:
+        """Points (K, N) on both sides of where a condition changes in a cell, close to it."""
+        if not self._conditions:
+            return []
+        part = rng.random((2, _PAIRS, *lower.shape))
+        start, end = (lower + (upper - lower) * part).reshape(2, -1, lower.shape[1])
+
+        def truth(points: Array) -> NDArray[np.bool_]:
+            return np.asarray(self._decided(points, points).low == 1.0)
+
+        # One condition of each pair, in turn: the others may change on the way as well.
+        changes = truth(start) != truth(end)
+        which, pair = changes.argmax(axis=0), np.flatnonzero(changes.any(axis=0))
+        start, end, which = start[pair], end[pair], which[pair]
+        rows, first = np.arange(len(pair)), truth(start)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * start + 0.5 * end
+            before = (truth(middle) == first)[which, rows]
+            start = np.where(before[:, None], middle, start)
+            end = np.where(before[:, None], end, middle)
+        return [start, end]
 
     def enclosed(
         self, lower: Array, upper: Array, truths: Array | None = None

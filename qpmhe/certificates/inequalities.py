@@ -213,10 +213,16 @@ def definite(matrices: Matrices) -> NDArray[np.bool_]:
 
 def eigenvalue_bounds(P: Array) -> tuple[float, float]:
     r"""Numbers :math:`0 < a \le b` with :math:`a I \prec P \prec b I`, verified."""
-    values, eye = np.linalg.eigvalsh(P), np.eye(len(P))
-    for slack in (1e-13, 1e-11, 1e-9, 1e-7):
-        room = slack * float(np.abs(values).max())
-        low, high = float(values[0]) - room, float(values[-1]) + room
+    eye, diagonal = np.eye(len(P)), np.abs(P.diagonal())
+    # In units that differ much, small eigenvalues are rounding beside the large ones: the least is
+    # the inverse of the largest one of the inverse, in units of its own.
+    scale = np.exp2(-np.round(0.5 * np.log2(np.where(diagonal > 0.0, diagonal, 1.0))))
+    balanced, values = np.outer(scale, scale) * P, np.linalg.eigvalsh(P)
+    if np.linalg.eigvalsh(balanced)[0] > 0.0:
+        inverse = np.outer(scale, scale) * np.linalg.inv(balanced)
+        values[0] = 1.0 / np.linalg.eigvalsh(0.5 * (inverse + inverse.T))[-1]
+    for slack in (1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1e-3, 0.1, 0.5):
+        low, high = (1.0 - slack) * float(values[0]), (1.0 + slack) * float(values[-1])
         sides = np.stack((P, -P)), np.stack((-low * eye, high * eye))
         if low > 0.0 and definite(Matrices.exact(sides[0]) + Matrices.exact(sides[1])).all():
             return low, high

@@ -74,11 +74,14 @@ def certify_invariance(
         return Invariance(None, f"{unknown}: {model.reason}", where)
     cells = Cells(where, _MOST_CELLS, deadline)
     points = where.sample(_SAMPLES, np.random.default_rng(_SEED))
+    proved: list[tuple[Array, Array]] = []
     leaving = _leaving(model, where, rows, limits, added, points)
     for low, high in cells if leaving is None else ():
         reach, parts = _reach(model, rows, low, high)
         excess = reach - (limits - added)
-        left = np.flatnonzero(~(excess <= 0.0).all(axis=1))
+        shown = (excess <= 0.0).all(axis=1)
+        left = np.flatnonzero(~shown)
+        proved.append((low[shown], high[shown]))
         low, high, excess = low[left], high[left], excess[left]
         points = 0.5 * low + 0.5 * high
         points = points[where.contains(points[:, : where.n])]
@@ -90,6 +93,8 @@ def certify_invariance(
             cells.halve(low, high, parts[left, worst])
     if leaving is not None:
         return Invariance(False, leaving, where, cells.taken)
+    if cells.done and not model.agrees(proved):
+        return Invariance(None, f"{unknown}: {model.reason}", where, cells.taken)
     if cells.done:
         return Invariance(True, "x stays in the region", where, cells.taken)
     end = "when its time was over" if cells.late else "the most that are allowed"

@@ -533,21 +533,51 @@ class ObserverBound:
 
     @property
     def headline(self) -> str:
-        """The bound in the limit, in the states' units, and how soon it is reached, in one line."""
+        """The bounds on the observer and on estimates, in the states' units, in one line."""
         limit, after = self.settled.box, self.settling_samples
         each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {at_most(b, 3)}" for i, b in enumerate(limit))
         when = f" and at most 10 % more from sample {after} on" if after else ""
         wide = " x ".join(f"{width:.3g}" for width in self._widths)
+        return (
+            f"{each} in the limit{when} ({self._shown}{self._while}), on a region {wide} "
+            f"wide{self._nothing(limit)}; {self._of_estimates}"
+        )
+
+    def _nothing(self, limit: Array) -> str:
+        """Of which states bounds say nothing, in words; blank if they say something of all."""
         vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self._widths))
-        nothing = f": it says nothing about {vacuous}" if vacuous else ""
-        stays = self.invariance is not None and self.invariance.holds
-        how = f"{self.evidence}{'' if stays else ' while x stays in the region'}"
+        return f": it says nothing about {vacuous}" if vacuous else ""
+
+    @property
+    def _while(self) -> str:
+        """What must hold besides, in words; blank if nothing must."""
         if self.begins_within:
-            how = f"{self.evidence} from an initial error within the limit on"
-        guarded = ""
-        if self.evidence is Evidence.PROVED and not self.sizes.deviations:
-            guarded = "; guarded estimates are within twice that"
-        return f"{each} in the limit{when} ({how}), on a region {wide} wide{nothing}{guarded}"
+            return ", from an initial error within the limit on"
+        stays = self.invariance is not None and self.invariance.holds
+        return "" if stays else ", while x stays in the region"
+
+    @property
+    def _shown(self) -> str:
+        """The evidence, and for what."""
+        if not self.stability.compared:
+            return str(self.evidence)
+        return (
+            f"{self.evidence} for the traced model, which agreed with f at "
+            f"{self.stability.compared} points"
+        )
+
+    @property
+    def _of_estimates(self) -> str:
+        """What follows for an estimate x_hat, in words."""
+        offset = "|x_hat - z| + b"
+        if self.evidence is not Evidence.PROVED or self.sizes.deviations:
+            return f"x_hat is within {offset} along a run"
+        limit = 2.0 * self.settled.box
+        twice = ", ".join(at_most(b, 3) for b in limit)
+        return (
+            f"guarded, x_hat is within min(2 b, {offset}) along a run, and in advance within 2 b = "
+            f"{twice}{self._nothing(limit)}"
+        )
 
     @property
     def condition(self) -> str:

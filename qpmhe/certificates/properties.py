@@ -27,6 +27,7 @@ class _Certified:
     W: Array | None = None
     V: Array | None = None
     cells: int = 0
+    compared: int = 0
     evidence: Evidence = field(default=Evidence.ASSUMED, init=False)
     system: System | None = field(default=None, init=False, repr=False)
     model: ModelValues | None = field(default=None, init=False, repr=False)
@@ -97,6 +98,9 @@ class Detectability(_Certified):
         Which inequality was shown: ``output weight``, ``output injection``, or ``assumed``.
     cells : int
         Number of pieces of the region on which the inequality was verified; 0 if none.
+    compared : int
+        At how many points of them f and h had the values of the traces that it was proved for; 0
+        for functions that are symbolic already.
     system : System or None
         The certified system; None for constants made or changed by hand, or copied.
     model : ModelValues or None
@@ -158,7 +162,7 @@ class ObserverStability(_Certified):
     room : (p,) array or None
         Below what each noise must be for angles among the outputs, so that no innovation wraps;
         infinite for other outputs, None without angles.
-    evidence, region, notes, cells, system, model, content
+    evidence, region, notes, cells, compared, system, model, content
         As for `Detectability`.
     """
 

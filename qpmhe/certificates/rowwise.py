@@ -158,7 +158,7 @@ class RowwiseStep:
             wide = wide[np.argsort(-np.nan_to_num(spread[wide], nan=np.inf), kind="stable")]
             wide = wide[: most - len(lower)]
             if not len(wide):
-                return rows
+                return rows if model.agrees([(lower, upper)]) else None
             kept = np.setdiff1d(np.arange(len(lower)), wide)
             low, high = halves_of(region, lower[wide], upper[wide], enclosure.excess[wide])
             lower, upper = np.vstack((lower[kept], low)), np.vstack((upper[kept], high))

@@ -50,6 +50,7 @@ class Found:
     form: Form  # filled in
     evidence: Evidence
     cells: int  # in which it was proved
+    compared: int  # at how many points f had the value of the trace that it is proved for
     notes: tuple[str, ...]
 
 
@@ -364,17 +365,20 @@ class Search:
             deadline = self._deadline.part(_VERIFICATION)
             found = cover(self.model, self.region, form, most_cells, deadline)
             if found.proved:
-                return Found(form, Evidence.PROVED, found.cells, ())
+                traced = self.system.tracing is not None
+                points = self.model.compared if traced else 0
+                return Found(form, Evidence.PROVED, found.cells, points, ())
             if found.violations.shape[0]:
                 return found
             end = ", when its time was over" if found.late else ""
             why = (
+                f"the proof is of something else: {self.model.reason}" if self.model.reason else
                 f"the proof was given up after dividing the region into {found.cells} cells{end}"
                 f"{self.model.unknown}"
             )
         self._check_pairs(form)
         note = f"{why}; the inequality holds at {self.points.shape[0]} states of the region"
-        return Found(form, Evidence.SAMPLED, 0, (note,))
+        return Found(form, Evidence.SAMPLED, 0, 0, (note,))
 
     def _check_pairs(self, form: Form) -> None:
         """Raise where the inequality does not hold between two of the samples."""

@@ -29,10 +29,11 @@ from .regions import Region
 from .sizes import Sizes
 
 #: Of the file; a new one wherever what was proved before would not be proved today, too.
-VERSION = 2
+VERSION = 3
 _KIND = "qpmhe certificate"
 _AGAIN = "Certify again: qpmhe certify --out."
 _ARRAYS = ("P", "W", "V", "gain", "Q", "R", "room")
+_COUNTS = ("cells", "compared")
 _NUMBERS = ("rho", "C_p", "C_w", "C_v", "kappa")
 
 
@@ -197,7 +198,8 @@ def _encoded(bound: ObserverBound) -> dict[str, Any]:
     return {
         "stability": {name: _number(getattr(found, name)) for name in _NUMBERS}
         | {name: _array(getattr(found, name)) for name in _ARRAYS}
-        | {"notes": list(found.notes), "cells": found.cells, "evidence": found.evidence.value},
+        | {name: getattr(found, name) for name in _COUNTS}
+        | {"notes": list(found.notes), "evidence": found.evidence.value},
         "model": {each.name: _array(getattr(model, each.name)) for each in fields(ModelValues)},
         "region": _region(bound.region), "certified_region": _region(found.region or bound.region),
         "sizes": {
@@ -211,10 +213,11 @@ def _encoded(bound: ObserverBound) -> dict[str, Any]:
 def _decoded(given: Mapping[str, Any], content: Content, system: System) -> ObserverBound:
     """The bound that was encoded."""
     stated = given["stability"]
-    matrices: dict[str, Any] = {name: _read_array(stated[name]) for name in _ARRAYS}
+    rest: dict[str, Any] = {name: _read_array(stated[name]) for name in _ARRAYS}
+    rest |= {name: stated[name] for name in _COUNTS}
     stability = ObserverStability(
         *(float(stated[name]) for name in _NUMBERS), region=_read_region(given["certified_region"]),
-        notes=tuple(stated["notes"]), cells=stated["cells"], **matrices,
+        notes=tuple(stated["notes"]), **rest,
     )
     model = ModelValues(**{
         name: np.array(values, np.float64).reshape(len(values), -1)

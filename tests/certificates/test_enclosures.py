@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import Evidence, certify_detectability, enclosures
+from qpmhe.certificates import Evidence, certify_detectability, certify_observer, enclosures
 from qpmhe.certificates.enclosures import SmoothModel
-from qpmhe.certificates.regions import Region
+from qpmhe.certificates.invariance import certify_invariance
+from qpmhe.certificates.regions import Region, bounded_region
+from qpmhe.certificates.rowwise import RowwiseStep
 from qpmhe.errors import ModelError
 
-from .helpers import box, scalar, smooth, unit_box
+from .helpers import GAIN, box, scalar, smooth, unit_box
 from .random_expressions import made, value
 
 mpmath.mp.dps = 40
@@ -174,6 +176,38 @@ def test_what_looks_for_symbols_is_not_proved(letter):
     for way, (function, word) in REFUSED.items():
         model, _ = smooth(scalar(**{letter: function}), unit_box(1))
         assert word in model.reason, way
+
+
+class Counting:
+    """0.5 |x - 0.2|, and from its k-th call on something else within a width of the kink."""
+
+    def __init__(self, after, width):
+        self.after, self.width, self.calls = after, width, 0
+
+    def __call__(self, x):
+        self.calls += 1
+        away = np.abs(x - 0.2)
+        return 0.5 * away + (0.01 * (away < self.width) if self.calls > self.after else 0.0)
+
+
+def test_the_trace_of_a_proof_is_compared_with_f_inside_each_cell():
+    """Also close to kinks, which no sample of the region meets."""
+    region, found = box(-1.0, 1.3), {}
+    for after in (100, 10**9):
+        found[after] = certify_observer(scalar(Counting(after, 1e-9)), GAIN, region)
+    assert found[10**9].evidence is Evidence.PROVED
+    assert found[10**9].compared > 400 + 2 * 256 + 2
+    assert found[100].evidence is Evidence.SAMPLED
+    assert found[100].compared == 0
+    assert "the proof is of something else: f is [0.01" in found[100].notes[0]
+    assert "its expression is" in found[100].notes[0]
+    for prove in (
+        lambda system: certify_invariance(system, region).holds,
+        lambda system: RowwiseStep(
+            system, bounded_region(system, region), np.array([[0.1]]), np.eye(1)).rows,
+    ):
+        assert prove(scalar(Counting(100, 1e-9))) is None
+        assert prove(scalar(Counting(10**9, 1e-9))) is not None
 
 
 def of_numbers(x):

@@ -73,6 +73,15 @@ def test_eigenvalue_and_norm_bounds_and_constants_are_outward_and_tight():
         np.testing.assert_allclose([low, high], np.linalg.eigvalsh(P)[[0, -1]], rtol=1e-7)
         bound = norm_bound(Matrices.exact(basis[None]))[0]
         assert np.linalg.norm(basis, 2) <= bound <= np.linalg.norm(basis, 2) * (1 + 1e-8)
+        for unit in (1e11, 1e-30):
+            units = np.where(np.arange(n) % 2, unit, 1.0)
+            Q = np.outer(units, units) * P
+            low, high = eigenvalue_bounds(Q)
+            assert exactly_definite(Q, low)
+            assert exactly_definite(-Q, -high)
+            # The least is the inverse of the largest one of the inverse, which is as exact.
+            largest = np.linalg.eigvalsh(np.linalg.inv(P) / np.outer(units, units))[-1]
+            np.testing.assert_allclose(low, 1.0 / largest, rtol=1e-7)
     with pytest.raises(CertificateError, match="eigenvalues"):
         eigenvalue_bounds(np.diag([1.0, -1.0]))
     found = np.array(euclidean_constants(np.diag([1.0, 4.0]), np.array([[9.0]]), 0.5))

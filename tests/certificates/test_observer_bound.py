@@ -112,6 +112,9 @@ def test_a_scalar_system_has_the_bound_that_one_computes_by_hand():
     for value, text in ((0.4031, "0.404"), (0.9, "0.9"), (99.91, "100"), (np.inf, "inf")):
         assert at_most(value, 3) == text
     assert 0.0 <= float(shown[1]) / bound.settled.box[0] - 1.0 < 0.01
+    twice = re.search(r"guarded, x_hat is within min\(2 b, \|x_hat - z\| \+ b\) along a run, and "
+                      r"in advance within 2 b = (\S+)$", bound.headline)
+    assert 0.0 <= float(twice[1]) / (2.0 * bound.settled.box[0]) - 1.0 < 0.01
 
 
 def plain(vectors, weight):
@@ -177,6 +180,18 @@ def test_what_is_beyond_the_region_does_not_count(four):
     np.testing.assert_allclose(four.around(1e-3, z)[1] - z, 1e-3 * four.slopes, rtol=1e-9)
 
 
+def test_a_bound_is_the_same_in_any_units():
+    """Of one state, which makes the eigenvalues of P differ by 1e22 and more."""
+    A, found = np.array([[0.9, 0.2], [-0.1, 0.7]]), []
+    for unit in (1.0, 1e11, 1e-11):
+        d = np.array([1.0, unit])
+        bound = bound_of(
+            linear(A * d[:, None] / d, [[1.0, 0.0]]), d[:, None] * [[0.4], [0.1]],
+            box(-2 * d, 2 * d), box(-0.02 * d, 0.02 * d), box(-0.05, 0.05))
+        found.append(bound.settled.box / d)
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=0.1)
+
+
 def scalar_certificate(slope, w=0.01):
     return certify(
         linear(slope, 1.0), qpmhe.Luenberger([[max(slope - 0.5, 0.1)]]),
@@ -186,11 +201,14 @@ def scalar_certificate(slope, w=0.01):
 
 def test_the_headline_says_whether_the_region_is_kept():
     certificate = scalar_certificate(1.5)
-    assert "(proved while x stays in the region)" in certificate.headline
+    points = certificate.stability.compared
+    assert points > 400
+    traced = f"(proved for the traced model, which agreed with f at {points} points"
+    assert f"{traced}, while x stays in the region)" in certificate.headline
     words = "not proved that x stays in the region: f and the disturbances reach x1 = "
     assert words in str(certificate)
     certificate = scalar_certificate(0.8)
-    assert "(proved), on a region 2 wide" in certificate.headline
+    assert f"{traced}), on a region 2 wide; guarded" in certificate.headline
     bound = certificate.observer_bound
     limit = bound.components(bound.limit())[0]
     assert bound.inner.region.upper[0] == pytest.approx(1.0 - limit)

@@ -103,7 +103,7 @@ def test_files_that_were_changed_or_are_of_another_version_are_refused(file):
     stated["bound"]["stability"]["rho"] *= 0.5
     for content, words in (
         (json.dumps(stated), "was changed since it was written"),
-        (text.replace('"version": 2', '"version": 1'), "has the version 1 .*expected 2.*again"),
+        (text.replace('"version": 3', '"version": 2'), "has the version 2 .*expected 3.*again"),
         (text.replace("qpmhe certificate", "a recipe"), "is no certificate of an observer"),
         ("[1, 2]", "is no certificate of an observer"), ("{", "it is not JSON"),
     ):

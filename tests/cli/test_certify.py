@@ -48,7 +48,7 @@ def shown(tmp_path):
     (tmp_path / "two.py").write_text(MODEL)
     report = tmp_path / "out" / "two.json"
 
-    def call(arguments="", width=200, of="model", **options):
+    def call(arguments="", width=300, of="model", **options):
         console = Console(file=io.StringIO(), width=width, color_system=None)
         options = {"report": report} | options
         done = certify(console, f"{tmp_path}/two.py:{of}{arguments}", **options)
@@ -62,8 +62,10 @@ def test_the_first_line_is_the_observers_bound_in_the_states_units(shown):
     first, *rest = text.splitlines()
     assert re.fullmatch(
         r"\|x1 - z1\| <= [\d.]+, \|x2 - z2\| <= [\d.]+ in the limit "
-        r"and at most 10 % more from sample \d+ on \(proved( while x stays in the region)?\), "
-        "on a region 4 x 4 wide", first,
+        r"and at most 10 % more from sample \d+ on "
+        r"\(proved for the traced model, which agreed with f at \d+ points"
+        r"(, while x stays in the region)?\), on a region 4 x 4 wide; "
+        r"x_hat is within \|x_hat - z\| \+ b along a run", first,
     )
     assert len(rest) < 11
     for words in (
