@@ -7,6 +7,7 @@ from . import batch, codegen, errors, models, solvers
 from ._version import __version__
 from .adapters.casadi import from_casadi
 from .adapters.control import from_control
+from .adapters.fmu import from_fmu
 from .adapters.iosystem import to_iosystem
 from .adapters.jax import from_jax
 from .adapters.sympy import from_sympy
@@ -161,6 +162,7 @@ __all__ = [
     "errors",
     "from_casadi",
     "from_control",
+    "from_fmu",
     "from_jax",
     "from_sympy",
     "load_run",

@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import io
 import re
+import shutil
 import subprocess
 import sys
 import types
@@ -67,6 +68,8 @@ def test_page_runs(page, tmp_path, monkeypatch, registered_backends):
     if page in ("how-to/speed.md", "tutorial.md"):  # they start with an empty cache
         monkeypatch.setenv("QPMHE_CACHE_DIR", str(tmp_path / "cache"))
         monkeypatch.delenv("QPMHE_ENGINE")
+    if page == "how-to/fmu.md":
+        shutil.copy(importlib.import_module("tests.adapters.fmus").fmu(), tmp_path)
     blocks = fences(page)
     # A module, so that functions of a page can be pickled as those of a script can.
     module = types.ModuleType("page_" + re.sub(r"\W", "_", page))

@@ -21,6 +21,14 @@ Function = Callable[..., Any]
 _FRACTIONS = np.array([0.1, 1.0 / 3.0, 0.5, np.sqrt(0.5), np.pi, 10.0 * np.sqrt(2.0)])
 
 
+def other_times(dt: float, continuous: bool = True) -> Array:
+    """Times after 0 at which a model that depends on time most likely differs from that at 0."""
+    times = [dt * np.unique(np.geomspace(1.0, 1e6, 25).round())]
+    if continuous:
+        times.append(dt * _FRACTIONS)  # what has the sampling time as its period, too
+    return np.concatenate(times)
+
+
 def from_control(
     system: Any,
     *,
@@ -180,16 +188,13 @@ def _nonlinear(
 def _check_no_time(system: Any, made: System, dt: float | None) -> None:
     """Check that dynamics and output do not depend on time, which a `System` cannot express."""
     unit = float(dt or (1.0 if system.dt in (None, True) else system.dt) or 1.0)
-    steps = np.unique(np.geomspace(1.0, 1e6, 25).round())
-    times = [unit * steps]
-    if system.isctime():
-        times.append(unit * _FRACTIONS)  # what has the sampling time as its period, too
+    times = other_times(unit, system.isctime())
     for name, function in (("dynamics", system.dynamics), ("output", system.output)):
         for x, u in points(FEW, made.n, made.m, made.states):
             first = _value(function, 0.0, x, u)
             if first is None:
                 continue
-            for time in np.concatenate(times).tolist():
+            for time in times.tolist():
                 then = _value(function, time, x, u)
                 if then is None or not np.array_equal(first, then, equal_nan=True):
                     raise ModelError(

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .augmentation import Augmentation
     from .constraints import ConstraintFunctions
     from .dae import Equations
+    from .signals import Signals
     from .system import System
     from .system_arguments import SystemOptions
 
@@ -202,6 +203,8 @@ class Origin:
         within how many deviations of the prior.
     is_timed : bool
         Whether the last input is the length of the step.
+    signals : Signals, optional
+        Names, units and starts of the variables.
     """
 
     dt: float | None = None
@@ -221,6 +224,7 @@ class Origin:
     recipe: tuple[Callable[..., Any], dict[str, Any]] | None = None
     held: Mapping[int, float] = field(default_factory=dict)
     is_timed: bool = False
+    signals: Signals | None = None
 
 
 @dataclass(frozen=True, eq=False)

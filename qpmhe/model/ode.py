@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import dimension, positive
+from ..errors import OptionError
 from .accuracy import TOLERANCE, TRIED, Choice, choice
 from .derivatives import Jacobian
-from .discretize import AUTO, Discretization, discretize
+from .discretize import AUTO, METHODS, Discretization, checked_discretization, discretize
 from .functions import BatchedFunction, Trusted
 from .model import Origin
 from .points import FEW, points
@@ -26,12 +29,28 @@ Array = NDArray[np.float64]
 Function = Callable[..., Any]
 
 
+def checked_method(
+    method: str, steps: int, tolerance: float | None
+) -> tuple[Discretization, float]:
+    """The arguments of `System.from_ode` of these names, checked."""
+    how = checked_discretization(method, steps, (*METHODS, AUTO))
+    if tolerance is not None and method != AUTO:
+        raise OptionError(
+            f"tolerance is {shown(tolerance)}, but method is {method!r}, whose steps are as "
+            "many as steps says; leave it out, or take method='auto'."
+        )
+    if steps != 1 and method == AUTO:
+        raise OptionError(f"steps is {steps}, but method='auto' chooses steps; leave steps out.")
+    return how, TOLERANCE if tolerance is None else tolerance
+
+
 def made_from_ode(
     cls: type[System], rate: Function | Trusted, h: Function | Trusted, *, dt: float, n: int,
     p: int, m: int, how: Discretization, rate_jacobian: Function | Trusted | None,
     h_jacobian: Function | Trusted | None, options: SystemOptions, tolerance: float = TOLERANCE,
+    jacobians: str = "given",
 ) -> System:
-    """The system that `System.from_ode` describes."""
+    """The system that `System.from_ode` describes; for ``jacobians`` see `Origin`."""
     n, m = dimension("n", n, 1), dimension("m", m, 0)
     states = checked_set("states", options.get("states"), n)
     probes = points(FEW, n, m, states)
@@ -83,6 +102,7 @@ def made_from_ode(
         Trusted(partial(step, length)), h,
         Origin(
             dt=length, how=how, rate=batched, rate_jacobian=compared, choice=chosen,
+            jacobians=jacobians,
             make_timed=timed, make_augmented=augmented,
             recipe=(cls.from_ode, {
                 "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": how.method,

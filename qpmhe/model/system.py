@@ -15,19 +15,19 @@ from qpmhe_solvers.errors import check_options, report_unknown_options
 from qpmhe_solvers.values import shown
 
 from .._checks import dimension
-from ..errors import InvalidInputError, ModelError, OptionError
-from .accuracy import TOLERANCE
+from ..errors import InvalidInputError, ModelError
 from .constraints import Constraint, ConstraintFunctions, checked_constraints
 from .dae import made_from_dae, made_from_implicit
 from .derivatives import Jacobian
-from .discretize import AUTO, METHODS, checked_discretization
+from .discretize import checked_discretization
 from .functions import BatchedFunction, Trusted
 from .implicit_steps import COLLOCATIONS
 from .model import Model, ModelCache, Origin, check_at
-from .ode import made_from_ode
+from .ode import checked_method, made_from_ode
 from .points import FEW, USUAL, Points, points
 from .residuals import Residual, Turns, checked_residual
 from .sets import ConvexSet, SoftSet
+from .signals import Signals
 from .system_arguments import (
     SystemOptions,
     check_soft_angles,
@@ -429,6 +429,11 @@ class System:
         return self.origin.held
 
     @property
+    def signals(self) -> Signals | None:
+        """Names, units and starts of its variables; None where its origin knows none."""
+        return self.origin.signals
+
+    @property
     def has_timed(self) -> bool:
         """Whether it takes steps of other lengths: see `timed`."""
         return self.origin.make_timed is not None
@@ -502,20 +507,10 @@ class System:
         ModelError, SetError
             As for `System`; also if ``"auto"`` finds no step that is accurate enough.
         """
-        how = checked_discretization(method, steps, (*METHODS, AUTO))
-        if tolerance is not None and method != AUTO:
-            raise OptionError(
-                f"tolerance is {shown(tolerance)}, but method is {method!r}, whose steps are as "
-                "many as steps says; leave it out, or take method='auto'."
-            )
-        if steps != 1 and method == AUTO:
-            raise OptionError(
-                f"steps is {steps}, but method='auto' chooses steps; leave steps out."
-            )
+        how, allowed = checked_method(method, steps, tolerance)
         return made_from_ode(
             cls, rate, h, dt=dt, n=n, p=p, m=m, how=how, rate_jacobian=rate_jacobian,
-            h_jacobian=h_jacobian, options=options,
-            tolerance=TOLERANCE if tolerance is None else tolerance,
+            h_jacobian=h_jacobian, options=options, tolerance=allowed,
         )
 
     @classmethod
@@ -770,6 +765,8 @@ class System:
             lines.append(f"{name}: {text}. Jacobian: {_METHODS.get(method, method)}.")
         if self.origin.choice is not None:
             lines.append(str(self.origin.choice))
+        if self.signals is not None:
+            lines.append(str(self.signals))
         if own.no_symbolic and self.has_other_steps:
             lines.append(f"No C code: {own.no_symbolic}.")
         return "\n".join(lines)
@@ -828,7 +825,7 @@ class System:
 _METHODS = {
     "traced": "exact, by its trace", "given": "as given", "casadi": "exact, by CasADi",
     "integrator": "by CasADi, to its integrator's tolerances",
-    "jax": "exact, by JAX",
+    "jax": "exact, by JAX", "fmu": "by the FMU's directional derivatives",
     "finite differences": "by finite differences",
 }
 def _made(maker: Function, arguments: dict[str, Any]) -> Any:

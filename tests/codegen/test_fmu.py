@@ -5,8 +5,8 @@ import shutil
 import numpy as np
 import pytest
 
-from qpmhe import codegen
-from qpmhe.errors import CompilationError
+from qpmhe import codegen, from_fmu
+from qpmhe.errors import CompilationError, ModelError
 
 from .cases import case
 
@@ -92,6 +92,8 @@ def test_it_is_the_python_step_from_any_state(name, tmp_path):
 def test_what_is_refused(tmp_path, monkeypatch):
     mhe = case("inputs").estimator("python")
     unit = Unit(mhe, tmp_path)
+    with pytest.raises(ModelError, match="it is only for co-simulation"):
+        from_fmu(tmp_path / "unit.fmu", dt=0.1)
     unit.start()
     unit.take(u=[0.0, 0.0])
     for refused in (
