@@ -19,6 +19,7 @@ from .properties import Detectability, ObserverStability, sealed
 from .regions import Region, bounded_region
 from .sdp import NoiseSizes, started
 from .search import Search, embedded
+from .theorem import checked_rate
 
 # Of an output in its own size, for a state in the region's.
 _UNSEEN = 1e-9
@@ -78,6 +79,7 @@ def certify_detectability(
         system, bounded_region(system, region, inputs), None,
         (positive("weights[0]", first), positive("weights[1]", second)), seconds=started(seconds),
     )
+    _check(search, "eta", eta)
     found = search.answer("eta", eta, (), _undetectable)
     form = found.form
     notes = (*found.notes, *_left_out(search), _PAIR_STAYS)
@@ -92,8 +94,16 @@ def certify_detectability(
     )
 
 
-def _unseen_mode(search: Search) -> NotCertifiedError | None:
-    """A mode at one of the states that neither decays nor appears in the output, if there is."""
+def _check(search: Search, name: str, rate: float | None) -> None:
+    """Raise where no program is worth solving."""
+    if rate is not None:
+        checked_rate(name, rate)
+    if search.gain is None:
+        _check_modes(search)
+
+
+def _check_modes(search: Search) -> None:
+    """Raise where a mode neither decays nor appears in the output: then no program is feasible."""
     n, states, outputs = search.n, search.scales.states, search.scales.outputs
     for point, jacobian in zip(search.points, search.jacobians, strict=True):
         A = jacobian[:n] * states / states[:, None]
@@ -107,7 +117,7 @@ def _unseen_mode(search: Search) -> NotCertifiedError | None:
                 continue
             direction = states * vectors[-1].conj()
             direction = np.real_if_close(direction / np.linalg.norm(direction))
-            return NotCertifiedError(
+            raise NotCertifiedError(
                 "the system is not exponentially detectable by any constant P: at "
                 f"{np.round(point, 4).tolist()} the mode with eigenvalue {value:.6g}, along "
                 f"{np.round(direction, 4).tolist()}, does not decay and does not appear in the "
@@ -115,14 +125,11 @@ def _unseen_mode(search: Search) -> NotCertifiedError | None:
                 ("measure an output that this mode affects",
                  "leave the mode out of the model if it is not to be estimated"),
             )
-    return None
 
 
 def _undetectable(search: Search, text: str) -> NotCertifiedError:
     """Why no rate is feasible."""
-    unseen = _unseen_mode(search)
-    if unseen is not None:
-        return unseen
+    _check_modes(search)  # at more states by now
     steep = _steepest(search)
     return NotCertifiedError(
         f"{text}: no constant P shows detectability on the whole region, although every single "
@@ -133,7 +140,7 @@ def _undetectable(search: Search, text: str) -> NotCertifiedError:
 
 def _steepest(search: Search) -> str:
     """Where f grows so fast that rounding alone may spoil a program; an error where it jumps."""
-    radii, system = _radii(search), search.system
+    radii, system = search.radii(), search.system
     point, largest = search.points[int(radii.argmax())], float(radii.max())
     if largest < _FAST:
         return ""
@@ -221,7 +228,7 @@ def certify_observer(
     search = Search(
         system, bounded_region(system, region, inputs), "observer", sizes, gain, started(seconds)
     )
-    radii = _radii(search, search.gain)
+    radii = search.radii(search.gain)
     worst = int(radii.argmax())
     if radii[worst] >= 1.0:  # then there is no P
         steep = _steepest(search)
@@ -235,6 +242,7 @@ def certify_observer(
 
 def _stability(search: Search, rho: float | None) -> ObserverStability:
     """The constants that follow from a verified contraction of the error."""
+    _check(search, "rho", rho)
     others = () if search.gain is None else (_OTHER_GAIN,)
     found = search.answer("rho", rho, others, _unstable)
     form = found.form
@@ -272,19 +280,11 @@ def _left_out(search: Search) -> tuple[str, ...]:
     )
 
 
-def _radii(search: Search, gain: Array | None = None) -> Array:
-    """The spectral radii of A, or of A - L C, at the samples."""
-    closed = search.jacobians[:, : search.n]
-    if gain is not None:
-        closed = closed - gain @ search.jacobians[:, search.n :]
-    radii: Array = np.abs(np.linalg.eigvals(closed)).max(axis=1)
-    return radii
-
-
 def _unstable(search: Search, text: str) -> NotCertifiedError:
     """Why no rate is feasible."""
     if search.gain is None:
-        return _unseen_mode(search) or NotCertifiedError(
+        _check_modes(search)
+        return NotCertifiedError(
             "no constant gain is shown to contract on the whole region: the semidefinite program "
             "is infeasible for every rate below 1",
             ("a smaller region", "other coordinates, in which the model is closer to linear"),
@@ -292,7 +292,7 @@ def _unstable(search: Search, text: str) -> NotCertifiedError:
     return NotCertifiedError(
         f"{text}: no constant P shows contraction on the whole region, although A - L C is stable "
         f"at each of {len(search.points)} states (spectral radius up to "
-        f"{_radii(search, search.gain).max():.6g})", (_OTHER_GAIN, "a smaller region"),
+        f"{search.radii(search.gain).max():.6g})", (_OTHER_GAIN, "a smaller region"),
     )
 
 

@@ -13,6 +13,7 @@ from qpmhe import certificates
 from qpmhe.certificates import Evidence, NotCertifiedError, certify_detectability, certify_observer
 from qpmhe.certificates import deadline as deadline_module
 from qpmhe.certificates import search as search_module
+from qpmhe.certificates.sdp import SemidefiniteProgram
 from qpmhe.errors import ModelError, OptionError, ShapeError
 
 from .helpers import GAIN, PENDULUM, QUESTIONS, REACTOR, box, linear, scalar, unit_box, unit_cost
@@ -230,7 +231,7 @@ def test_a_mode_is_called_unseen_only_where_it_is():
             certify_detectability(hidden, region, seconds=300.0)
     reactor = qpmhe.models.cstr()[0]  # f overflows on its own set of states
     with pytest.raises(NotCertifiedError, match="may not be meant to hold") as caught:
-        certify_detectability(reactor, None, inputs=box(287.0, 311.6))
+        certify_detectability(reactor, None, inputs=box(287.0, 311.6), seconds=300.0)
     assert "not appear in the output" not in str(caught.value)
     assert "a smaller region" in caught.value.suggestions
 
@@ -278,3 +279,20 @@ def test_proofs_end_with_the_time(monkeypatch):
 def test_no_search_is_begun_in_vain():
     with pytest.raises(certificates.OutOfTimeError, match=r"40 states takes about .* s were left"):
         certify_detectability(linear(0.9 * np.eye(40), np.ones((1, 40))), unit_box(40))
+
+
+def test_no_program_is_solved_that_has_no_solution(monkeypatch):
+    solved, solve = [], SemidefiniteProgram.solve
+    monkeypatch.setattr(
+        SemidefiniteProgram, "solve",
+        lambda program, rate, *rest: (solved.append(rate), solve(program, rate, *rest))[1],
+    )
+    hidden = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
+    for ask in (certify_detectability, certificates.synthesise_gain):
+        with pytest.raises(NotCertifiedError, match=r"eigenvalue 1\.1.*not appear in"):
+            ask(hidden, unit_box(2))
+    assert not solved
+    # |0.9 - 0.1| = 0.8, beyond which there are solutions.
+    certify_observer(linear(0.9, 1.0), qpmhe.Luenberger([[0.1]]), unit_box(1))
+    assert solved
+    assert min(solved) > 0.8 * (1.0 - 1e-9)
