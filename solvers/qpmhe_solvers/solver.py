@@ -25,6 +25,7 @@ from .solution import Errors, RawSolution, Residuals, Solution, SolveStatus
 _SLACK = 1e3
 _LOOSEST = 1e-3
 _NUMBERS = count(1)
+_REHEARSED: set[type] = set()  # classes of which one has solved its two small QPs
 
 
 class Solver(ABC):
@@ -103,7 +104,10 @@ class Solver(ABC):
         """
 
     def _rehearse(self) -> None:
-        """Solve two small QPs, so that whatever is imported or made at first is there."""
+        """Solve two small QPs, once in a process: what the first solves import is then there."""
+        if type(self) in _REHEARSED:
+            return
+        _REHEARSED.add(type(self))
         self.solve(sample(3, 2))
         self.solve(sample(3, 2, 2, bounds="part", sides="mixed"))
         self.forget()
