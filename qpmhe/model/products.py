@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 #: A matrix of at least so many nonzeros is kept as one. From 20 by 20 on, loops are faster than as
 #: many scalar operations in C, and compiled in less than half the time. Where less than half of a
-#: matrix is nonzero, loops over indices take 1.5 times as long to run; from so many nonzeros on, the
+#: matrix is nonzero, loops over indices run 1.5 times as long; from so many nonzeros on, the
 #: scalar operations would be in a compiler for seconds.
 LEAST, LEAST_SPARSE = 400, 2000
 #: A function of more operations takes longer in CasADi's virtual machine, and in a compiler, than
