@@ -74,8 +74,9 @@ class Interpreter:
         f, h = step(x, u, dt), model.h(x, u)
         # Transposed: CasADi stores by columns, NumPy by rows.
         values = {
-            "f": (f, (n,)), "h": (h, (p,)), "f_jacobian": (ca.jacobian(f, x).T, (n, n)),
-            "h_jacobian": (ca.jacobian(h, x).T, (p, n)),
+            "f": (f, (n,)), "h": (h, (p,)),
+            "f_jacobian": (model.slope("f", f, x, u, dt).T, (n, n)),
+            "h_jacobian": (model.slope("h", h, x, u, dt).T, (p, n)),
         }
         for name, (value, shape) in values.items():
             function, result = ca.Function(name, [x, u, dt], [ca.densify(value)]), np.zeros(shape)

@@ -13,6 +13,7 @@ from typing import Any
 
 from .._version import __version__
 from ..model.expressions import CasadiModel, import_casadi
+from ..model.products import with_slope
 from .layout import Layout
 
 # Members of a model that are data of the generated code, not code.
@@ -54,11 +55,14 @@ def _written(value: Any) -> Iterator[str]:
 def _generator() -> str:
     """Digest of all that makes the source of a model: templates and generator."""
     digest = hashlib.sha256(__version__.encode())
-    model_file = Path(sys.modules[CasadiModel.__module__].__file__ or "")
+    models = [
+        Path(sys.modules[one.__module__].__file__ or "") for one in (CasadiModel, with_slope)
+    ]
     here = files(__package__)
     for folder in (here, here.joinpath("c")):
         for file in sorted(folder.iterdir(), key=lambda one: one.name):
             if file.name.endswith((".py", ".c", ".h")):
                 digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
-    digest.update(model_file.read_bytes())
+    for model_file in models:
+        digest.update(model_file.read_bytes())
     return digest.hexdigest()

@@ -67,7 +67,9 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         )
     _check_solvers(model)
     ca = import_casadi()
-    generator = ca.CodeGenerator("mhe_model.c", {"casadi_int": "int", "include_math": False})
+    # Without comments, which would have the numbers of large matrices again.
+    options = {"casadi_int": "int", "include_math": False, "verbose": False}
+    generator = ca.CodeGenerator("mhe_model.c", options)
     calls = []
     for which in ("f", "h"):
         function = getattr(model, which)
@@ -211,8 +213,31 @@ _EXPORTED = re.compile(
 )
 
 
+# CasADi's own product adds up each entry by itself, with steps of a column's length in the memory.
+_PRODUCT = re.compile(r"(?<=^void )casadi_mtimes_dense\(.*?^}\n", re.M | re.S)
+_BY_COLUMNS = """casadi_mtimes_dense(const casadi_real* x, casadi_int nrow_x, casadi_int ncol_x,
+    const casadi_real* y, casadi_int ncol_y, casadi_real* restrict z, casadi_int tr) {
+  casadi_int i, j, k;
+  if (tr) {
+    for (i=0; i<ncol_y; ++i)
+      for (j=0; j<ncol_x; ++j)
+        for (k=0; k<nrow_x; ++k)
+          z[j + i*ncol_x] += x[k + j*nrow_x] * y[k + i*nrow_x];
+    return;
+  }
+  for (i=0; i<ncol_y; ++i) {
+    for (k=0; k<ncol_x; ++k) {
+      const casadi_real *column = x + k*nrow_x, factor = y[k + i*ncol_x];
+      for (j=0; j<nrow_x; ++j) z[j + i*nrow_x] += column[j] * factor;
+    }
+  }
+}
+"""
+
+
 def _bare(text: str) -> str:
     """CasADi's code without what only a caller from outside needs, all of it static."""
+    text = _PRODUCT.sub(_BY_COLUMNS, text)
 
     def kept(match: re.Match[str]) -> str:
         wanted = "casadi_real** arg" in match["head"]

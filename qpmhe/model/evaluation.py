@@ -282,9 +282,10 @@ class VirtualMachine:
             elif name == "h":
                 made[name] = model.h(made["x"], u)
             else:
-                value = self._expression(name.partition("_")[0])
+                which = name.partition("_")[0]
+                slope = model.slope(which, self._expression(which), made["x"], u, dt)
                 # Transposed: CasADi stores by columns, NumPy by rows.
-                made[name] = ca.densify(ca.jacobian(value, made["x"]).T)
+                made[name] = ca.densify(slope.T)
         return made[name]
 
     def _residuals(self, count: int) -> Buffers:

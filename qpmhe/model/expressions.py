@@ -13,6 +13,7 @@ from .._checks import dimension, positive
 from ..errors import InvalidInputError, ModelError
 from .discretize import Discretization, checked_discretization
 from .functions import check_inputs, takes_input
+from .products import has_products, with_slope
 
 
 def import_casadi() -> Any:
@@ -69,9 +70,8 @@ class CasadiModel:
         Also where each nonzero is in the dense Jacobian, counted by rows.
         """
         ca, function = import_casadi(), getattr(self, which)
-        x, u = _symbols(ca, function, self.width, self.m)
-        value = function(x, u)
-        slopes = ca.jacobian(value, x)
+        x, u = symbols(function, self.width, self.m)
+        value, slopes = with_slope(function, x, u)
         rows, columns = slopes.sparsity().get_triplet()
         nonzeros = ca.sparsity_cast(slopes, ca.Sparsity.dense(slopes.nnz(), 1))
         made = ca.Function(f"{which}_jacobian", [x, u], [value, nonzeros])
@@ -81,7 +81,7 @@ class CasadiModel:
         """The discrete-time map as a casadi.Function of (x, u, dt), unless it is implicit."""
         assert not self.is_implicit
         ca = import_casadi()
-        x, u = _symbols(ca, self.f, self.n, self.m)
+        x, u = symbols(self.f, self.n, self.m)
         dt = type(x).sym("dt")
         following = x
         if self.how is None:
@@ -91,6 +91,27 @@ class CasadiModel:
             for _ in range(self.how.steps):
                 following = self._substep(following, u, h)
         return ca.Function("step", [x, u, dt], [following])
+
+    def slope(self, name: str, value: Any, x: Any, u: Any, dt: Any) -> Any:
+        """The Jacobian by x of ``value``, which is the map f or h at these symbols."""
+        ca, function = import_casadi(), getattr(self, name)
+        if not has_products(function):
+            return ca.jacobian(value, x)
+        if name == "h" or self.how is None:
+            return with_slope(function, x, u)[1]
+        h, slope, one = dt / self.how.steps, ca.DM.eye(self.n), ca.DM.eye(self.n)
+        for _ in range(self.how.steps):
+            k1, K1 = with_slope(self.f, x, u)
+            inner = one + h * K1
+            if self.how.method == "rk4":
+                k2, J2 = with_slope(self.f, x + h / 2 * k1, u)
+                K2 = ca.mtimes(J2, one + h / 2 * K1)
+                k3, J3 = with_slope(self.f, x + h / 2 * k2, u)
+                K3 = ca.mtimes(J3, one + h / 2 * K2)
+                K4 = ca.mtimes(with_slope(self.f, x + h * k3, u)[1], one + h * K3)
+                inner = one + h / 6 * (K1 + 2 * (K2 + K3) + K4)
+            slope, x = ca.mtimes(inner, slope), self._substep(x, u, h)
+        return slope
 
     def _substep(self, x: Any, u: Any, h: Any) -> Any:
         assert self.how is not None
@@ -166,7 +187,9 @@ def _agreed(name: str, stated: int | None, found: int) -> int:
     return int(found)
 
 
-def _symbols(ca: Any, function: Any, n: int, m: int) -> tuple[Any, Any]:
+def symbols(function: Any, n: int, m: int) -> tuple[Any, Any]:
+    """Columns x (n,) and u (m,) of symbols of the kind that a function takes."""
+    ca = import_casadi()
     kind = ca.SX if function.is_a("SXFunction") else ca.MX
     return kind.sym("x", n), kind.sym("u", m)
 

@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import contractions
 from .forms import forms
+from .products import LEAST, Products
 from .stand_ins import MakingRecord, with_symbols, without_symbols
 from .symbols import INSTEAD, NUMBERS, NotTraceableError, Symbol, SymbolArray, flat, plain
 
@@ -40,9 +42,12 @@ _NUMBERS_ONLY = {"bitwise_and", "bitwise_or", "bitwise_xor", "invert"}
 class ExpressionRecord(MakingRecord):
     """Symbols carry scalar expressions (casadi.SX)."""
 
-    def __init__(self, casadi: Any, watched: bool = False) -> None:
+    def __init__(
+        self, casadi: Any, watched: bool = False, products: Products | None = None
+    ) -> None:
         super().__init__()
         self.casadi, self.watched = casadi, watched
+        self._product = casadi.mtimes if products is None else products.of
 
     @without_symbols
     def symbols(self, column: Any) -> SymbolArray:
@@ -268,7 +273,7 @@ class ExpressionRecord(MakingRecord):
             return np.zeros(shape)
         # In CasADi itself: quicker than entry by entry.
         rows, columns = np.atleast_2d(a), b.reshape(b.shape[0], -1)
-        found = self.casadi.mtimes(self.matrix(rows), self.matrix(columns))
+        found = self._product(self.matrix(rows), self.matrix(columns))
         return self.from_matrix(found, shape)
 
     @without_symbols
@@ -507,8 +512,39 @@ def _einsum(record: ExpressionRecord, *operands: Any, **options: Any) -> Any:
     options.pop("optimize", None)
     if options:
         raise TypeError
-    arrays: Any = (one if isinstance(one, (str, list)) else _objects(one) for one in operands)
-    return record.finished(np.asarray(np.einsum(*arrays), np.object_))
+    arrays: Any = [one if isinstance(one, (str, list)) else _objects(one) for one in operands]
+    found = None
+    if len(arrays) == 3 and _holds_large(arrays[1:]):
+        subscripts, left, right = arrays
+        names = contractions.of_subscripts(subscripts, left, right)
+        found = names and contractions.product(record.product, left, right, names)
+    return record.finished(np.asarray(
+        np.einsum(*arrays) if found is None else plain(found), np.object_
+    ))
+
+
+def _tensordot(record: ExpressionRecord, a: Any, b: Any, axes: Any = 2) -> Any:
+    left, right = _objects(a), _objects(b)
+    names = contractions.of_axes(axes, left, right)
+    found = contractions.product(record.product, left, right, names)
+    return record.finished(np.asarray(
+        np.tensordot(left, right, axes) if found is None else plain(found), np.object_
+    ))
+
+
+def _inner(record: ExpressionRecord, a: Any, b: Any) -> Any:
+    left, right = _objects(a), _objects(b)
+    if left.ndim and right.ndim:
+        return _tensordot(record, left, right, (-1, -1))
+    return record.finished(np.asarray(np.inner(left, right), np.object_))
+
+
+def _holds_large(arrays: Sequence[Any]) -> bool:
+    """Whether one of two arrays is of symbols, and another one of many numbers."""
+    symbolic = [any(isinstance(one, Symbol) for one in array.flat) for array in arrays]
+    return any(symbolic) and any(
+        array.size >= LEAST and not of for array, of in zip(arrays, symbolic, strict=True)
+    )
 
 
 # NumPy's other functions that have a form of their own, with the record as first argument.
@@ -516,7 +552,8 @@ _FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.where: _where, np.clip: _clipped, np.select: _selected, np.round: _rounded,
     np.around: _rounded, np.interp: _interpolated, np.linalg.norm: _norm, np.dot: _dot,
     np.linalg.solve: _solved, np.linalg.inv: _inverse, np.linalg.det: _determinant,
-    np.einsum: _einsum, np.cross: _cross, np.nan_to_num: _no_nan, np.piecewise: _piecewise,
+    np.einsum: _einsum, np.tensordot: _tensordot, np.inner: _inner, np.cross: _cross,
+    np.nan_to_num: _no_nan, np.piecewise: _piecewise,
     np.zeros_like: lambda record, a, dtype=None, *_, shape=None, **__: _like(
         record, a, 0.0, dtype, shape
     ),

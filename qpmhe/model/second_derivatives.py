@@ -153,11 +153,13 @@ def _function(model: CasadiModel) -> Any:
     """A function of x, (u, dt) and p to the parts of `Curvature`, each stored by rows."""
     ca = import_casadi()
     kind = ca.SX if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else ca.MX
-    x, given = kind.sym("x", model.n), kind.sym("u", model.m + 1)
+    x, u, dt = kind.sym("x", model.n), kind.sym("u", model.m), kind.sym("dt")
     forces = kind.sym("p", model.n + model.p)
-    u, dt = given[: model.m], given[model.m]
     values = ca.vertcat(model.step()(x, u, dt), model.h(x, u))
     slope = ca.gradient(ca.dot(forces, values), x)
     found = [ca.jacobian(slope, x), ca.jacobian(slope, u), ca.jacobian(values, u)]
     # Transposed: CasADi stores by columns, NumPy by rows.
-    return ca.Function("curvature", [x, given, forces], [ca.densify(one.T) for one in found])
+    made = ca.Function("curvature", [x, u, dt, forces], [ca.densify(one.T) for one in found])
+    given = kind.sym("u", model.m + 1)
+    results = made.call([x, given[: model.m], given[model.m], forces])
+    return ca.Function("curvature", [x, given, forces], results)

@@ -15,9 +15,10 @@ from ..errors import EngineWarning
 from .derivatives import Jacobian
 from .discretize import Discretization
 from .evaluation import Evaluator, machine
-from .expressions import CasadiModel, import_casadi
+from .expressions import CasadiModel, import_casadi, symbols
 from .functions import BatchedFunction, Trusted
 from .points import ALL, USUAL, Magnitude, Points, points
+from .products import MOST_OPERATIONS, operations, with_slope
 from .sets import ConvexSet
 from .tracing import Traced, difference, expressed
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# The function takes longer in CasADi's virtual machine, and in a compiler, than it is worth.
-_MOST_OPERATIONS = 20_000
 # Entries of a given Jacobian are right where they differ by less than this share of their row's.
 _SAME = 1e-9
 
@@ -154,18 +153,21 @@ class ModelTrace:
     def _traced(self, name: str, where: Points) -> Traced:
         function = self._functions[name]
         source = function if self._sources is None else self._sources[name]
-        found = expressed(source, (self._width, self._m), name)
+        found = expressed(source, (self._width, self._m), name, products=True)
         if found.function is None:
             return found
         fault = self._difference(name, found, where)
         if fault:
             warn_of(f"{name} cannot be traced: {fault}")
             return Traced(None, fault)
-        size, count = self._width if name == "f" else self._p, found.function.n_instructions()
+        size, count = self._width if name == "f" else self._p, operations(found.function)
         if found.function.numel_out() != size:
             return Traced(None, f"it returns shape {found.shape} of symbols; expected ({size},)")
-        if count > _MOST_OPERATIONS:
-            return Traced(None, f"it takes {count} operations, more than {_MOST_OPERATIONS}")
+        if count > MOST_OPERATIONS:
+            return Traced(None, (
+                f"it takes {count} operations, more than {MOST_OPERATIONS}; write a product with "
+                "a matrix as A @ x, which is one"
+            ))
         if self._sources is None:
             self._batched[name].reads_only = True
         return found
@@ -213,8 +215,8 @@ class ModelTrace:
     def is_rate(self, jacobian: Jacobian, pinned: Pinned, scales: Array | None) -> bool:
         """Whether a given Jacobian of the rate equals the traced derivative, up to rounding."""
         ca, rate = import_casadi(), pinned.found["f"].function
-        x, u = ca.SX.sym("x", self._n), ca.SX.sym("u", self._m)
-        slope = ca.Function("slope", [x, u], [ca.densify(ca.jacobian(rate(x, u), x))])
+        x, u = symbols(rate, self._n, self._m)
+        slope = ca.Function("slope", [x, u], [ca.densify(with_slope(rate, x, u)[1])])
         return self._same(jacobian, lambda x, u: np.array(slope(x, u)), scales)
 
     def _same(
@@ -284,8 +286,7 @@ def evaluated_alone(
 def depends(trace: Traced) -> NDArray[np.bool_]:
     """Which entries of a traced function (size,) depend on each entry of its first argument."""
     ca = import_casadi()
-    columns = [ca.SX.sym("a", trace.function.numel_in(k)) for k in range(trace.function.n_in())]
-    sparsity = ca.jacobian(trace.function(*columns), columns[0]).sparsity()
+    sparsity = trace.function.jac_sparsity(0, 0)
     found: NDArray[np.bool_] = np.array(ca.DM(sparsity, 1.0)) != 0.0
     return found
 

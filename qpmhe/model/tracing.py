@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from .operations import ExpressionRecord
 from .points import ALL
 from .points import arguments as arguments_at
+from .products import Products
 from .stand_ins import numpy_on_symbols
 from .symbols import (
     _MACHINERY,
@@ -45,7 +46,8 @@ class Traced(NamedTuple):
     ----------
     function : casadi.Function or None
         Of columns (size, 1), one for each argument, to one dense column: the entries of the
-        function's value row by row. Of scalar operations (SX) alone.
+        function's value row by row. Of scalar operations (SX) alone, unless ``products`` were
+        wanted (see `expressed`).
     reason : str
         Why there is no function; blank if there is one.
     shape : tuple of int
@@ -123,14 +125,18 @@ def traced(
 
 def expressed(
     function: Callable[..., Any], sizes: Sequence[int], name: str = "traced",
-    watched: bool = False,
+    watched: bool = False, products: bool = False,
 ) -> Traced:
-    """The expression that a function computes from symbols, not compared with the function yet."""
+    """The expression that a function computes from symbols, not compared with the function yet.
+
+    With ``products``, a product with a large constant matrix is one operation.
+    """
     import casadi  # late: `import qpmhe` does without
 
     columns = [casadi.SX.sym(f"a{k}", size) for k, size in enumerate(sizes)]
     for deeper in (False, True):  # a model that needs no more is traced without
-        record = ExpressionRecord(casadi, watched)
+        made = Products()
+        record = ExpressionRecord(casadi, watched, made if products else None)
         watch = _watch(record) if watched else contextlib.nullcontext()
         with numpy_on_symbols(record, deeper), watch:
             value, error = run(record, function, [record.symbols(one) for one in columns])
@@ -154,7 +160,7 @@ def expressed(
         record.closed = True
     if record.refused:
         return Traced(None, record.reason)
-    return Traced(casadi.Function(name, columns, [column]), "", values.shape)
+    return Traced(made.function(name, columns, column), "", values.shape)
 
 
 # Functions and attributes by which code tells symbols from numbers, without their knowledge.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from .._checks import Array
 from ..diagnosis.bank import FilterBank, Hypothesis
 from ..errors import QpmheError
 from ..model.expressions import import_casadi
+from ..model.products import in_scalars
 from ..model.system import System
 from .data import Data, Mask
 from .structures import Structure
@@ -136,6 +138,8 @@ class _Filter:
         model = self._system.symbolic
         if model is not None and model.is_implicit:  # a step is no expression
             model = None
+        if model is not None:
+            model = replace(model, f=in_scalars(model.f), h=in_scalars(model.h))
         residual = system.output_residual
         self.traced = (
             model is not None and model.f.is_a("SXFunction") and model.h.is_a("SXFunction")

@@ -340,6 +340,50 @@ def _swing(method="radau", steps=1):
     return Case(system, observer, cost, np.array([0.1, 0.1]), tuple(samples), options)
 
 
+def _layered(method=None, steps=1, **options):
+    """A network with a layer of 24 by 24, a product with which is one operation."""
+    draw = np.random.default_rng(5).standard_normal
+    first, middle, last = draw((24, 4)) / 2.0, draw((24, 24)) / 5.0, draw((3, 24)) / 10.0
+
+    def rate(x, u):
+        hidden = np.tanh(first @ np.concatenate((x, u)))
+        return last @ np.tanh(middle @ hidden + 0.1) - x
+
+    def output(x):
+        return (draw_out @ np.tanh(x))[:2]
+
+    draw_out = draw((140, 3)) / 3.0
+    if method is None:
+        system = qpmhe.System(lambda x, u: x + 0.3 * rate(x, u), output, n=3, p=2, m=1)
+    else:
+        system = qpmhe.System.from_ode(
+            rate, output, dt=0.3, n=3, p=2, m=1, method=method, steps=steps
+        )
+    cost = QuadraticCost(
+        prior=2.0 * np.eye(3), disturbance=20.0 * spd(1, 3), noise=10.0 * spd(2, 2)
+    )
+    generator, x, samples = np.random.default_rng(3), np.array([0.3, -0.2, 0.1]), []
+    for u in generator.uniform(-1.0, 1.0, (14, 1)):
+        samples.append({"y": system.h(x, u) + 0.1 * generator.standard_normal(2), "u": u})
+        x = system.f(x, u)
+    observer = Luenberger([[0.2, 0.1], [0.0, 0.2], [0.1, 0.0]])
+    return Case(system, observer, cost, np.zeros(3), tuple(samples), {"horizon": 4, "max_qps": 2})
+
+
+def _dense():
+    """A dense linear part that is a product of one operation."""
+    matrix = np.linalg.qr(np.random.default_rng(4).standard_normal((20, 20)))[0]
+    n, p = 20, 2
+    system = qpmhe.System(
+        lambda x: 0.95 * np.einsum("...j,ij->...i", x, matrix) + 0.05 * np.sin(x),
+        lambda x: x[..., :2], n=n, p=p,
+    )
+    cost = QuadraticCost(disturbance=20.0 * np.eye(n), noise=10.0 * np.eye(p))
+    observer = EKF(prior=np.eye(n), disturbance=0.05 * np.eye(n), noise=0.1 * np.eye(p))
+    samples = recorded(system, np.full(n, 0.2), steps=10)
+    return Case(system, observer, cost, np.zeros(n), samples, {"horizon": 4, "max_qps": 1})
+
+
 def _rate(x):
     return ca.sin(ca.vertcat(x[1:], x[0])) - 1.4 * x
 
@@ -845,6 +889,13 @@ FEATURES = {
         "algebraic": (_swing, with_conditions),
         "algebraic substeps": (lambda: _swing(steps=2), filtered(), gaps, AGAIN, WARM),
         "algebraic midpoint": (lambda: _swing("midpoint", 3), filtered(UKF), gaps),
+    },
+    "products": {
+        "layered": (_layered, with_conditions, AGAIN, WARM),
+        "layered rk4": (lambda: _layered("rk4", 2), filtered(), gaps),
+        "layered euler": (lambda: _layered("euler", 2), conditions),
+        "layered radau": (lambda: _layered("radau"), gaps),
+        "dense": (_dense,),
     },
     "failing": {
         "power failing": (lambda: _failing(1.8), losses(**dict.fromkeys(TERMS, power(1.5)))),

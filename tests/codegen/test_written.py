@@ -97,10 +97,13 @@ def test_the_compiled_step_is_clean(part, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
 
 
+SINGLE_TOO = "inputs", "states in a polytope", "algebraic", "layered"
+
+
 @pytest.mark.parametrize("name", [
     "inputs", "euler", "extended", "unscented", "mixed losses", "states in a polytope",
     "fewer disturbances in sets", "held with gaps", "soft states", "restored",
-    "restarted extended", "algebraic", "radau",
+    "restarted extended", "algebraic", "radau", "layered",
 ])
 def test_the_written_code_is_the_python_step(name, tmp_path):
     one = case(name)
@@ -108,7 +111,7 @@ def test_the_written_code_is_the_python_step(name, tmp_path):
     reference = one.estimator("python")
     expected = [reference.update(sample["y"], sample.get("u")) for sample in samples]
     ways = [("double", 10 * one.tolerance), ("float", 2e-2)]
-    for real, tolerance in ways[: 1 + (name in ("inputs", "states in a polytope", "algebraic"))]:
+    for real, tolerance in ways[: 1 + (name in SINGLE_TOO)]:
         found = estimates(one, samples, tmp_path, (*FLAGS, *WATCHED, *STRICT), real=real)
         for got, true in zip(found, expected, strict=True):
             assert (got["time"], got["length"]) == (true.time, len(true.trajectory) - 1)
