@@ -66,8 +66,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         onto it, with an `ObserverWarning`.
     backend : str or Solver
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
-        factorisation and another solver only where inequalities are active; a named backend solves
-        every QP. A solver made by ``qpmhe.solvers.create`` keeps its cap and tolerances. Several
+        factorisation and, only where inequalities are active, another solver or active sets on that
+        factorisation; a named backend solves every QP. A solver made by ``qpmhe.solvers.create`` keeps its cap and tolerances. Several
         estimators of one thread may share it; it starts cold whenever the estimator changes.
     max_qps : int or None
         QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence; it

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import chain
 from time import perf_counter
 
+from .active_set import ActiveSetSolver
 from .backend import make_solver
 from .banded import BandedSolver
 from .native import NATIVE
@@ -14,20 +16,28 @@ from .qp import QP, Array
 from .solution import Solution, SolveStatus
 from .solver import ContainedSolver, Solver
 
-# daqp is the fastest up to about this many unknowns; sparse interior points win beyond.
-_SMALL = 60
+# daqp is the fastest up to about this many unknowns; beyond, the active set on the banded
+# factorisation is, or a sparse interior point where that takes more exchanges than these.
+_SMALL, _EXCHANGES = 60, 40
 _SMALL_ORDER = ("daqp", "piqp", "clarabel", "proxqp", "osqp")
 _LARGE_ORDER = ("piqp", "clarabel", "osqp", "proxqp")
 
 
 class AutoSolver(Solver):
-    """Solve by `BandedSolver`, or by a QP solver if the result violates an inequality."""
+    """Solve by `BandedSolver`, or by a QP solver if the result violates an inequality.
+
+    Without a cap, large QPs go to `ActiveSetSolver` first.
+    """
 
     _judges = True
 
     def __init__(self, options: SolverOptions) -> None:
         super().__init__(options)
         self._banded = BandedSolver(options)
+        self._exact = None if options.max_iterations else ContainedSolver(
+            ActiveSetSolver(options, most_exchanges=_EXCHANGES)
+        )
+        self._active = False  # whether constraints were active at its last solution
         self._others: dict[bool, list[ContainedSolver]] = {}
         self._shifts = 0  # of which the others do not know yet
 
@@ -35,30 +45,56 @@ class AutoSolver(Solver):
         return type(self), (self.options,)
 
     def _solve(self, qp: QP, start: Array | None) -> Solution:
-        limit = remaining = self.time_limit
-        began = 0.0 if limit is None else perf_counter()
+        limit = self.time_limit
+        until = None if limit is None else perf_counter() + limit
+        small, exact = qp.size <= _SMALL, self._exact
+        if small:
+            exact = None
+        elif exact is not None and self._active:  # which the factorisation alone would not see
+            answer = self._exactly(exact, qp, limit)
+            if answer is not None:
+                return answer
+            exact = None
         solution = self._banded._solve(qp, start)
         if solution.status is SolveStatus.SOLVED:
             return solution
-        small = qp.size <= _SMALL
+        if exact is not None:
+            answer = self._exactly(exact, qp, _left(until))
+            if answer is not None:
+                return answer
         if small not in self._others:
             self._others[small] = self._choose(small)
-        if self._shifts:
-            self._pass_shifts_on(qp.stages)
+        self._pass_shifts_on(qp.stages)
         for other in self._others[small]:
-            if limit is not None:
-                remaining = limit - (perf_counter() - began)
-                if remaining <= 0.0:
-                    break
-            answer = other.solve(qp, start, remaining)
+            left = _left(until)
+            if left is not None and left <= 0.0:
+                break
+            answer = other.solve(qp, start, left)
             if answer.status.usable:
                 return answer
         return solution
 
+    def _exactly(self, exact: ContainedSolver, qp: QP, limit: float | None) -> Solution | None:
+        """The solution by the active set; None where it does not find it."""
+        self._pass_shifts_on(qp.stages)
+        answer = exact.solve(qp, None, limit)
+        solved = answer.status is SolveStatus.SOLVED
+        self._active = solved and any(
+            duals is not None and duals.any() for duals in (answer.bound_duals, answer.row_duals)
+        )
+        return answer if solved else None
+
+    @property
+    def _kept(self) -> Iterator[ContainedSolver]:
+        """The solvers that keep something between solves."""
+        if self._exact is not None:
+            yield self._exact
+        yield from chain.from_iterable(self._others.values())
+
     def forget(self) -> None:
         """Reset the QP solvers; see `Solver.forget`."""
-        self._shifts = 0
-        for other in chain.from_iterable(self._others.values()):
+        self._shifts, self._active = 0, False
+        for other in self._kept:
             other.forget()
 
     def shift(self) -> None:
@@ -66,7 +102,7 @@ class AutoSolver(Solver):
         self._shifts += 1
 
     def _pass_shifts_on(self, stages: int) -> None:
-        for other in chain.from_iterable(self._others.values()):
+        for other in self._kept if self._shifts else ():
             # After as many as there are stages, nothing that was kept belongs to any.
             for _ in range(min(self._shifts, stages)):
                 other.shift()
@@ -93,3 +129,8 @@ class AutoSolver(Solver):
                 with suppress(Exception):
                     chosen.append(ContainedSolver(make_solver(backend, options)))
         return chosen
+
+
+def _left(until: float | None) -> float | None:
+    """The seconds left until then."""
+    return None if until is None else until - perf_counter()

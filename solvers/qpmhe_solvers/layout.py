@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from .qp import QP, Array, Places, as_csc, hessian_pattern, rows_pattern
 
 if TYPE_CHECKING:
-    from scipy.sparse import csc_matrix
+    from scipy.sparse import csc_matrix, csr_matrix
 
 Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
@@ -211,13 +212,27 @@ def _patterns(
     style: QPStyle, stages: int, n: int, rows: int, constraints: Index, equalities: Index
 ) -> list[csc_matrix]:
     """P, C and A; the entries of the latter are places in own rows, next rows, and a 1."""
-    from scipy.sparse import csc_matrix, triu, vstack
+    upper = style.triangle == "upper" and style.matrices == "csc"
+    every = _every_row(stages, n, rows)
+    return [
+        _upper_hessian(stages, n) if upper else hessian_pattern(stages, n),
+        *(every[chosen].tocsc() for chosen in (constraints, equalities)),
+    ]
 
-    hessian, general = hessian_pattern(stages, n), rows_pattern(stages, n, rows)
-    if style.triangle == "upper" and style.matrices == "csc":
-        hessian = triu(hessian, format="csc")
+
+@lru_cache(maxsize=64)
+def _upper_hessian(stages: int, n: int) -> csc_matrix:
+    from scipy.sparse import triu
+
+    return triu(hessian_pattern(stages, n), format="csc")
+
+
+@lru_cache(maxsize=64)
+def _every_row(stages: int, n: int, rows: int) -> csr_matrix:
+    """The rows of all constraints, bounds first, and a void one."""
+    from scipy.sparse import csc_matrix, vstack
+
     unit = np.arange(stages * n)
     ones = csc_matrix((np.full(unit.size, 2 * stages * rows * n), (unit, unit)))
     void = csc_matrix((1, unit.size), dtype=np.intp)
-    every = vstack((ones, general, void), format="csr")
-    return [hessian, *(every[chosen].tocsc() for chosen in (constraints, equalities))]
+    return vstack((ones, rows_pattern(stages, n, rows), void), format="csr")

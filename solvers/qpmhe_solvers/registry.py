@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from importlib import metadata
 
+from .active_set import ActiveSetSolver
 from .auto import AutoSolver
 from .backend import Backend, make_solver
 from .banded import BandedSolver
@@ -163,6 +164,10 @@ register(Backend(  # the default one
 register(Backend(
     "banded", BandedSolver, "banded Cholesky", matrices="banded", inequalities=False,
     keeps_workspace=True,
+))
+register(Backend(
+    "active_set", ActiveSetSolver, "active set", matrices="banded", iteration_cap=True,
+    iterate_at_cap=True, time_limit=True, keeps_duals=True, reports_infeasibility=True,
 ))
 for _one in sorted((*NATIVE.values(), *DISPATCHED), key=lambda backend: backend.name):
     register(_one)

@@ -32,6 +32,7 @@ def test_it_is_banded_where_no_inequality_binds(monkeypatch):
 
 
 def test_it_chooses_by_size_cap_and_clock(monkeypatch):
+    monkeypatch.setattr(qpmhe_solvers.auto, "_EXCHANGES", 0)
     chosen, make_solver = [], qpmhe_solvers.auto.make_solver
     monkeypatch.setattr(
         qpmhe_solvers.auto, "make_solver",
