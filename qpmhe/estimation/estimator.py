@@ -67,8 +67,9 @@ class MovingHorizonEstimator(EstimatorMemory):
     backend : str or Solver
         QP solver, one of ``qpmhe.solvers.available()``. ``auto`` uses a banded Cholesky
         factorisation and, only where inequalities are active, another solver or active sets on that
-        factorisation; a named backend solves every QP. A solver made by ``qpmhe.solvers.create`` keeps its cap and tolerances. Several
-        estimators of one thread may share it; it starts cold whenever the estimator changes.
+        factorisation; a named backend solves every QP. A solver made by ``qpmhe.solvers.create``
+        keeps its cap and tolerances. Several estimators of one thread may share it; it starts cold
+        whenever the estimator changes.
     max_qps : int or None
         QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence; it
         ends before, with `Status.UNCONVERGED`, at 100 QPs, and without a cap on iterations or time
