@@ -119,7 +119,7 @@ def check_guarded(bound: ObserverBound, estimator: MovingHorizonEstimator, sizes
          f"the observer's bound is {bound.evidence}, not proved"),
         (sizes.deviations,
          f"the sizes are {sizes.source}, and Gaussian noises are not bounded; state bounds, "
-         "sizes=Sizes(disturbance=..., noise=...)"),
+         "sizes=Sizes(disturbance=..., noise=...), or --max-disturbance and --max-noise"),
         (settings.candidate != "observer",
          "candidate='reinitialized' restarts the observer at each sample"),
         (settings.restart, "restart=True restarts the observer from estimates"),

@@ -121,8 +121,10 @@ class Monitor:
     barred : str
         Why the theorem's bound, which goes back to the first sample, does not follow; empty while
         it does. An estimate with `Status.RESTORED` ends it; the bound by the measured cost stays.
-    steps : int
-        Samples seen.
+    steps, moved : int
+        Samples seen, and those of which the guard has moved an estimate.
+    unguarded : str
+        Why the guard is off; empty while it is on.
 
     Examples
     --------
@@ -180,7 +182,7 @@ class Monitor:
         self._ends = REINITIALIZED if estimator.settings.candidate != "observer" else ""
         self.lost: int | None = None
         self.reason = ""
-        self.steps, self._horizon = 0, estimator.horizon
+        self.steps, self.moved, self._horizon = 0, 0, estimator.horizon
         # Of the window: z and b at its states, and its inputs.
         self._before: deque[tuple[Array, float]] = deque(maxlen=estimator.horizon + 1)
         self._before.append((self._z, self._tube.radius))
@@ -295,6 +297,7 @@ class Monitor:
                 moved.append(name)
         if self.unguarded:
             return state, filtered, ()
+        self.moved += bool(moved)
         return later.point, now.point, tuple(moved)
 
     def _order(self, time: int) -> str:
@@ -375,12 +378,16 @@ class Monitor:
         return not self.barred
 
     def summary(self) -> str:
-        """How long the observer's bound and the theorem's hypotheses held."""
+        """How long the observer's bound and the theorem's hypotheses held, and what a guard did."""
         held = f"held up to sample {self.lost}: there {self.reason}."
         if self.lost is None:
             held = f"held at all {self.steps} samples."
         theorem = f"does not apply: {self.barred}" if self.barred else "applies"
-        return f"The observer's bound {held} The theorem {theorem}."
+        guard = ""
+        if self._guard is not None:
+            off = f", and is off {self.unguarded}" if self.unguarded else ""
+            guard = f" The guard moved estimates at {self.moved} of {self.steps} samples{off}."
+        return f"The observer's bound {held} The theorem {theorem}.{guard}"
 
     def state_dict(self) -> dict[str, Any]:
         """What `load_state_dict` restores of the observer's bound, as plain numbers and arrays."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..costs import Cost
 from ..errors import OptionError, SetError
@@ -17,17 +20,20 @@ from .certificate import Certificate, examined, horizons_of
 from .contraction import certify_observer, synthesise_gain
 from .deadline import Deadline
 from .evidence import CertificateError, NotCertifiedError
+from .monitor import Monitor
 from .observer_bound import ObserverBound
 from .properties import ObserverStability
 from .regions import Region, bounded_region
 from .sdp import started
-from .sizes import Sizes
+from .sizes import Sizes, stated_size
 
 # Without a region: the simulated states, with this share of their extent on each side.
 _ROOM = 0.75
 # How much of the time the choice of an observer may take.
 _OBSERVER = 0.6
 _QPS = 2  # a sample, in the run on the simulated record
+# An estimator's options that may bar a guard.
+_BARRING = ("candidate", "restart", "infeasible")
 
 
 class Report(NamedTuple):
@@ -37,36 +43,77 @@ class Report(NamedTuple):
     simulated: str
     replaced: str  # which observer took the place of the model's own, and why
     tried: str  # why there is no gain made for the region, where one was looked for in vain
+    guard: str = ""  # what a guard did on the record, or why there is none
+    refused: bool = False  # whether a guard was asked for, and there is none
 
 
 def certify_model(
     system: System, observer: Observer, cost: Cost, scenario: Scenario | None, *,
     horizon: Any, region: ConvexSet | None, inputs: Box | None, seed: int, seconds: float,
+    max_disturbance: ArrayLike | None = None, max_noise: ArrayLike | None = None,
+    guard: bool = False, options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Report:
-    """Certify a model as far as possible, and compare the bound with a simulated record."""
+    """Certify a model as far as possible, and compare the bound with a simulated record.
+
+    The model's options count where they bar a ``guard``.
+    """
     deadline = started(seconds)
     record = None if scenario is None else scenario.simulate(seed)
     place = region_of(system, scenario, region, inputs, record=record)
-    horizons, sizes = horizons_of(horizon), sizes_of(system, cost, scenario)
+    horizons = horizons_of(horizon)
+    sizes = sizes_of(system, cost, scenario, max_disturbance, max_noise)
     observer, stability, replaced, tried = _proved_observer(
         system, observer, place, sizes, deadline.part(_OBSERVER)
     )
     certificate = examined(
         system, observer, cost, place, horizons, sizes, deadline, stability=stability
     )
-    proved, simulated = certificate.observer_bound, ""
-    if proved is not None and scenario is not None and record is not None:
-        run = MovingHorizonEstimator(
-            system, observer, cost, horizon=horizons[-1],
-            initial_state=scenario.initial_estimate, max_qps=_QPS, engine="python",
-        ).run(record.measurements, record.inputs)
+    found, proved = Report(certificate, "", replaced, tried), certificate.observer_bound
+    if proved is None:
+        text = "there is no guard: there is no bound of the observer."
+        return found._replace(guard=text if guard else "", refused=guard)
+    start = place.lower[: system.n] if scenario is None else scenario.initial_estimate
+    own = {name: options[name] for name in _BARRING if guard and name in options}
+    mhe = MovingHorizonEstimator(
+        system, observer, cost, horizon=horizons[-1], initial_state=start, max_qps=_QPS,
+        engine="python", **own,
+    )
+    if guard:
+        try:
+            watch = Monitor(
+                proved, mhe, initial_error=0.0 if scenario is None else initial_error(scenario),
+                guard=True,
+            )
+        except CertificateError as error:
+            return found._replace(guard=str(error), refused=True)
+        if record is not None:
+            found = found._replace(guard=f"seed {seed}: {_guarded(watch, mhe, record)}")
+    if scenario is not None and record is not None:
+        mhe.reset()
+        run = mhe.run(record.measurements, record.inputs)
         band = proved.along(run, initial_error=initial_error(scenario))
-        errors, held = np.linalg.norm(record.states - run.states, axis=1), np.isfinite(band.error)
-        simulated = (
+        errors = np.linalg.norm(record.states - run.states, axis=1)
+        held = np.isfinite(band.error)
+        found = found._replace(simulated=(
             f"seed {seed}: the largest |x - x_hat| is {errors[held].max():.3g}, and the largest "
             f"bound {band.error[held].max():.3g}; {band}"
-        )
-    return Report(certificate, simulated, replaced, tried)
+        ))
+    return found
+
+
+def _guarded(watch: Monitor, mhe: MovingHorizonEstimator, record: Record) -> str:
+    """What a guard does on a record, in words."""
+    inputs = [None] * len(record.measurements) if record.inputs is None else record.inputs
+    errors = []
+    for t, (y, u) in enumerate(zip(record.measurements, inputs, strict=True)):
+        reading = watch.check(mhe.update(y, u), u)
+        if reading.unguarded:
+            return f"{watch.moved} of {t} estimates were moved; it is off {reading.unguarded}"
+        errors.append(np.linalg.norm(record.states[t + 1] - reading.state))
+    return (
+        f"{watch.moved} of {len(errors)} estimates were moved; the largest |x - x_hat| is "
+        f"{max(errors):.3g}"
+    )
 
 
 def _proved_observer(
@@ -148,12 +195,24 @@ def region_of(
     )
 
 
-def sizes_of(system: System, cost: Cost, scenario: Scenario | None) -> Sizes:
-    """The system's W and V, or three standard deviations of the scenario's noises."""
-    if scenario is None:
-        return Sizes.of(None, system, cost)
-    return Sizes.usual(
+def sizes_of(
+    system: System, cost: Cost, scenario: Scenario | None, disturbance: ArrayLike | None = None,
+    noise: ArrayLike | None = None,
+) -> Sizes:
+    """The stated sizes, one number or one a component, or the usual ones.
+
+    These are the system's W and V, or three standard deviations of the scenario's noises.
+    """
+    usual = Sizes.of(None, system, cost) if scenario is None else Sizes.usual(
         system, scenario.disturbance_covariance, scenario.noise_covariance, "the model's scenario"
+    )
+    if disturbance is None and noise is None:
+        return usual
+    w, v = usual.disturbance, usual.noise
+    return Sizes(
+        w if disturbance is None else stated_size("--max-disturbance", disturbance, system.r),
+        v if noise is None else stated_size("--max-noise", noise, system.p), "as stated",
+        usual.deviations and (disturbance is None or noise is None),
     )
 
 

@@ -162,13 +162,26 @@ def certify(
         bool, typer.Option("--design", help="Design weights, discount and horizon by a "
                                             "Lyapunov function, and print code to paste.")
     ] = False,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="Try a guard of estimates on the simulated record, or "
+                                           "say why there is none.")
+    ] = False,
+    max_disturbance: Annotated[
+        str | None,
+        typer.Option(help="Largest |w|, one length or a number for each component. Default: W, "
+                          "else three standard deviations."),
+    ] = None,
+    max_noise: Annotated[
+        str | None, typer.Option(help="Largest |v|, likewise for outputs.")
+    ] = None,
 ) -> None:
     """Prove how far the observer can be from the true state."""
     from .certify import certify as run
 
     certified = run(
         Console(), model, box, horizon, report, out=out, input_box=input_box, seed=seed,
-        seconds=seconds, details=details, with_design=design,
+        seconds=seconds, details=details, with_design=design, guard=guard,
+        max_disturbance=max_disturbance, max_noise=max_noise,
     )
     if not certified:
         raise typer.Exit(1)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from .._checks import make_folder
+from .._checks import Array, make_folder
 from ..certificates.certificate import ASSUMED, Certificate
 from ..certificates.deadline import Deadline
 from ..certificates.evidence import NotCertifiedError, at_most, json_ready
@@ -23,7 +23,7 @@ from ..certificates.theorem import DecayingSums
 from ..errors import OptionError
 from ..models.loading import build, find
 from ..records.record_model import model_parts
-from .values import read_box
+from .values import read_box, read_numbers
 
 Rows = list[tuple[str, str]]
 
@@ -32,6 +32,7 @@ def certify(
     console: Console, model: str, box: str | None = None, horizon: str | None = None,
     report: Path | None = None, *, out: Path | None = None, input_box: str | None = None,
     seed: int = 0, seconds: float = 60.0, details: bool = False, with_design: bool = False,
+    guard: bool = False, max_disturbance: str | None = None, max_noise: str | None = None,
 ) -> bool:
     """Certify a model, and show the result."""
     horizons = _horizons(horizon)
@@ -52,7 +53,9 @@ def certify(
     with console.status("looking for matrices, and verifying them"):
         found = certify_model(
             system, observer, cost, scenario, horizon=horizons or options["horizon"],
-            region=region, inputs=inputs, seed=seed, seconds=seconds,
+            region=region, inputs=inputs, seed=seed, seconds=seconds, guard=guard, options=options,
+            max_disturbance=_numbers("--max-disturbance", max_disturbance),
+            max_noise=_numbers("--max-noise", max_noise),
         )
     certificate = found.certificate
     other = "With a gain made for the region: " if found.replaced else ""
@@ -61,6 +64,8 @@ def certify(
     _show(console, [("model", title), *_findings(found)])
     for text in certificate.failures:
         _print(console, f"[bold red]Not certified:[/] {escape(text)}")
+    if found.refused:
+        _print(console, f"[bold red]{escape(found.guard[:1].upper() + found.guard[1:])}[/]")
     if not certificate.holds:
         _print(
             console, "What holds without any certificate: the estimate costs no more than the "
@@ -76,7 +81,7 @@ def certify(
     if report is not None:
         content = certificate.to_dict() | {
             "model": model, "certified": certificate.holds, "replaced": found.replaced,
-            "simulated": found.simulated, "design": json_ready(plan),
+            "simulated": found.simulated, "guard": found.guard, "design": json_ready(plan),
         }
         try:
             report.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
@@ -86,7 +91,11 @@ def certify(
     if out is not None and certificate.observer_bound is not None:
         save(certificate.observer_bound, out)
         _wrote(console, out)
-    return certificate.holds
+    return certificate.holds and not found.refused
+
+
+def _numbers(option: str, text: str | None) -> Array | None:
+    return None if text is None else read_numbers(option, text)
 
 
 def _wrote(console: Console, file: Path) -> None:
@@ -125,6 +134,8 @@ def _findings(found: Report) -> Rows:
             ))
     if found.simulated:
         rows.append(("simulated", found.simulated))
+    if found.guard and not found.refused:
+        rows.append(("guard", found.guard))
     for each, limit in certificate.limits():
         vacuous = ""
         if not limit < certificate.diameter:

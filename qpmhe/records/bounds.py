@@ -13,7 +13,7 @@ from .._checks import Array
 from ..certificates.monitor import Monitor
 from ..certificates.observer_bound import ObserverBound, bound_observer
 from ..certificates.report import initial_error, region_of, sizes_of
-from ..certificates.sizes import Size, Sizes
+from ..certificates.sizes import Size, stated_size
 from ..errors import OptionError
 from ..estimation.estimate import Estimate
 from ..model.sets import Box
@@ -63,22 +63,16 @@ class RowBounds:
         report: Callable[[str], None] | None = None,
     ) -> None:
         mhe, scenario = model.estimator, model.scenario
-        system, n, p = mhe.system, mhe.system.n, mhe.system.p
+        system, n = mhe.system, mhe.system.n
         region = region_of(
             system, scenario, options.box, options.input_box, option="--bound-box"
         )
-        usual = sizes_of(system, mhe.cost, scenario)
-        sizes = Sizes(
-            _size("--max-disturbance", options.max_disturbance, system.r, usual.disturbance),
-            _size("--max-noise", options.max_noise, p, usual.noise),
-            usual.source if options.max_disturbance is None and options.max_noise is None
-            else "as stated",
-            usual.deviations
-            and (options.max_disturbance is None or options.max_noise is None),
+        sizes = sizes_of(
+            system, mhe.cost, scenario, options.max_disturbance, options.max_noise
         )
         start: Size | None = None if scenario is None else initial_error(scenario)
         if options.initial_error is not None:
-            start = _size("--initial-error", options.initial_error, n, 0.0)
+            start = stated_size("--initial-error", options.initial_error, n)
         if start is None:
             raise OptionError(
                 "--initial-error is missing, and the model has no scenario that states how far the "
@@ -131,17 +125,3 @@ class RowBounds:
         """Continue where another run stopped."""
         self._watch.load_state_dict(state)
 
-
-def _size(option: str, given: ArrayLike | None, size: int, usual: Any) -> Any:
-    """A length, a box of components, or what is usual."""
-    if given is None:
-        return usual
-    values = np.asarray(given, np.float64)
-    if values.ndim == 1 and values.size == 1:
-        values = values[0]
-    if values.shape not in ((), (size,)) or not (values >= 0.0).all():
-        raise OptionError(
-            f"{option} is {np.asarray(given).tolist()}; expected one number >= 0 that bounds the "
-            f"length, or {size}, one for each component."
-        )
-    return float(values) if values.ndim == 0 else Box(-values, values)

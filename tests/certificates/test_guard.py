@@ -162,6 +162,8 @@ def test_adversaries_and_hostile_estimates_stay_within_twice_the_bound(
                 assert np.sqrt(e @ P @ e) <= 2.0 * tube.radius * (1.0 + 1e-9)
                 assert (np.abs(e) <= 2.0 * tube.box * (1.0 + 1e-9)).all()
             assert np.linalg.norm(x - reading.state) <= reading.error
+        assert watch.moved > 10
+        assert f"The guard moved estimates at {watch.moved} of 30 samples." in watch.summary()
     assert acted > 10 * runs
 
 
@@ -180,6 +182,7 @@ def test_usual_estimates_are_not_moved_and_nothing_feeds_back(bound):
         assert (reading.guarded, reading.unguarded) == ((), "")
     reading = watch.check(watched.update([np.nan]))
     assert reading.unguarded.startswith("from sample 15 on: a measurement was missing")
+    assert "at 0 of 16 samples, and is off from sample 15 on: a measurem" in watch.summary()
     plain = Monitor(bound, estimator(bound), initial_error=START)
     assert plain.unguarded == "the monitor has no guard"
 

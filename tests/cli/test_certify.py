@@ -38,6 +38,10 @@ def estimator(bounded=True):
 
 def parts():
     return model()[:3]
+
+def restarts():
+    return qpmhe.MovingHorizonEstimator(
+        *model()[:3], horizon=7, initial_state=[0.0, 0.0], restart=True)
 '''
 SQUARE = "-2:2,-2:2"
 
@@ -163,6 +167,26 @@ def test_angles_are_certified_where_they_do_not_wrap():
         certificates.certify_observer(system, observer, place, sizes=(0.1, 1.2))
     with pytest.raises(certificates.CertificateError, match="the system has angles"):
         certificates.certify_detectability(system, place)
+
+
+def test_a_guard_is_tried_on_the_record_or_refused_by_name(shown):
+    """With the stated sizes, which the noises of the record need not keep to."""
+    stated = {"box": SQUARE, "guard": True, "max_noise": "0.4"}
+    done, text, content = shown(max_disturbance="0.05,0.04", **stated)
+    assert done
+    assert "|w1| <= 0.05, |w2| <= 0.04, |v| <= 0.4 (as stated)" in text
+    assert "guarded, x_hat is within min(2 b, |x_hat - z| + b)" in text.splitlines()[0]
+    assert re.search(r"guard +seed 0: \d+ of 20 estimates were moved; the largest", text)
+    assert content["guard"].startswith("seed 0: ")
+    for of, options, words in (
+        ("model", {}, "the sizes are as stated, and Gaussian noises are not bounded"),
+        ("restarts", {"max_disturbance": "0.05"}, "restart=True restarts the observer"),
+    ):
+        done, text, content = shown(of=of, **stated | options)
+        assert not done
+        assert content["certified"]
+        assert f"There is no guard: {words}" in text
+        assert content["guard"].startswith("there is no guard: ")
 
 
 def test_out_writes_the_bound_for_load(shown, tmp_path):

@@ -76,7 +76,7 @@ def test_the_truth_is_in_the_columns_with_sizes_of_the_scenario_or_of_options(ma
     summary = bounded(report=warned.append)
     wide = width("out.csv", made[0])
     note = next(each for each in summary.notes if "z1" in each)
-    assert "(proved while x stays in the region)" in note
+    assert "while x stays in the region)" in note
     assert "three standard deviations of the model's scenario" in note
     assert warned == []
     box = qpmhe.Box([-9.0, -9.0], [9.0, 9.0])
