@@ -74,8 +74,8 @@ def trajectories(
 def states(
     run: Run, *, dt: float | None = None, labels: Sequence[str] | None = None,
     time_label: str | None = None, truth: Array | None = None, sigmas: float = 2.0,
-    band: tuple[ArrayLike, ArrayLike] | None = None, axes: Any = None,
-    residual: Residual | None = None,
+    band: tuple[ArrayLike, ArrayLike] | None = None, guarded: Array | None = None,
+    axes: Any = None, residual: Residual | None = None,
 ) -> list[Any]:
     """The estimates of a run, with bands of their covariances and of the proved set.
 
@@ -94,13 +94,16 @@ def states(
     band : (lower, upper), optional
         Sides (T + 1, n) of a box that contains the true state, as ``lower`` and ``upper`` of a
         `qpmhe.certificates.Band`; nothing is drawn where they are NaN.
+    guarded : (T + 1, n) array, optional
+        The guarded estimates, ``reading.state`` of a `qpmhe.certificates.Monitor`, as a line of
+        their own: they are in the band, where the estimates need not be.
 
     Raises
     ------
     InvalidInputError
         If run is not a `Run`, labels are not strings, axes not Axes, or sides of the band swapped.
     ShapeError
-        If labels, truth, axes or band do not fit the run's states and times.
+        If labels, truth, axes, band or guarded do not fit the run's states and times.
     OptionError
         If a number is not above zero.
     """
@@ -108,13 +111,12 @@ def states(
     count, n = run.states.shape
     times, when = run_times(run, dt, time_label)
     sigmas = positive("sigmas", sigmas)
-    drawn = trajectories(
-        times, truth, {"estimate": run.states}, _names(labels, n), when, axes, residual=residual,
-    )
+    lines = {"estimate": run.states} | ({} if guarded is None else {"guarded": guarded})
+    drawn = trajectories(times, truth, lines, _names(labels, n), when, axes, residual=residual)
     if run.covariances is not None and len(run):
         half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
         for j, panel in enumerate(drawn):
-            middle = panel.lines[-1].get_ydata()[1:]
+            middle = panel.lines[-len(lines)].get_ydata()[1:]
             panel.fill_between(
                 times[1:], middle - half[:, j], middle + half[:, j],
                 color=STYLES[0]["color"], alpha=0.18, linewidth=0.0,

@@ -40,11 +40,13 @@ def test_states_with_bands(case):
     states, run, _ = case
     lower, upper = run.states - [1.0, 2.0], run.states + 3.0
     lower[20:], upper[20:] = np.nan, np.nan
-    axes = plots.states(run, dt=0.1, truth=states, sigmas=3.0)
+    guarded = np.clip(run.states, lower + 0.5, upper - 2.9)
+    axes = plots.states(run, dt=0.1, truth=states, sigmas=3.0, guarded=guarded)
     proved = plots.states(run, dt=0.1, truth=states, band=(lower, upper))
     for j, panel in enumerate(axes):
         drawn = lines(panel)
         np.testing.assert_array_equal(drawn["estimate"][:, 1], run.states[:, j])
+        np.testing.assert_array_equal(drawn["guarded"][:, 1], guarded[:, j])
         np.testing.assert_array_equal(drawn["truth"][:, 1], states[:, j])
         np.testing.assert_allclose(drawn["truth"][:, 0], 0.1 * np.arange(31))
         half = 3.0 * np.sqrt(run.covariances[:, j, j])
@@ -173,6 +175,7 @@ def test_what_does_not_fit_is_refused(case):
         (plots.states, [run], {"sigmas": -2.0}, OptionError, "sigmas is -2.0"),
         (plots.states, [run], {"axes": 3}, InvalidInputError, "axes contain 3; expected matplotl"),
         (plots.states, [run], {"band": (rows, rows[1:])}, ShapeError, r"band\[1\] has shape"),
+        (plots.states, [run], {"guarded": rows[1:]}, ShapeError, r"'guarded'\] has shape"),
         (plots.states, [run], {"band": (rows + 1, rows - 1)}, InvalidInputError, "is 1 and band"),
         (plots.states, [estimate], {}, InvalidInputError, r"type Estimate; .*plots\.window"),
         (plots.window, [run], {}, InvalidInputError, r"estimate is of type Run; .*plots\.states"),
