@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,11 +12,12 @@ from typing import TYPE_CHECKING
 from .._checks import flag
 from ..errors import InvalidInputError, OptionError
 from .ahead import Compiled, compile, engine_choice
+from .needs import Needs
 
 if TYPE_CHECKING:
     from ..estimation.estimator import MovingHorizonEstimator
 
-__all__ = ["Compiled", "compile", "engine_choice", "write"]
+__all__ = ["Compiled", "Needs", "Written", "compile", "engine_choice", "write"]
 
 # Headers that a compiler, or its own headers, would find in the place of a system's.
 _SYSTEM_HEADERS = frozenset((
@@ -31,10 +34,28 @@ _SYSTEM_HEADERS = frozenset((
 _LONGEST_NAME = 60
 
 
+class Written(tuple[Path, ...]):
+    """The paths of written files.
+
+    Attributes
+    ----------
+    needs : Needs
+        What a step takes at most.
+    """
+
+    needs: Needs
+
+    def __new__(cls, paths: Iterable[Path], needs: Needs) -> Written:
+        """The paths, with what they need."""
+        made = super().__new__(cls, paths)
+        made.needs = needs
+        return made
+
+
 def write(
     estimator: MovingHorizonEstimator, directory: str | PathLike[str], *, name: str = "mhe",
-    real: str = "double", fmu: bool = False,
-) -> tuple[Path, ...]:
+    real: str = "double", fmu: bool = False, compiler: str | None = None,
+) -> Written:
     """Write the estimator as a C99 header and source that need only libm.
 
     The source holds observer, growing window, candidate, Gauss-Newton QPs by a block-banded
@@ -64,23 +85,29 @@ def write(
         inputs y and u, the outputs state, filtered, cost, candidate_cost, status and qps, and the
         parameter initial_state. Its communication step is the sampling time, 1 for a model in
         discrete time. It holds the C sources, and a library for this kind of machine.
+    compiler : str, optional
+        The command of a C compiler on this machine, of the target or not, with options: memory,
+        code and stack are measured in the header and in ``needs`` as it compiles the source. GCC
+        states the stack, from version 10 on.
 
     Returns
     -------
     header, source : Path
-        ``<name>.h`` and ``<name>.c``; with ``fmu``, also the path of the FMU.
+        ``<name>.h`` and ``<name>.c``; with ``fmu``, also the path of the FMU. Its attribute
+        ``needs`` says what a step takes at most: see `Needs`.
 
     Raises
     ------
     OptionError, CompilationError
         If something has no C form, or an option is unknown; if CasADi has no C code for the model,
-        or an FMU is requested and there is no C compiler.
+        or an FMU is requested and there is no C compiler, or there is not the one that is named.
     InvalidInputError
         If this is no estimator, or the directory cannot be written.
     """
     from ..estimation.estimator import MovingHorizonEstimator
     from .fmu import write_fmu
     from .library import generated
+    from .needs import measured
     from .strip import stripped
 
     if not isinstance(estimator, MovingHorizonEstimator):
@@ -104,11 +131,15 @@ def write(
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
-    files = generated(
+    files, needs = generated(
         estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real,
         estimator.usual,
     )
     files = dict(zip(files, stripped(*files.values()), strict=True))
+    if compiler is not None:
+        needs = replace(needs, **measured(files, name, compiler))
+    header, types = f"{name}.h", f"typedef {real} {name}_real;\n"
+    files[header] = files[header].replace(types, f"{types}\n{needs.header(name)}", 1)
     try:
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
@@ -122,4 +153,4 @@ def write(
             f"directory is {directory!r}, which cannot be written ({error})."
         ) from error
     suffixes = ("h", "c", "fmu") if fmu else ("h", "c")
-    return tuple(folder / f"{name}.{suffix}" for suffix in suffixes)
+    return Written((folder / f"{name}.{suffix}" for suffix in suffixes), needs)

@@ -25,6 +25,7 @@ from .directions import Directions
 from .fingerprint import source_key
 from .layout import TERMS, Layout, settings_record
 from .losses import loss_function
+from .needs import Needs
 from .source import MAIN, estimator_files, template
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
@@ -163,10 +164,11 @@ def _memory(count: int, kind: np.dtype[Any], what: str) -> NDArray[Any]:
 def generated(
     system: System, observer: Observer, cost: Cost, settings: Settings, name: str = "mhe",
     real: str = "double", usual: Conditions = USUAL,
-) -> dict[str, str]:
-    """Header and source of an estimator, by the names of their files."""
+) -> tuple[dict[str, str], Needs]:
+    """Header and source of an estimator, by the names of their files, and what a step takes."""
     layout, record = planned(system, observer, cost, settings, real, usual=usual)
-    return estimator_files(symbolic_model(system, observer, cost), layout, record, name)
+    files = estimator_files(symbolic_model(system, observer, cost), layout, record, name)
+    return files, Needs.of(layout, record)
 
 
 def symbolic_model(system: System, observer: Observer, cost: Cost) -> CasadiModel:

@@ -3,13 +3,14 @@
 import re
 import shutil
 import subprocess
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from qpmhe import codegen
-from qpmhe.codegen import write
+from qpmhe.codegen import Needs, write
 from qpmhe.codegen.library import generated
 from qpmhe.codegen.strip import stripped
 
@@ -179,7 +180,9 @@ def test_written_code_reads_well(name, tmp_path):
         ):
             assert re.search(pattern, text) is None, pattern
     macros = re.findall(r"^#define (\w+)", header + written, re.M)
-    for macro in macros:
+    for_users = {f"MHE_MOST_{one.name.upper()}" for one in fields(Needs)[:4]} | {"MHE_MEMORY"}
+    assert for_users < {*macros}
+    for macro in {*macros} - for_users:
         assert len(re.findall(rf"\b{macro}\b", header + written)) > 1, macro
 
 
@@ -194,7 +197,7 @@ def test_written_code_reads_well(name, tmp_path):
 def test_the_numbers_are_the_same(name, real, level, tmp_path):
     one = case(name)
     mhe = one.estimator("python")
-    whole = generated(
+    whole, _ = generated(
         mhe.system, mhe.observer, mhe.cost, mhe.settings, "mhe", real, mhe.usual
     )
     number = np.float64 if real == "double" else np.float32

@@ -143,7 +143,9 @@ def test_single_precision_computes_nothing_in_double(name, tmp_path):
     not (shutil.which("arm-none-eabi-gcc") and shutil.which("arm-none-eabi-nm")),
     reason="there is no compiler for microcontrollers",
 )
-@pytest.mark.parametrize("name", SINGLE[::4])
+@pytest.mark.parametrize(
+    "name", sorted({"soft states", "restored", "restarted extended", *SINGLE[::4]})
+)
 def test_a_microcontroller_needs_no_double_precision(name, tmp_path):
     _, source = write(case(name).estimator("python"), tmp_path, real="float")
     made = tmp_path / "mhe.o"
