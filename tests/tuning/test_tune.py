@@ -81,6 +81,7 @@ def test_known_covariances_are_within_the_intervals_of_a_table():
     assert len(tuning.plot()[0].get_xticks()) < 10
 
 
+@pytest.mark.slow
 def test_neither_start_nor_units_matter():
     y, u = simulated()
     unit = 1e6
@@ -150,6 +151,7 @@ def test_structures():
     second.cost()
 
 
+@pytest.mark.slow
 def test_whole_matrices_are_told_as_standard_deviations_and_correlations():
     """All states are measured: each of the true values is within its interval."""
     true = np.array([[0.16, 0.8 * 0.4 * 0.3, -0.04], [0.0, 0.09, 0.0], [0.0, 0.0, 0.25]])
