@@ -108,12 +108,13 @@ def _check_modes(search: Search) -> None:
     for point, jacobian in zip(search.points, search.jacobians, strict=True):
         A = jacobian[:n] * states / states[:, None]
         C = jacobian[n:] * states / outputs[:, None]
-        for value in np.linalg.eigvals(A):
+        values = np.linalg.eigvals(A)
+        for value in values[np.abs(values) >= 1.0 - 1e-9]:
             # Large rows are scaled down, so that no size of A can hide what C sees.
             rest = A - value * np.eye(n)
             rest = rest / np.maximum(1.0, np.abs(rest).max(axis=1, keepdims=True))
             _, sizes, vectors = np.linalg.svd(np.vstack((rest, C)))
-            if abs(value) < 1.0 - 1e-9 or sizes[-1] > _UNSEEN:
+            if sizes[-1] > _UNSEEN:
                 continue
             direction = states * vectors[-1].conj()
             direction = np.real_if_close(direction / np.linalg.norm(direction))

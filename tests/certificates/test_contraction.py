@@ -229,6 +229,10 @@ def test_a_mode_is_called_unseen_only_where_it_is():
         assert certify_detectability(seen, region).evidence is Evidence.PROVED
         with pytest.raises(NotCertifiedError, match=r"eigenvalue 1\.1.*not appear in.*measure an"):
             certify_detectability(hidden, region, seconds=300.0)
+
+
+@pytest.mark.slow
+def test_a_model_that_overflows_may_not_be_meant_to_hold():
     reactor = qpmhe.models.cstr()[0]  # f overflows on its own set of states
     with pytest.raises(NotCertifiedError, match="may not be meant to hold") as caught:
         certify_detectability(reactor, None, inputs=box(287.0, 311.6), seconds=300.0)

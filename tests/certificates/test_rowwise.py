@@ -352,6 +352,7 @@ def test_with_a_set_x_the_limit_needs_that_no_projection_acts():
 # What keeps it
 
 
+@pytest.mark.slow
 def test_files_and_pickles_keep_the_components(tmp_path):
     system, gain, region, w, v, _ = kinked()
     bound = bound_of(system, gain, region, w, v)

@@ -27,6 +27,7 @@ def test_a_bound_that_holds_helps_the_speed_and_harms_the_distance():
     assert long["distance at the end, v ≥ 0"] > 1.5 * long["distance at the end, without"]
 
 
+@pytest.mark.slow
 def test_the_exact_map_is_worse_than_the_kalman_filter():
     for row in study.uniform(FEW):
         kalman = row["Kalman filter"]
@@ -54,6 +55,7 @@ def test_a_vague_prior_is_worst_just_above_the_observability_index():
     assert max(sure.values()) < 1.35
 
 
+@pytest.mark.slow
 def test_a_smoothed_prior_wants_a_smaller_covariance():
     rows = study.smoothed(FEW)
     for N in ("N = 5", "N = 10"):
@@ -62,6 +64,7 @@ def test_a_smoothed_prior_wants_a_smaller_covariance():
         assert errors["10 P"] > 1.1 * errors["0.3 P"]
 
 
+@pytest.mark.slow
 def test_huber_and_gates_change_sides():
     slow, _, fast, fastest = study.outliers(FEW)
     assert slow["Huber over the first"] == pytest.approx(1.0, abs=0.1)
@@ -70,6 +73,7 @@ def test_huber_and_gates_change_sides():
     assert fastest["over the second"] < 0.9
 
 
+@pytest.mark.slow
 def test_missing_at_random_is_worse_than_regularly():
     ratios = [row["random over regular"] for row in study.missing(FEW)]
     assert ratios[0] < 1.1 < ratios[1] < 1.3 < ratios[2]
@@ -84,6 +88,7 @@ def test_the_unobservable_turn_is_claimed_to_be_known():
     assert row["claimed (median)"] < 0.2 * least < 0.5 * row["error (rms)"]
 
 
+@pytest.mark.slow
 def test_the_mean_cost_tells_the_priors_apart():
     kalman, luenberger, smoothed = study.consistency(0.4 * FEW)
     for N in ("N = 5", "N = 10", "N = 20"):

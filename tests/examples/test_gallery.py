@@ -108,6 +108,7 @@ def test_a_problem_is_tuned_judged_and_written(parts, tmp_path, capsys):
     assert "They are there." in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_only_the_held_estimate_of_the_motors_inertia_neither_drifts_nor_gets_stiff(parts):
     motor = import_module("gallery.weak_excitation.motor")
     (problem,) = motor.problems(Path(), True)

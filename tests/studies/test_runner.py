@@ -88,6 +88,7 @@ def test_a_full_disk_is_reported_and_the_same_call_goes_on(path, monkeypatch):
     assert list(after["finished"][: len(before)]) == list(before["finished"])
 
 
+@pytest.mark.slow
 def test_a_backend_that_crashes_is_isolated_and_the_qp_is_kept(path, tmp_path):
     banded = qpmhe_solvers.backend("banded")
     mine = qpmhe_solvers.Backend("mine", lambda options: banded.factory(options), "banded")

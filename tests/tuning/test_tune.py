@@ -81,6 +81,7 @@ def test_known_covariances_are_within_the_intervals_of_a_table():
     assert len(tuning.plot()[0].get_xticks()) < 10
 
 
+@pytest.mark.slow
 def test_neither_start_nor_units_matter():
     y, u = simulated()
     unit = 1e6
@@ -150,6 +151,7 @@ def test_structures():
     second.cost()
 
 
+@pytest.mark.slow
 def test_whole_matrices_are_told_as_standard_deviations_and_correlations():
     """All states are measured: each of the true values is within its interval."""
     true = np.array([[0.16, 0.8 * 0.4 * 0.3, -0.04], [0.0, 0.09, 0.0], [0.0, 0.0, 0.25]])
@@ -270,6 +272,7 @@ def test_weights_and_intervals_are_of_all_blocks_once_some_have_judged():
     assert some.cost_per_sample == pytest.approx(every.cost_per_sample, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_parameters_of_a_model():
     record = simulated(1, 400, f=make(0.9).f, noise=(0.1, 0.1, 0.3), m=2)
     structure = {"disturbance": {"x1": [0]}, "noise": "scalar"}
@@ -296,6 +299,7 @@ def test_the_estimators_own_error_is_lowered(objective):
         assert after < before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["prediction", "truth"])
 def test_the_estimators_own_error_leaves_the_scale_to_the_likelihood(objective):
     """The initial error is larger than the prior says: smaller Q and R would make up for that."""
@@ -307,6 +311,7 @@ def test_the_estimators_own_error_leaves_the_scale_to_the_likelihood(objective):
     assert tuning.values["noise y1"] == pytest.approx(tuning.likeliest["noise y1"], rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", [1.5, 3.0])
 def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors, monkeypatch):
     """The second search's weights are less likely, and better by so many standard errors."""
