@@ -10,6 +10,7 @@ from .adapters.control import from_control
 from .adapters.fmu import from_fmu
 from .adapters.iosystem import to_iosystem
 from .adapters.jax import from_jax
+from .adapters.learnt import from_sklearn, from_torch
 from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
 from .codegen import Compiled, compile
@@ -164,7 +165,9 @@ __all__ = [
     "from_control",
     "from_fmu",
     "from_jax",
+    "from_sklearn",
     "from_sympy",
+    "from_torch",
     "load_run",
     "models",
     "noisy_inputs",
