@@ -58,7 +58,7 @@ from .observers import (
 from .sensitivity import ActiveRow, Gradient, Sensitivity
 
 if TYPE_CHECKING:
-    from . import certificates, diagnosis, plots, records, studies, tuning
+    from . import baselines, certificates, diagnosis, plots, records, studies, tuning
     from .diagnosis import diagnose
     from .tuning import tune
 
@@ -89,7 +89,7 @@ load_run = Run.load
 
 
 # What most programs do without is imported when it is first named.
-_LATE_MODULES = ("certificates", "diagnosis", "plots", "records", "studies", "tuning")
+_LATE_MODULES = ("baselines", "certificates", "diagnosis", "plots", "records", "studies", "tuning")
 _LATE_FUNCTIONS = {"diagnose": "diagnosis", "tune": "tuning"}
 
 
@@ -153,6 +153,7 @@ __all__ = [
     "__version__",
     "angles",
     "augment_parameters",
+    "baselines",
     "batch",
     "certificates",
     "codegen",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 from pathlib import Path
@@ -43,6 +44,16 @@ def compare(
     backend: Annotated[
         list[str] | None,
         typer.Option(help="QP backend; may be repeated. All installed ones if left out."),
+    ] = None,
+    observer: Annotated[
+        list[str] | None,
+        typer.Option(help="Observer: model for the model's own, ekf, ukf, or a function as for "
+                          "--model, of a qpmhe.baselines.Problem; may be repeated."),
+    ] = None,
+    estimator: Annotated[
+        list[str] | None,
+        typer.Option(help="Another estimator to run beside: ekf, ukf, enkf, particles, or a "
+                          "function, likewise; NAME=... names it; may be repeated."),
     ] = None,
     qps: Annotated[
         str, typer.Option(help="QPs per sample, separated by commas; 0 is the observer, none "
@@ -94,11 +105,13 @@ def compare(
     if model is None and steps is None and record is None:
         steps = 100  # all backends at all caps are to be done within ten minutes
     with named_as_options(
-        "noise_levels", "seeds", "steps", "deadline", "cell_timeout", starts="--start"
+        "noise_levels", "seeds", "steps", "deadline", "cell_timeout", starts="--start",
+        observers="--observer", estimators="--estimator",
     ):
         what = Study(
             models=model or ("batch_reactor",), records=record or (),
             reading=reading if record else {}, backends=backend or None,
+            observers=observer or ("model",), estimators=dict(map(_labelled, estimator or ())),
             qps=_numbers("qps", qps),
             solver_iterations=_numbers("solver_iterations", solver_iterations),
             horizons=_numbers("horizons", horizons),
@@ -180,6 +193,12 @@ def _show_kept(console: Console, folder: Path | None) -> None:
         else f"{folder} has no QPs: every backend solved its QPs, or stopped at a cap.",
         highlight=False, markup=False, soft_wrap=True,
     )
+
+
+def _labelled(text: str) -> tuple[str, str]:
+    """The name of an estimator, and of the function that makes it."""
+    found = re.match(r"([^=:()]+)=(.*)", text, re.DOTALL)
+    return (found[1].strip(), found[2].strip()) if found else (text, text)
 
 
 def _numbers(name: str, text: str) -> list[int | None]:

@@ -19,7 +19,7 @@ from ..studies.environment import environment_words
 from ..studies.report.answers import Case, cases, chosen
 from ..studies.report.words import cap_words, number, percent, qps_words, seconds
 from ..studies.row import SHOWN
-from ..studies.summary import TOLERANCE, with_halves
+from ..studies.summary import TOLERANCE, with_halves, with_observers
 from . import options
 from .values import read_width
 
@@ -60,10 +60,10 @@ def show_report(
     """Write a store's report, and print its answers and tables."""
     page = studies.write_report(store, out, width=width)
     held = studies.Store(store)
-    summary = studies.summarise(held.frame())
-    show(console, summary)
+    frame = held.frame()
+    show(console, studies.summarise(with_observers(frame)))
     for found in held.meta()["environments"]:
-        words = environment_words(found, summary["backend"])
+        words = environment_words(found, frame["backend"])
         console.print(f"[dim]{escape(words)}[/]", highlight=False)
     kinds = "PNG and SVG" if width is None else "PDF, PNG and SVG"
     console.print(f"wrote {page}, and its figures as {kinds} beside it", highlight=False)

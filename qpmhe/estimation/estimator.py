@@ -547,7 +547,7 @@ class MovingHorizonEstimator(EstimatorMemory):
                 y, None if us is None else us[t], dt=None if lengths is None else lengths[t]
             ))
             if covariances:
-                collected.append(self._newest_covariance())
+                collected.append(self.newest_covariance())
         n = self.system.n
         blocks = np.array(collected).reshape(-1, n, n) if covariances else None
         run = Run.of(start, estimates, blocks, observer_start=observer_start)

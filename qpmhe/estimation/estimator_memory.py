@@ -191,7 +191,8 @@ class EstimatorMemory:
                 solved, second, self.settings.tolerance, len(self.settings.parameters)
             )
 
-    def _newest_covariance(self) -> Array:
+    def newest_covariance(self) -> Array:
+        """The covariance (n, n) of the last estimate's ``state``; NaN where there is none."""
         try:
             value: Array = self.covariances()[-1]
         except InvalidInputError:  # bad luck: the record goes on

@@ -1,4 +1,4 @@
-"""A model from a name of the catalogue, from a module, or from a file."""
+"""A model, observer or estimator from a name that is known, from a module, or from a file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import importlib.util
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from modulefinder import ModuleFinder
@@ -31,10 +31,7 @@ from .scenario import Scenario
 
 _FORM = re.compile(r"(?P<where>[^()]+)(?:\((?P<arguments>.*)\))?", re.DOTALL)
 _PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"))
-_EXPECTED = (
-    "expected a name of the catalogue, name(keyword=value), package.module:function or "
-    "path/file.py:function"
-)
+_EXPECTED = "name(keyword=value), package.module:function or path/file.py:function"
 _PACKAGES = (Path(__file__).parents[1], Path(qpmhe_solvers.__file__).parent)
 # Fingerprint at the time when this process imported a place.
 _imported_as: dict[str, str] = {}
@@ -42,7 +39,7 @@ _imported_as: dict[str, str] = {}
 
 @dataclass(frozen=True)
 class ModelSource:
-    """Where a model comes from.
+    """Where a model comes from, or an observer or estimator to compare.
 
     Parameters
     ----------
@@ -54,12 +51,15 @@ class ModelSource:
         Keyword arguments of the function, as ``key=value, key=value``.
     fingerprint : str
         Digest of the file and of those it imports from its folder; empty for the catalogue.
+    kind : str
+        What it makes, for messages: model, observer or estimator.
     """
 
     name: str
     where: str
     arguments: str = ""
     fingerprint: str = ""
+    kind: str = "model"
 
     @property
     def is_file(self) -> bool:
@@ -76,7 +76,10 @@ class ModelSource:
         return Path(path) if path else None
 
 
-def find(text: Any, folder: Path | None = None) -> ModelSource:
+def find(
+    text: Any, folder: Path | None = None, kind: str = "model",
+    known: Mapping[str, str] | None = None,
+) -> ModelSource:
     """Find a model by its name, without importing its file.
 
     Parameters
@@ -87,29 +90,33 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
         no such model or file.
     folder : Path, optional
         What a file's path is relative to; the working directory if left out.
+    kind : str
+        What it makes: model, observer or estimator.
+    known : mapping, optional
+        Names without a colon, and ``package.module:function`` for each; those of the catalogue if
+        left out.
     """
+    names = catalogue() if known is None else known
+    expected = f"expected one of {', '.join(names)}, or {_EXPECTED}"
     match = _FORM.fullmatch(text.strip()) if isinstance(text, str) else None
     if match is None:
-        raise ModelError(f"the model is {text!r}; {_EXPECTED}.")
+        raise ModelError(f"the {kind} is {text!r}; {expected}.")
     written = match["where"].strip()
-    given = _arguments(text, match["arguments"] or "")
+    given = _arguments(text, match["arguments"] or "", kind)
     arguments = ", ".join(f"{key}={value!r}" for key, value in given.items())
     name = f"{written}({arguments})" if arguments else written
     if ":" not in written:
         if written.endswith(".py"):
             raise ModelError(
-                f"the model is {text!r}, which names no function; "
+                f"the {kind} is {text!r}, which names no function; "
                 f"{_proposal((folder or Path()) / written, written)}."
             )
-        if written not in catalogue():
-            raise ModelError(
-                f"model {written!r} is not known; expected one of {', '.join(catalogue())}, or "
-                "package.module:function, or path/file.py:function."
-            )
-        return ModelSource(name, written, arguments)
+        if written not in names:
+            raise ModelError(f"{kind} {written!r} is not known; {expected}.")
+        return ModelSource(name, written if known is None else known[written], arguments, "", kind)
     place, _, function = written.rpartition(":")
     if not function.isidentifier() or not place:
-        raise ModelError(f"the model is {text!r}; {_EXPECTED}.")
+        raise ModelError(f"the {kind} is {text!r}; {expected}.")
     path: Path | None
     if place.endswith(".py"):
         path = (folder or Path()).joinpath(place).resolve()
@@ -120,17 +127,21 @@ def find(text: Any, folder: Path | None = None) -> ModelSource:
         digest = "" if path is None else fingerprint(path)
     except OSError as error:
         raise ModelError(
-            f"model {name!r}: cannot read {error.filename} ({error.strerror})."
+            f"{kind} {name!r}: cannot read {error.filename} ({error.strerror})."
         ) from error
-    return ModelSource(name, f"{place}:{function}", arguments, digest)
+    return ModelSource(name, f"{place}:{function}", arguments, digest, kind)
 
 
-def check_named_in_file(text: Any, folder: Path) -> None:
+def check_named_in_file(
+    text: Any, folder: Path, kind: str = "model", returns: tuple[type, ...] = ()
+) -> None:
     """Raise `ModelError` unless a study file in a folder may name this model.
 
     A model is code, and a study file comes from anywhere. It may name a model of the catalogue, a
     function that a Python file in its own folder defines, or a function of a module outside of the
-    standard library whose annotation says that it returns a model. The function is not called.
+    standard library whose annotation says that it returns a model. The function is not called. The
+    same holds for observers and estimators, where ``returns`` are the classes that an annotation
+    may name; such a class may itself be named.
     """
     match = _FORM.fullmatch(text.strip()) if isinstance(text, str) else None
     place, colon, name = (match["where"].strip() if match else "").rpartition(":")
@@ -141,26 +152,32 @@ def check_named_in_file(text: Any, folder: Path) -> None:
         path = folder.joinpath(place).resolve()
         if not path.is_relative_to(folder.resolve()):
             raise ModelError(
-                f"model {text!r} is a file outside of the study's folder {folder}; {remedy}."
+                f"{kind} {text!r} is a file outside of the study's folder {folder}; {remedy}."
             )
     elif place.partition(".")[0] in sys.stdlib_module_names:
         raise ModelError(
-            f"model {text!r} is in Python's standard library, which has no models; {remedy}."
+            f"{kind} {text!r} is in Python's standard library, which has no {kind}s; {remedy}."
         )
-    source = find(text, folder)
+    source = find(text, folder, kind)
     if place.endswith(".py"):
         if not _defines(path, name):
             raise ModelError(
-                f"model {text!r}: {place} does not define {name} itself; a study may not name what "
-                "the file imports."
+                f"{kind} {text!r}: {place} does not define {name} itself; a study may not name "
+                "what the file imports."
             )
         return
     with _import_path(place):
         function = _function(source)
-    if not _returns_model(function):
+    if returns:
+        found = function if isinstance(function, type) else _annotated(function)
+        fits, such = isinstance(found, type) and issubclass(found, returns), returns[0]
+        words = f"{such.__module__}.{such.__qualname__}"
+    else:
+        fits, words = _returns_model(function), "qpmhe.models.Example"
+    if not fits:
         raise ModelError(
-            f"model {text!r}: nothing says that {name} returns a model; annotate it, as in "
-            f"def {name}() -> qpmhe.models.Example, or {remedy}."
+            f"{kind} {text!r}: nothing says that {name} returns a{'n' * (kind[0] in 'aeiou')} "
+            f"{kind}; annotate it, as in def {name}(...) -> {words}, or {remedy}."
         )
 
 
@@ -177,14 +194,19 @@ def _defines(file: Path, name: str) -> bool:
     )
 
 
+def _annotated(function: Any) -> Any:
+    """What a function's annotation says that it returns; None for anything else."""
+    if not isinstance(function, FunctionType):
+        return None
+    try:
+        return get_type_hints(function).get("return")
+    except Exception:  # names that cannot be resolved
+        return None
+
+
 def _returns_model(function: Any) -> bool:
     """Whether a function's annotation says that it returns a model, in any form that is read."""
-    if not isinstance(function, FunctionType):
-        return False
-    try:
-        kind = get_type_hints(function).get("return")
-    except Exception:  # names that cannot be resolved
-        return False
+    kind = _annotated(function)
     arguments = get_args(kind)
     wanted: Any = arguments[0] if get_origin(kind) is tuple and arguments else kind
     return isinstance(wanted, type) and issubclass(
@@ -208,8 +230,10 @@ def _proposal(file: Path, written: str) -> str:
     return "expected " + " or ".join(f"{written}:{name}" for name in names[:5])
 
 
-def build(source: ModelSource) -> Any:
+def build(source: ModelSource, *given: Any) -> Any:
     """Call the function of a source that `find` found, and return whatever it returns.
+
+    ``given`` are arguments before those that the name has.
 
     A file can import the files beside it, as it can when Python runs it. A `ModelError` is
     raised if the file cannot be imported, has changed since it was found, or lacks the function,
@@ -218,7 +242,7 @@ def build(source: ModelSource) -> Any:
     with _import_path(source.where.rpartition(":")[0]):
         function = _function(source)
         try:
-            return function(**_arguments(source.name, source.arguments))
+            return function(*given, **_arguments(source.name, source.arguments, source.kind))
         except (Exception, SystemExit) as error:  # a user's function may raise anything
             raise _failure(source, " cannot be made", error) from error
 
@@ -287,7 +311,7 @@ def _is_users(code: Path, file: Path) -> bool:
     )
 
 
-def _arguments(text: str, inside: str) -> dict[str, Any]:
+def _arguments(text: str, inside: str, kind: str) -> dict[str, Any]:
     try:
         call = ast.parse(f"f({inside})", mode="eval").body
         if not isinstance(call, ast.Call) or call.args:
@@ -297,7 +321,7 @@ def _arguments(text: str, inside: str) -> dict[str, Any]:
             raise ValueError("two asterisks")
     except (SyntaxError, ValueError) as error:
         raise ModelError(
-            f"the arguments of model {text!r} cannot be read ({error}); expected plain values "
+            f"the arguments of {kind} {text!r} cannot be read ({error}); expected plain values "
             "by keyword, as in chain_of_masses(masses=2)."
         ) from error
     return {str(key): value for key, value in pairs}
@@ -314,20 +338,23 @@ def _function(source: ModelSource) -> Callable[..., Any]:
         raise _failure(source, " cannot be imported", error) from error
     if source.fingerprint and now != source.fingerprint:
         raise ModelError(
-            f"model {name!r}: {place}, or a file that it imports, differs from the one that the "
-            "study was started with; copy the same files to all machines, and give the command "
-            "again."
+            f"{source.kind} {name!r}: {place}, or a file that it imports, differs from the one "
+            "that the study was started with; copy the same files to all machines, and give the "
+            "command again."
         )
     function = getattr(module, attribute, None)
     if not callable(function):
-        raise ModelError(f"model {name!r}: {place} has no function {attribute}.")
+        raise ModelError(f"{source.kind} {name!r}: {place} has no function {attribute}.")
     found: Callable[..., Any] = function
     return found
 
 
 def _failure(source: ModelSource, what: str, error: BaseException) -> ModelError:
     if isinstance(error, SystemExit):
-        said = "it ends the program; put what is not the model behind if __name__ == '__main__'"
+        said = (
+            f"it ends the program; put what is not the {source.kind} behind "
+            "if __name__ == '__main__'"
+        )
     elif isinstance(error, QpmheError):
         said = str(error)
     elif isinstance(error, SyntaxError):  # its text would repeat file and line
@@ -336,11 +363,16 @@ def _failure(source: ModelSource, what: str, error: BaseException) -> ModelError
     else:
         said = f"{type(error).__name__}: {error}"
     place = code_place(error, source.file)
-    return ModelError(f"{place}model {source.name!r}{what}: {said.rstrip('.')}.")
+    return ModelError(f"{place}{source.kind} {source.name!r}{what}: {said.rstrip('.')}.")
 
 
 def module_file(place: str) -> Path | None:
-    """The file of a module, found without importing it; packages above it are imported."""
+    """The file of a module, found without importing it; packages above it are imported.
+
+    None for our own: their version identifies them.
+    """
+    if place.partition(".")[0] in (one.name for one in _PACKAGES):
+        return None
     importlib.invalidate_caches()
     try:
         with _import_path(place):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -17,20 +18,20 @@ import numpy as np
 from qpmhe_solvers import Backend, BackendError, Recording, backend, register
 
 from .._checks import Array
-from ..errors import InvalidInputError
-from ..estimation.estimate import Estimate
+from ..baselines import follow
+from ..errors import InvalidInputError, ModelError, PriorWarning
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..models import Record
+from ..models.loading import ModelSource, build
+from ..observers import Observer
 from . import metrics
 from .environment import environment
 from .experiment import Source, experiment
-from .row import Cell, StudyRow
+from .row import OBSERVER, Cell, StudyRow
 
 #: Engine of all cells: only the Python step calls the backends that a study compares.
 ENGINE = "python"
-#: Backend of a cell that solves no QP.
-OBSERVER = "observer"
 # Failing QPs that are kept of one cell, at most.
 _KEPT = 20
 
@@ -42,7 +43,8 @@ class Task:
     It gives up between two steps after ``timeout`` seconds. ``keep`` returns the trajectory,
     ``shared`` says that other cells run on the machine at the same time, ``registered`` is the
     backend for workers that do not know it, and ``isolated`` runs the solver in another process.
-    QPs on which the backend failed go to a folder in ``failing``.
+    QPs on which the backend failed go to a folder in ``failing``. ``observer`` makes the observer,
+    if not the model, and ``estimator`` what runs in place of moving horizon estimation.
     """
 
     cell: Cell
@@ -54,6 +56,8 @@ class Task:
     registered: Backend | None = None
     isolated: bool = False
     failing: Path | None = None
+    observer: ModelSource | None = None
+    estimator: ModelSource | None = None
 
     @property
     def hard_limit(self) -> float:
@@ -113,13 +117,14 @@ def _measured(task: Task, limit: float) -> StudyRow:
     residual = found.system.state_residual
     measured: dict[str, Any] = {
         **metrics.accuracy(run.states, record.states, found.settled, residual),
-        **metrics.outcomes(run),
     }
+    if run.flags.any():  # a foreign estimator's steps have no status
+        measured |= metrics.outcomes(run)
     if "time" in task.parts:
         measured |= metrics.timing(run.times)
     if run.covariances is not None:
         measured["nees"] = metrics.consistency(run.states, record.states, run.covariances, residual)
-    if "accuracy" in task.parts:
+    if "accuracy" in task.parts and task.estimator is None:
         try:
             reference = _reference(task, record, limit)
         except CellTimeoutError as error:
@@ -134,7 +139,7 @@ def _measured(task: Task, limit: float) -> StudyRow:
             else residual.aligned(run.states, record.states),
             "labels": list(found.labels), "title": found.title, "time_unit": found.time_unit,
         }
-    stopped = {"SOLVER_FAILED", "SOLVER_STOPPED"} & measured["reasons"].keys()
+    stopped = {"SOLVER_FAILED", "SOLVER_STOPPED"} & measured.get("reasons", {}).keys()
     if task.failing is not None and stopped:
         try:
             _keep_failing(task, task.failing, record, limit)
@@ -161,40 +166,45 @@ def _register(entry: Backend) -> None:
         register(entry)
 
 
-def _estimator(task: Task, backend_name: str = "") -> MovingHorizonEstimator:
+def _estimator(task: Task, backend_name: str = "") -> Any:
     cell, found = task.cell, experiment(task.source)
-    return MovingHorizonEstimator(*found.parts, **found.options | {
-        "horizon": cell.horizon, "max_qps": cell.qps, "warm_start": cell.start == "best",
-        "backend": backend_name or ("banded" if cell.backend == OBSERVER else cell.backend),
-        "max_solver_iterations": cell.solver_iterations, "isolated": task.isolated,
-        "engine": ENGINE,
-    })
+    if task.estimator is not None:
+        return build(task.estimator, replace(found.problem, seed=cell.seed))
+    system, observer, cost = found.parts
+    if task.observer is not None:
+        observer = build(task.observer, found.problem)
+        if not isinstance(observer, Observer):
+            raise ModelError(
+                f"observer {task.observer.name!r} returned a {type(observer).__name__}; expected "
+                "a qpmhe.Observer."
+            )
+    with warnings.catch_warnings():
+        if task.observer is not None:  # the prior's weight is what observers are compared with
+            warnings.simplefilter("ignore", PriorWarning)
+        return MovingHorizonEstimator(system, observer, cost, **found.options | {
+            "horizon": cell.horizon, "max_qps": cell.qps, "warm_start": cell.start == "best",
+            "backend": backend_name or ("banded" if cell.backend == OBSERVER else cell.backend),
+            "max_solver_iterations": cell.solver_iterations, "isolated": task.isolated,
+            "engine": ENGINE,
+        })
 
 
 def _run(
     task: Task, record: Record, limit: float, *, covariances: bool = False, backend_name: str = ""
 ) -> Run:
-    mhe, lengths = _estimator(task, backend_name), experiment(task.source).lengths
-    start, estimates, collected = mhe.state.copy(), [], []
-    total = len(record.measurements)
-    inputs = [None] * total if record.inputs is None else record.inputs
-    steps = [None] * total if lengths is None else lengths
-    for y, u, dt in zip(record.measurements, inputs, steps, strict=False):
-        estimate: Estimate = mhe.update(y, u, dt=dt)
-        estimates.append(estimate)
-        if covariances:
-            collected.append(_newest_covariance(mhe))
+    found, total = experiment(task.source), len(record.measurements)
+
+    def watch(done: int) -> None:
         if perf_counter() > limit:
-            raise CellTimeoutError(f"{len(estimates)} of {total} steps were done.")
-    return Run.of(start, estimates, np.array(collected) if covariances else None)
+            raise CellTimeoutError(f"{done} of {total} steps were done.")
 
-
-def _newest_covariance(mhe: MovingHorizonEstimator) -> Array:
-    try:
-        value: Array = mhe.covariances()[-1]
-    except (ValueError, np.linalg.LinAlgError):
-        value = np.full((mhe.system.n, mhe.system.n), np.nan)
-    return value
+    made = _estimator(task, backend_name)
+    start = found.options["initial_state"] if task.estimator is not None else made.state
+    return follow(
+        made, np.array(start, float), record.measurements, record.inputs,
+        None if found.lengths is None else found.lengths[:total], covariances=covariances,
+        each=watch,
+    )
 
 
 _WARM: set[tuple[object, ...]] = set()
@@ -203,7 +213,7 @@ _WARM: set[tuple[object, ...]] = set()
 def _warm_up(task: Task, limit: float) -> None:
     """Imports and first calls happen before the first measured run, as they belong to no step."""
     cell = task.cell
-    key = (task.source, task.isolated, *cell.configuration)
+    key = (task.source, task.isolated, task.observer, task.estimator, *cell.configuration)
     if key not in _WARM:
         steps = min(cell.steps, cell.horizon + 2)
         _run(task, experiment(task.source).record(cell.seed, steps, cell.noise_level), limit)
@@ -216,7 +226,9 @@ _REFERENCES: dict[tuple[object, ...], Array | None] = {}
 def _reference(task: Task, record: Record, limit: float) -> Array | None:
     """J of the converged solutions, which all cells on the same record share."""
     cell, source = task.cell, task.source
-    key = (source, cell.horizon, cell.start, cell.seed, cell.steps, cell.noise_level)
+    key = (
+        source, cell.horizon, cell.start, cell.seed, cell.steps, cell.noise_level, task.observer
+    )
     if key not in _REFERENCES:
         if len(_REFERENCES) >= 8:
             del _REFERENCES[next(iter(_REFERENCES))]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .._checks import Array
+from ..baselines import Problem
 from ..errors import InvalidInputError, ModelError
 from ..model.system import System
 from ..models import Record, Scenario
@@ -97,6 +98,15 @@ class Experiment:
         """The model's system."""
         system: System = self.parts[0]
         return system
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What other estimators and observers are made for; a `WeightError` if there is none."""
+        system, observer, cost = self.parts
+        return Problem.of(
+            system, observer, cost, self.options["initial_state"],
+            parameters=self.options.get("parameters") or (),
+        )
 
     def times(self, steps: int) -> Array:
         """Times of the states x(0), ..., x(steps)."""

@@ -18,7 +18,7 @@ from .report.answers import cases
 from .report.words import cap_words, qps_words
 from .row import SHOWN
 from .store import Store, opened
-from .summary import student, summarise
+from .summary import student, summarise, with_observers
 
 _SPECIAL = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
@@ -78,7 +78,8 @@ def tables(store: Store | str | Path, keys: Set[str] | None = None) -> str:
     places = held.meta()["environments"]
     backends = set(frame["backend"])
     machines = [environment_words(places[k], backends) for k in sorted(set(frame["environment"]))]
-    return "\n".join(_table(case.title, case.summary, machines) for case in cases(summarise(frame)))
+    found = cases(summarise(with_observers(frame)))
+    return "\n".join(_table(case.title, case.summary, machines) for case in found)
 
 
 def escaped(text: str) -> str:

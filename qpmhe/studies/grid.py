@@ -18,16 +18,18 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from qpmhe_solvers import available, backend
+from qpmhe_solvers import available, backend, backends
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import shown
 
 from .._checks import choice, count, dimension, flag, positive
+from ..baselines import Baseline
 from ..errors import BackendError, InvalidInputError, ModelError, OptionError
-from ..models.loading import check_named_in_file, find
-from .cell import OBSERVER
+from ..estimation.estimator import MovingHorizonEstimator
+from ..models.loading import ModelSource, check_named_in_file, find
+from ..observers import Observer
 from .experiment import Source, experiment
-from .row import Cell
+from .row import OBSERVER, USUAL_OBSERVER, Cell
 
 if TYPE_CHECKING:
     from .store import Store
@@ -42,6 +44,25 @@ READING = {
     **dict.fromkeys(("time", "outputs", "inputs", "truth", "dt", "separator", "time_format")),
     "time_scale": 1.0, "decimal": "auto", "encoding": "utf-8", "missing": (),
     "skip_repeated": False, "skip_lines": 0, "same_time": None, "log_time": False,
+}
+
+
+#: Short names of observers and estimators, and the functions that make them.
+KNOWN = {
+    "observers": {
+        "ekf": "qpmhe.baselines.observers:extended_kalman",
+        "ukf": "qpmhe.baselines.observers:unscented_kalman",
+    },
+    "estimators": {
+        "ekf": "qpmhe.baselines:ExtendedKalmanFilter",
+        "ukf": "qpmhe.baselines:UnscentedKalmanFilter",
+        "enkf": "qpmhe.baselines:EnsembleKalmanFilter",
+        "particles": "qpmhe.baselines:BootstrapParticleFilter",
+    },
+}
+# What the functions return.
+_RETURNS: dict[str, tuple[type, ...]] = {
+    "observers": (Observer,), "estimators": (Baseline, MovingHorizonEstimator),
 }
 
 
@@ -77,6 +98,17 @@ class Study:
         ``qpmhe estimate``.
     backends : sequence of str, optional
         QP backends; by default all that are installed, without the forms ``qpsolvers:...``.
+    observers : sequence of str
+        Observers: ``model`` for the model's own, ``ekf``, ``ukf``, or functions, named as models
+        are. Such a function gets a `qpmhe.baselines.Problem` and returns an observer. The cost, and
+        what it says of the prior, stays the model's.
+    estimators : mapping or sequence of str
+        Other estimators, by the names that tables give them: ``ekf``, ``ukf``, ``enkf``,
+        ``particles``, the filters of `qpmhe.baselines`, with arguments where wanted
+        (``enkf(members=40)``), or functions, likewise. Such a function gets a
+        `qpmhe.baselines.Problem` and returns any object that `qpmhe.baselines.follow` can run, such
+        as one with ``update(y, u)``, which returns the estimate of x(t+1). Each is one cell beside
+        those of the grid.
     qps, solver_iterations, horizons : sequence of int or None
         QPs per sample, the paper's i (0 is the observer; None iterates to convergence); caps on
         the solver's iterations in each QP (None: its default); N (None: the scenario's).
@@ -117,6 +149,8 @@ class Study:
     records: Sequence[str | Path] = ()
     reading: Mapping[str, Any] = field(default_factory=dict, hash=False)
     backends: Sequence[str] | None = None
+    observers: Sequence[str] = (USUAL_OBSERVER,)
+    estimators: Mapping[str, str] | Sequence[str] = field(default_factory=dict, hash=False)
     qps: Sequence[int | None] = (0, 1, 2, 5, None)
     solver_iterations: Sequence[int | None] = (1, 2, 5, 10, None)
     horizons: Sequence[int | None] = (None,)
@@ -130,6 +164,7 @@ class Study:
     cell_timeout: float = 60.0
     folder: str | Path | None = field(default=None, repr=False, compare=False)
     sources: tuple[Source, ...] = field(init=False, repr=False, compare=False)
+    makers: Mapping[str, Mapping[str, ModelSource]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name, check in _CHECKS.items():
@@ -152,6 +187,20 @@ class Study:
         for source in sources:
             experiment(source)
         object.__setattr__(self, "sources", sources)
+        assert isinstance(self.estimators, Mapping)
+        named = {
+            "observers": {one: one for one in self.observers if one != USUAL_OBSERVER},
+            "estimators": self.estimators,
+        }
+        made = {
+            group: {
+                name: find(text, folder, group[:-1], KNOWN[group]) for name, text in chosen.items()
+            } for group, chosen in named.items()
+        }
+        object.__setattr__(self, "makers", made)
+        if any(made.values()):
+            for source in sources:
+                _ = experiment(source).problem
         object.__setattr__(self, "models", tuple(model.name for model in models))
 
     @classmethod
@@ -191,6 +240,10 @@ class Study:
             try:
                 for name in _models(value) if key == "models" else ():
                     check_named_in_file(name, path.parent)
+                if key in _RETURNS:
+                    names = _CHECKS[key](value)
+                    for name in names.values() if isinstance(names, dict) else names:
+                        check_named_in_file(name, path.parent, key[:-1], _RETURNS[key])
                 cls(**(data if key in _DATA else {key: value}), folder=path.parent)
             except InvalidInputError as error:
                 words = str(error)
@@ -222,14 +275,19 @@ class Study:
                 usual.horizon if horizon is None else horizon, start, seed,
                 min(steps, usual.steps) if self.records else steps, level,
             )
-            for name, qps, cap in product(self.backends, self.qps, self.solver_iterations):
+            # The same wherever the sequence would have started.
+            without = None, place[0], "candidate", *place[2:]
+            for observer, name, qps, cap in product(
+                self.observers, self.backends, self.qps, self.solver_iterations
+            ):
                 if qps == 0:
-                    # The observer is the same wherever the sequence would have started.
-                    cell = Cell(source.name, OBSERVER, 0, None, place[0], "candidate", *place[2:])
+                    cell = Cell(source.name, OBSERVER, 0, *without, observer)
                 else:
                     own = cap if backend(name).iteration_cap else None
-                    cell = Cell(source.name, name, qps, own, *place)
+                    cell = Cell(source.name, name, qps, own, *place, observer)
                 made[cell] = None
+            for name in self.estimators:
+                made[Cell(source.name, name, 0, *without, "")] = None
         return tuple(made)
 
     def to_latex(self, store: Store | str | Path) -> str:
@@ -308,6 +366,33 @@ def _backends(value: Any) -> tuple[str, ...]:
     return _distinct(names)
 
 
+def _observers(value: Any) -> tuple[str, ...]:
+    names = _several("observers", value, f"expected some of {USUAL_OBSERVER}, "
+                                         f"{', '.join(KNOWN['observers'])}, or functions")
+    for name in names:
+        if not isinstance(name, str):
+            raise StudyError(f"observers has {shown(name)}; expected the name of an observer.")
+    return _distinct(names)
+
+
+def _estimators(value: Any) -> dict[str, str]:
+    items = value if isinstance(value, Mapping) else {
+        one: one for one in ([value] if isinstance(value, str) else value)
+    }
+    for name, text in items.items():
+        if not (isinstance(name, str) and isinstance(text, str)):
+            raise StudyError(
+                f"estimators has {shown(name)}: {shown(text)}; expected a name, and the name of a "
+                "function that makes the estimator."
+            )
+        if name == OBSERVER or name in {one.name for one in backends()}:
+            raise StudyError(
+                f"estimators has the name {name!r}, which is taken by "
+                f"{'the observer' if name == OBSERVER else 'a QP backend'}; give it another."
+            )
+    return dict(items)
+
+
 def _numbers(name: str, least: int, nothing: str) -> Callable[[Any], tuple[int | None, ...]]:
     def check(value: Any) -> tuple[int | None, ...]:
         items = [value] if value is None else _several(name, value, "give at least one number")
@@ -364,6 +449,8 @@ _CHECKS: dict[str, Callable[[Any], Any]] = {
     "records": _records,
     "reading": _reading,
     "backends": _backends,
+    "observers": _observers,
+    "estimators": _estimators,
     "qps": _numbers("qps", 0, " None iterates to convergence."),
     "solver_iterations": _numbers("solver_iterations", 1, " None leaves the solver's default."),
     "horizons": _numbers("horizons", 1, " None takes the model's."),

@@ -8,12 +8,18 @@ from typing import Any
 
 from .._checks import Array
 
+#: Backend of a cell that solves no QP.
+OBSERVER = "observer"
+#: The observer that a model has.
+USUAL_OBSERVER = "model"
+
 
 @dataclass(frozen=True)
 class Cell:
     """What distinguishes one run from all others of a study.
 
-    ``backend`` is `qpmhe.studies.cell.OBSERVER` if no QP is solved. ``qps`` is None to iterate to
+    ``backend`` is `OBSERVER` if no QP is solved, and the name of another
+    estimator, which has no ``observer``; ``qps`` is 0 then. ``qps`` is None to iterate to
     convergence; ``solver_iterations``, the cap inside each QP, is None for the solver's default.
     ``noise_level`` multiplies the standard deviations of the simulated disturbance and noise.
     """
@@ -27,6 +33,7 @@ class Cell:
     seed: int
     steps: int
     noise_level: float = 1.0
+    observer: str = USUAL_OBSERVER
 
     @property
     def key(self) -> str:
@@ -34,9 +41,10 @@ class Cell:
         qps = "converged" if self.qps is None else self.qps
         cap = "none" if self.solver_iterations is None else self.solver_iterations
         level = "" if self.noise_level == 1.0 else f"/noise={self.noise_level:g}"
+        observer = "" if self.observer in ("", USUAL_OBSERVER) else f"/observer={self.observer}"
         return (
             f"{self.model}/{self.backend}/i={qps}/cap={cap}/N={self.horizon}/{self.start}"
-            f"/T={self.steps}{level}/seed={self.seed}"
+            f"/T={self.steps}{level}{observer}/seed={self.seed}"
         )
 
     @property

@@ -21,10 +21,10 @@ from qpmhe_solvers.values import shown
 
 from .._checks import dimension, flag, make_folder, need
 from ..errors import OptionError
-from .cell import ENGINE, OBSERVER, Task, compute, failure
+from .cell import ENGINE, Task, compute, failure
 from .environment import environment, revision
 from .grid import Study, StudyError
-from .row import StudyRow
+from .row import OBSERVER, StudyRow
 from .store import Store
 
 if TYPE_CHECKING:
@@ -110,7 +110,11 @@ def run(
             {
                 **study.settings(), "engine": ENGINE, "jobs": workers.jobs, "scheduler": scheduler,
             },
-            {source.name: source.fingerprint for source in study.sources},
+            {f"model {source.name!r}": source.fingerprint for source in study.sources}
+            | {
+                f"{one.kind} {name!r}": f"{one.name} {one.fingerprint}"
+                for group in study.makers.values() for name, one in group.items()
+            },
         )
         tasks, found = _tasks(study, writer.present(retry_failed), workers.jobs > 1, failing)
         git = revision()
@@ -288,7 +292,7 @@ def _answer(
 def _again(workers: _Processes | _Cluster, task: Task) -> StudyRow:
     """Run a cell alone at which a process may have died, at last with its solver isolated."""
     words = ""
-    for isolated in (False, True) if task.cell.backend != OBSERVER else (False,):
+    for isolated in (False, True) if task.cell.qps != 0 else (False,):
         workers.restart()
         start = monotonic()
         future = workers.submit(replace(task, isolated=isolated))
@@ -324,11 +328,14 @@ def _tasks(
         if wanted <= known:
             found += 1
             continue
-        registered = None if cell.backend == OBSERVER else backend(cell.backend)
+        estimator = study.makers["estimators"].get(cell.backend)
+        alone = estimator is not None or cell.backend == OBSERVER
         tasks.append(
             Task(
                 cell, sources[cell.model], wanted | known, study.cell_timeout,
-                keep=first, shared=shared, registered=registered, failing=failing,
+                keep=first, shared=shared,
+                registered=None if alone else backend(cell.backend), failing=failing,
+                observer=study.makers["observers"].get(cell.observer), estimator=estimator,
             )
         )
     return tasks, found

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 #: Version of the tables, and of what their columns mean.
-SCHEMA = 4
+SCHEMA = 5
 # Distinguishes our files from other SQLite files: "qpmh".
 _APPLICATION = 0x71706D68
 # Seconds to wait for another program's lock.
@@ -192,14 +192,14 @@ class Writer:
         self._path, self._connection = path, connection
 
     def begin(self, settings: dict[str, Any], fingerprints: dict[str, str]) -> None:
-        """Note that a study begins, with its settings and the fingerprints of its models' files."""
+        """Note that a study begins, with its settings and the fingerprints of what it names."""
         connection = self._connection
         with _explained(self._path), _transaction(connection):
             known = dict(connection.execute("SELECT name, fingerprint FROM models").fetchall())
             for name, fingerprint in fingerprints.items():
                 if known.get(name, fingerprint) != fingerprint:
                     raise StoreError(
-                        f"model {name!r} has changed since its cells were stored in "
+                        f"{name} has changed since its cells were stored in "
                         f"{self._path}: its file, a file that it imports, its record, or the "
                         "options for reading that. Name another store, or undo the change."
                     )

@@ -13,7 +13,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import numbers
 from ..errors import InvalidInputError, ShapeError
-from .row import CONFIGURATION, HALVES, METRICS
+from .row import CONFIGURATION, HALVES, METRICS, OBSERVER
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -122,6 +122,25 @@ def summarise(frame: DataFrame) -> DataFrame:
             whole["time_median"], whole[measure(rows)], TOLERANCE
         )
     return summary
+
+
+def with_observers(frame: DataFrame) -> DataFrame:
+    """Cells whose backends have the observer in their names, if there are several observers."""
+    own = frame["observer"].ne("")
+    if frame.loc[own, "observer"].nunique() < 2:
+        return frame
+    names = frame["backend"] + " / " + frame["observer"]
+    return frame.assign(backend=frame["backend"].where(~own, names))
+
+
+def alone(rows: DataFrame) -> Series:
+    """Which rows are an observer's that solves no QP; see `with_observers`."""
+    return rows["backend"].str.partition(" / ")[0] == OBSERVER
+
+
+def sequential(rows: DataFrame) -> Series:
+    """Which rows solve QPs: neither an observer's nor those of other estimators."""
+    return rows["qps"].ne(0).fillna(True).astype(bool)
 
 
 def with_halves(summary: DataFrame) -> DataFrame:

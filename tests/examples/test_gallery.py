@@ -37,25 +37,6 @@ def linear(parts, noise=0.1, steps=40, tunes=0, **options):
     )
 
 
-def test_an_iterated_filter_is_the_kalman_filter_and_minimises_its_update(parts):
-    problem, kind = linear(parts), parts["baselines"].IteratedKalman
-    y = problem.records[0].measurements
-    y[7] = np.nan
-    runs = [
-        problem.estimator(np.ones(2), problem.weights, one, max_qps=0).run(y)
-        for one in (kind, qpmhe.ExtendedKalman)
-    ]
-    np.testing.assert_allclose(runs[0].filtered, runs[1].filtered, atol=1e-12)
-    np.testing.assert_allclose(runs[0].states, runs[1].states, atol=1e-12)
-    # Of an exponential output: the minimum of the squares of prior and measurement.
-    system, one = qpmhe.System(lambda x: x, lambda x: np.exp(x), n=1, p=1), np.eye(1)
-    observer = kind(prior=one, disturbance=one, noise=0.01 * one)
-    z, y, nothing = np.array([0.0]), np.array([3.0]), np.zeros(0)
-    sample = qpmhe.Sample(system, nothing, one, system.h_jacobian(z, nothing), covariance=one)
-    found, _ = observer.filter(z, y - system.h(z, nothing), sample)
-    assert abs(found - np.exp(found) * (y - np.exp(found)) / 0.01) < 1e-4
-
-
 def test_errors_are_those_of_the_samples_own_times_and_lost_runs_count(parts):
     problem = linear(parts, noise=0.0, tunes=10)
     (record,) = problem.records

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..summary import PROBLEM, RANKED_BY, TOLERANCE, measure
+from ..summary import PROBLEM, RANKED_BY, TOLERANCE, alone, measure, sequential
 from .words import configuration_words, listed, missing, number, percent, seconds
 
 if TYPE_CHECKING:
@@ -118,8 +118,8 @@ class Case:
         return text + "."
 
     def _observer(self, other: Any) -> Answer | None:
-        rows = self.whole[self.whole["backend"] == "observer"]
-        if rows.empty or other["backend"] == "observer":
+        rows = self.whole[alone(self.whole) & (self.whole["observer"] == other["observer"])]
+        if rows.empty or other.name in rows.index:
             return None
         observer = rows.iloc[0]
         ratio = observer[self.by] / other[self.by] if other[self.by] > 0.0 else np.inf
@@ -134,19 +134,18 @@ class Case:
 
     def _worse(self) -> Answer | None:
         """The configurations that estimate worse than the observer alone, the worst first."""
-        observers = self.whole[self.whole["backend"] == "observer"]
-        rows = self.summary[
-            (self.summary["backend"] != "observer") & (self.summary["failures"] == 0)
-        ]
+        observers = self.whole[alone(self.whole)].drop_duplicates("observer").set_index("observer")
+        rows = self.summary[sequential(self.summary) & (self.summary["failures"] == 0)]
+        rows = rows[rows["observer"].isin(observers.index)]
         if observers.empty or rows.empty or self.by != "rmse":
             return None
-        question, alone = "Worse than no QP", observers.iloc[0]
-        found = []
+        question, found = "Worse than no QP", []
         for _, row in rows.iterrows():
+            own = observers.loc[row["observer"]]
             for name, words in (("rmse", "RMSE"), ("rmse_settled", "RMSE after settling")):
-                error, limit = float(row[name]), (1 + TOLERANCE) * float(alone[name])
+                error, limit = float(row[name]), (1 + TOLERANCE) * float(own[name])
                 if error > limit or (np.isnan(error) and not np.isnan(limit)):
-                    ratio = error / float(alone[name]) if alone[name] > 0 else np.inf
+                    ratio = error / float(own[name]) if own[name] > 0 else np.inf
                     times = f", {number(ratio)} times" if np.isfinite(ratio) else ""
                     text = f"{configuration_words(row)} ({words} {number(error)}{times})"
                     found.append((np.nan_to_num(ratio, nan=np.inf), text, name == "rmse"))
@@ -165,7 +164,7 @@ class Case:
         )
 
     def _failed(self) -> Answer:
-        rows = self.summary[self.summary["backend"] != "observer"]
+        rows = self.summary[~alone(self.summary)]
         never, failures = [], []
         for backend, mine in rows.groupby("backend"):
             cells, failed = int(mine["seeds"].sum()), int(mine["failures"].sum())

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._checks import Array
 from ..row import CONFIGURATION
-from ..summary import PROBLEM, RANKED_BY, measure
+from ..summary import PROBLEM, RANKED_BY, alone, measure, sequential
 from .answers import NEAR
 from .drawing import Axis, Drawing, Panel, PlotMark, Style, styles
 from .words import (
@@ -66,12 +66,11 @@ def anytime(summary: DataFrame, start: str) -> Drawing | None:
     nothing of one backend at one cap.
     """
     rest = summary[
-        (summary["backend"] != "observer") & (summary["failures"] == 0)
-        & (summary["start"] == start)
+        sequential(summary) & (summary["failures"] == 0) & (summary["start"] == start)
     ]
     if len(rest[["backend", "solver_iterations"]].drop_duplicates()) < 2:
         return None
-    observer = summary[summary["backend"] == "observer"]
+    others = summary[~sequential(summary)]
     caps = sorted({int(cap) for cap in rest["solver_iterations"] if not missing(cap)})
     order = [*map(str, caps), "none"]
     panels: list[Panel] = []
@@ -79,8 +78,8 @@ def anytime(summary: DataFrame, start: str) -> Drawing | None:
     metrics = [(name, label) for name, label in metrics if rest[name].notna().any()]
     for metric, label in metrics:
         marks = [
-            PlotMark("level", order, [float(row[metric])] * len(order), "observer")
-            for _, row in observer.iterrows() if not missing(row[metric])
+            PlotMark("level", order, [float(row[metric])] * len(order), str(row["backend"]))
+            for _, row in others.iterrows() if not missing(row[metric])
         ]
         for (backend, qps), rows in rest.groupby(["backend", "qps"], dropna=False, sort=False):
             marks.append(PlotMark(
@@ -113,14 +112,15 @@ def sweeps(summary: DataFrame) -> dict[str, tuple[Drawing, dict[str, Style]]]:
     drawn = {}
     for (model, steps), rows in summary.groupby(["model", "steps"], sort=False):
         rows = rows[(rows["failures"] == 0) & rows["solver_iterations"].isna()]
-        rest = rows[rows["backend"] != "observer"]
+        rest = rows[sequential(rows)]
         least = rest.groupby("backend")[measure(rows)].min()
         if least.isna().all():
             continue
         backend = min(least.index[least <= (1 + NEAR) * least.min()])
         start = min(rest["start"], key=usual_first)
-        rows = rows[rows["backend"].isin(["observer", backend]) & rows["start"].isin(
-            [start, "candidate"])]
+        mine = rows["backend"] == backend
+        same = rows["observer"] == rows.loc[mine, "observer"].iloc[0]
+        rows = rows[(mine | alone(rows) & same) & rows["start"].isin([start, "candidate"])]
         varying = [name for name in AXES if rows[name].nunique(dropna=False) > 1]
         for name in varying:
             lines = next((one for one in ("qps", "horizon", "noise_level")
@@ -167,8 +167,10 @@ def times(found: list[Spread], deadline: float | None) -> Drawing | None:
     """Step times: boxes of quartiles with 1 % and 99 % whiskers, and the longest step."""
     if not found:
         return None
-    backends = sorted({one.backend for one in found} - {"observer"}, reverse=True)
-    names = ["observer"] * any(one.backend == "observer" for one in found) + backends
+    # A category's first name is the lowest.
+    sequences = {one.backend for one in found if one.qps != "0"}
+    others = {one.backend for one in found} - sequences
+    names = [*sorted(others, reverse=True), *sorted(sequences, reverse=True)]
     marks = []
     for one in found:
         low, first, median, third, high, most = map(seconds, one.quantiles)
@@ -176,7 +178,7 @@ def times(found: list[Spread], deadline: float | None) -> Drawing | None:
             "box", one.quantiles, [one.backend], one.backend,
             [f"{one.backend}, {one.steps} steps\n1 % {low}, 25 % {first}, median {median}\n"
              f"75 % {third}, 99 % {high}, longest {most}"],
-            meta={} if one.backend == "observer" else {"qps": one.qps},
+            meta={} if one.qps == "0" else {"qps": one.qps},
         ))
     values = [value for one in found for value in one.quantiles]
     return Drawing(
@@ -238,10 +240,10 @@ class Spread:
 
 
 def spreads(cells: DataFrame, start: str) -> list[Spread]:
-    """Quantiles over the steps of all seeds: the observer's, and without a cap from this start."""
+    """Quantiles over the steps of all seeds: without QPs, and without a cap from this start."""
     uncapped = cells["solver_iterations"].isna() & (cells["start"] == start)
     found = []
-    for (backend, qps), rows in cells[uncapped | (cells["backend"] == "observer")].groupby(
+    for (backend, qps), rows in cells[uncapped | ~sequential(cells)].groupby(
         ["backend", "qps"], dropna=False
     ):
         parts = [np.asarray(one, dtype=float) for one in rows["times"] if one is not None]
@@ -284,7 +286,7 @@ def profiles(frame: DataFrame) -> list[Profile]:
     times, with fewer than two problems, or if no problem counts as solved.
     """
     problems = [*PROBLEM, "seed"]
-    cells = frame[frame["backend"] != "observer"]
+    cells = frame[sequential(frame)]
     names = [tuple(row) for row in cells[problems].astype(str).to_numpy()]
     count = len(set(names))
     if count < 2 or not cells["time_median"].notna().any():

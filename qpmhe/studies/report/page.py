@@ -13,7 +13,7 @@ from ...plots import save
 from ...plots.style import inches_of
 from ..environment import environment_words
 from ..store import Store, opened
-from ..summary import PROBLEM, cells_of, summarise
+from ..summary import PROBLEM, cells_of, summarise, with_observers
 from . import figures
 from .answers import cases, failures, limitations
 from .drawing import Picture, Style, styles
@@ -74,7 +74,7 @@ def write_report(
         raise InvalidInputError(
             "the study has no finished cell to report; run it first."
         )
-    folder = make_folder(out)
+    folder, frame = make_folder(out), with_observers(frame)
     summary = summarise(frame)
     deadline = (meta.get("study") or {}).get("deadline")
     found = [

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...plots import trajectories
 from ..store import Store
+from ..summary import sequential
 from . import figures
 from .answers import Case, chosen, file_name
 from .drawing import Picture, Style, draw
@@ -108,7 +109,7 @@ def _accuracy(part: Part, drawn: Mapping[str, Style], inches: float | None) -> P
 def _anytime(part: Part, drawn: Mapping[str, Style], inches: float | None) -> Picture | None:
     start, of_start = _start(part)
     one, rest = figures.anytime(part.case.summary, start), part.case.whole
-    rest = rest[(rest["backend"] != "observer") & (rest["start"] == start)]
+    rest = rest[sequential(rest) & (rest["start"] == start)]
     if one is None or rest.empty:
         return None
     words = ranked(map(qps_words, rest["qps"]))
@@ -121,7 +122,7 @@ def _anytime(part: Part, drawn: Mapping[str, Style], inches: float | None) -> Pi
 def _times(part: Part, drawn: Mapping[str, Style], inches: float | None) -> Picture | None:
     start, of_start = _start(part)
     spreads = figures.spreads(part.cells, start)
-    words = ranked(one.qps for one in spreads if one.backend != "observer")
+    words = ranked(one.qps for one in spreads if one.qps != "0")
     one = figures.times(spreads, part.deadline)
     if one is None or not words:
         return None

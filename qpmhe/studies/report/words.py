@@ -38,10 +38,9 @@ def cap_words(cap: Any) -> str:
 
 def configuration_words(row: Any) -> str:
     """A row's backend, QPs per sample, cap, and start if it is not the usual one."""
-    backend = str(row["backend"])
-    if backend == "observer":
+    backend, qps, cap = str(row["backend"]), qps_words(row["qps"]), row["solver_iterations"]
+    if qps == "0":  # an observer or another estimator
         return backend
-    qps, cap = qps_words(row["qps"]), row["solver_iterations"]
     parts = [backend, qps_heading(qps) + (" per sample" if qps != "converged" else "")]
     if not missing(cap):
         parts.append(f"cap {int(cap)}")
