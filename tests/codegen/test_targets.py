@@ -38,13 +38,14 @@ def block(start):
     return text.partition("written =")[0]
 
 
-def motor(**options):
+def motor(bounded=True, **options):
     """The page's estimator, with other options."""
     names = {}
     exec(block("python"), names)
     mhe = names["mhe"]
+    system = mhe.system if bounded else mhe.system.with_sets({"states": None})
     return type(mhe)(
-        mhe.system, mhe.observer, mhe.cost, horizon=20, initial_state=[0.0, 0.0, 0.05],
+        system, mhe.observer, mhe.cost, horizon=20, initial_state=[0.0, 0.0, 0.05],
         **{"max_qps": 2, "engine": "python"} | options,
     )
 
@@ -59,21 +60,18 @@ def record(system):
     return np.array(ys), us
 
 
-def on_target(name, mhe, ys, us, folder, compiled=True):
-    """The estimates of the written code, as an emulator runs it, and the bytes of stack it took."""
-    compiler, flags, emulator, real = TARGETS[name]
+def needed(compiler, emulator):
     for tool in (compiler, emulator.split()[0]):
         if shutil.which(tool) is None:
             pytest.skip(f"there is no {tool}")
-    is_board = emulator.startswith("qemu-system")
-    needs = codegen.write(
-        mhe, folder, name="drive", real=real, compiler=f"{compiler} {flags} -Os"
-    ).needs
-    arrays = {"y": ys, "u": us}
+
+
+def write_program(mhe, ys, us, folder):
+    """The page's files, and a record."""
     texts = [f"#define SAMPLES {len(ys)}"] + [
         f"static const drive_real {one}[][{rows.shape[1]}] = {{" + ",".join(
             "{" + ",".join(float(value).hex() for value in row) + "}" for row in rows
-        ) + "};" for one, rows in arrays.items()
+        ) + "};" for one, rows in (("y", ys), ("u", us))
     ]
     start = ",".join(float(value).hex() for value in mhe.initial_state)
     (folder / "samples.h").write_text("\n".join(
@@ -81,11 +79,26 @@ def on_target(name, mhe, ys, us, folder, compiled=True):
     ))
     for file, info in (("main.c", "c"), ("start.c", "c"), ("board.ld", "text")):
         (folder / file).write_text(block(f'{info} title="{file}"'))
+
+
+def run(folder, compiler, flags, emulator):
+    is_board = emulator.startswith("qemu-system")
     sources = ["main.c", "drive.c", *(["start.c"] if is_board else [])]
     command = [compiler, "-std=gnu99", "-Os", *flags.split(), *(BOARD.split() if is_board else [])]
     subprocess.run([*command, *sources, "-lm", "-o", "drive.elf"], cwd=folder, check=True)
-    run = [*emulator.split(), *(HOST.split() if is_board else []), "./drive.elf"]
-    subprocess.run(run, cwd=folder, check=True, timeout=200, stdin=subprocess.DEVNULL)
+    emulated = [*emulator.split(), *(HOST.split() if is_board else []), "./drive.elf"]
+    subprocess.run(emulated, cwd=folder, check=True, timeout=200, stdin=subprocess.DEVNULL)
+
+
+def on_target(name, mhe, ys, us, folder):
+    """The estimates of the written code, as an emulator runs it, and what it says that it needs."""
+    compiler, flags, emulator, real = TARGETS[name]
+    needed(compiler, emulator)
+    needs = codegen.write(
+        mhe, folder, name="drive", real=real, compiler=f"{compiler} {flags} -Os"
+    ).needs
+    write_program(mhe, ys, us, folder)
+    run(folder, compiler, flags, emulator)
     layout, _ = planned(mhe.system, mhe.observer, mhe.cost, mhe.settings, real)
     found = np.frombuffer((folder / "estimates.bin").read_bytes(), layout.estimate_type())
     assert len(found) == len(ys)
@@ -99,11 +112,7 @@ def test_a_target_is_the_python_step(name, bounded, tmp_path):
     mhe = motor()
     ys, us = record(mhe.system)
     if not bounded:
-        free = mhe.system.with_sets({"states": None})
-        mhe = type(mhe)(
-            free, mhe.observer, mhe.cost, horizon=20, initial_state=[0.0, 0.0, 0.05], max_qps=2,
-            engine="python",
-        )
+        mhe = motor(bounded=False)
     elif TARGETS[name][3] == "double":  # whose solutions of QPs are exact, as those in C are
         pytest.importorskip("daqp")
         mhe = motor(backend="daqp")
@@ -123,7 +132,6 @@ def test_a_target_is_the_python_step(name, bounded, tmp_path):
     for count in ("qps", "corrections", "nearest_points", "iterations"):
         assert found[count].max() <= getattr(needs, count)
     assert bounded == (found["iterations"].max() > 0)
-    print(name, bounded, needs, errors.mean(), found["iterations"].max(), found["qps"].max())
 
 
 @pytest.mark.slow
@@ -131,7 +139,6 @@ def test_the_stack_is_as_deep_as_is_said(tmp_path):
     """Of a stack full of marks, the record overwrites no more, and most of it."""
     mhe = motor()
     ys, us = record(mhe.system)
-    compiler, flags, emulator, _ = TARGETS["cortex-m7"]
     _, needs = on_target("cortex-m7", mhe, ys[:60], us[:60], tmp_path)
     main = (tmp_path / "main.c").read_text()
     main = main.replace("int main(void)", """
@@ -148,17 +155,46 @@ static void watched(const drive_real *y, const drive_real *u)
 
 int main(void)""").replace(
         "drive_update(&estimator, &workspace, y[t], u[t], &estimate);\n", "watched(y[t], u[t]);\n"
-    ).replace("sizeof estimate, 1, out", "0, 0, out").replace(
+    ).replace("fwrite(&estimate, sizeof estimate, 1, out)", "(void)0").replace(
         "return fclose", "fwrite(&deepest, sizeof deepest, 1, out);\n    return fclose"
     )
-    main = main.replace("fwrite(&estimate, 0, 0, out)", "(void)0")
     (tmp_path / "main.c").write_text(main)
-    subprocess.run(
-        [compiler, "-std=gnu99", "-Os", *flags.split(), *BOARD.split(), "main.c", "drive.c",
-         "start.c", "-lm", "-o", "drive.elf"], cwd=tmp_path, check=True,
-    )
-    subprocess.run([*emulator.split(), *HOST.split(), "./drive.elf"], cwd=tmp_path, check=True,
-                   timeout=200, stdin=subprocess.DEVNULL)
+    run(tmp_path, *TARGETS["cortex-m7"][:3])
     deepest = 4 * int(np.frombuffer((tmp_path / "estimates.bin").read_bytes(), np.uint32)[0])
-    print(deepest, needs)
     assert 0.5 * needs.stack < deepest <= needs.stack + 64  # and the saved registers of the caller
+
+
+# What a Cortex-M3 calls for each operation in double precision.
+CALLS = [f"__aeabi_{one}" for one in ("dadd", "dsub", "drsub", "dmul", "ddiv")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "least", "most"), [
+    ({"bounded": False, "max_qps": 0}, 700, 760), ({"bounded": False, "max_qps": 1}, 8_200, 8_900),
+    ({"bounded": False, "max_qps": 2}, 24_500, 26_500), ({}, 26_000, 115_000),
+])
+def test_operations_of_a_step(options, least, most, tmp_path):
+    """As many as the page says, once the window is full."""
+    tools = "arm-none-eabi-gcc", "qemu-system-arm -machine mps2-an385"
+    needed(*tools)
+    mhe = motor(**options)
+    ys, us = record(mhe.system)
+    codegen.write(mhe, tmp_path, name="drive")
+    write_program(mhe, ys[:200], us[:200], tmp_path)
+    counting = "static unsigned count;\n" + "".join(
+        f"double __real_{one}(double, double);\ndouble __wrap_{one}(double a, double b)\n"
+        f"{{\n    count++;\n    return __real_{one}(a, b);\n}}\n" for one in CALLS
+    )
+    main = (tmp_path / "main.c").read_text()
+    main = main.replace("int main(void)", f"{counting}int main(void)").replace(
+        "fwrite(&estimate, sizeof estimate, 1, out);", "fwrite(&count, 4, 1, out), count = 0;"
+    )
+    (tmp_path / "main.c").write_text(main)
+    start = (tmp_path / "start.c").read_text()
+    (tmp_path / "start.c").write_text(re.sub(r".*CPACR.*\n", "", start))  # it has no FPU
+    run(tmp_path, tools[0], "-mcpu=cortex-m3 -Wl," + ",".join(
+        f"--wrap={one}" for one in CALLS), tools[1])
+    found = np.frombuffer((tmp_path / "estimates.bin").read_bytes(), np.uint32)[25:]
+    assert least < np.median(found) < most
+    assert found.max() < most
+    assert found.min() > least
