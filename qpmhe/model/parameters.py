@@ -58,8 +58,8 @@ def augment_parameters(
     searches for a trajectory with constant parameters that costs no more.
 
     The model is a pair of NumPy functions, or a `System` whose last inputs are the parameters, made
-    by `System`, `from_casadi`, `from_jax`, `from_sympy` or `from_control`: the result has the same
-    kind of derivatives, and a CasADi model stays one.
+    by `System`, `from_casadi`, `from_jax`, `from_sympy`, `from_control` or `from_fmu`: the result
+    has the same kind of derivatives, and a CasADi model stays one.
 
     Parameters
     ----------

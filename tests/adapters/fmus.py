@@ -1,5 +1,6 @@
 """FMUs of two tanks for model exchange, compiled here, and the same model in NumPy."""
 
+import atexit
 import re
 import shutil
 import subprocess
@@ -19,7 +20,9 @@ STATES, INPUTS, OUTPUTS = ("upper", "lower"), ("pump", "leak"), ("flow", "total"
 
 @cache
 def folder():
-    return Path(tempfile.mkdtemp(prefix="qpmhe-tanks-"))
+    made = Path(tempfile.mkdtemp(prefix="qpmhe-tanks-"))
+    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    return made
 
 
 @cache

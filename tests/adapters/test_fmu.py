@@ -3,6 +3,7 @@
 import copy
 import os
 import pickle
+import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
@@ -303,3 +304,52 @@ def test_files_that_are_none_and_no_fmpy(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fmpy", None)
     with pytest.raises(InvalidInputError, match=r"from_fmu needs fmpy.*qpmhe\[fmu\]"):
         qpmhe.from_fmu(broken, dt=0.1)
+
+
+OSCILLATOR = '''
+from pythonfmu3 import Fmi3Causality, Fmi3Initial, Fmi3SlaveBase, Fmi3Variability, Float64
+from pythonfmu3 import ModelExchange
+
+
+class Oscillator(Fmi3SlaveBase, ModelExchange):
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.time, self.x, self.v, self.dx, self.dv, self.mu = 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
+        moving = {"variability": Fmi3Variability.continuous}
+        exact = {"initial": Fmi3Initial.exact, **moving}
+        rate = {"causality": Fmi3Causality.local, **moving}
+        for one in (
+            Float64("time", causality=Fmi3Causality.independent, **moving),
+            Float64("x", causality=Fmi3Causality.output, start=1.0, **exact),
+            Float64("v", causality=Fmi3Causality.local, start=0.0, **exact),
+            Float64("dx", derivative=1, **rate), Float64("dv", derivative=2, **rate),
+            Float64("mu", causality=Fmi3Causality.parameter, start=1.0,
+                    variability=Fmi3Variability.fixed),
+        ):
+            self.register_variable(one)
+
+    def get_continuous_state_derivatives(self):
+        self.dx, self.dv = self.v, self.mu * (1.0 - self.x**2) * self.v - self.x
+        return [self.dx, self.dv]
+'''
+
+
+@pytest.mark.slow
+def test_an_fmu_of_another_tool(tmp_path):
+    """Van der Pol's oscillator by pythonfmu3, which runs it in this interpreter."""
+    pytest.importorskip("pythonfmu3")
+    (tmp_path / "oscillator.py").write_text(OSCILLATOR)
+    subprocess.run(
+        [sys.executable, "-m", "pythonfmu3", "build", "-f", "oscillator.py"], cwd=tmp_path,
+        check=True, capture_output=True,
+    )
+    system = qpmhe.from_fmu(tmp_path / "Oscillator.fmu", dt=0.1, parameters={"mu": 0.7})
+    other = qpmhe.System.from_ode(
+        lambda x: np.stack([x[1], 0.7 * (1.0 - x[0] ** 2) * x[1] - x[0]]), lambda x: x[:1],
+        n=2, p=1, dt=0.1,
+    )
+    assert [one.name for one in system.signals.states] == ["x", "v"]
+    xs, us = fmus.points()[0], np.zeros((6, 0))
+    np.testing.assert_allclose(system.f.batch(xs, us), other.f.batch(xs, us), rtol=1e-12)
+    slopes = system.f_jacobian.batch(xs, us)
+    np.testing.assert_allclose(slopes, other.f_jacobian.batch(xs, us), rtol=1e-6, atol=1e-8)
