@@ -19,7 +19,7 @@ from .layout import SET_NAMES, Layout
 Array = NDArray[np.float64]
 
 # What the ring of stages has in place of a record's window; the rest follows from it.
-_OF_RING = ("first", "length", "has_trajectory", "has_smoothed")
+_OF_RING = ("first", "length", "has_trajectory", "has_smoothed_prior")
 
 
 def _in_order(memory: Any) -> NDArray[np.intp]:
@@ -47,20 +47,9 @@ def record_of(memory: Any, layout: Layout, directions: Directions) -> MemoryReco
         if field.rows == "state":
             array[length] = memory[f"{field.name}_end"]
     record.y[:length][~record.is_observed[:length]] = 0.0
-    record.start, record.end, record.time, record.unusual = 0, length, time, True
-    far, dropped = memory["watched"].tolist()
-    record.watched, record.last_good = (far, dropped), memory["last_good"].copy()
-    record.damping = float(memory["damping"])
-    if layout.restarts:
-        record.restarted = int(memory["restarted"])
-    if memory["has_trajectory"]:
-        record.trajectory = memory["trajectory"][: length + 1].copy()
-    if memory["has_smoothed"]:
-        record.smoothed_prior = memory["smoothed_prior"].copy()
-    if layout.held:
-        record.trusted = memory["trusted"].copy()
-    if layout.covariance:
-        record.last_good_covariance = memory["last_good_covariance"].copy()
+    record.start, record.end, record.unusual = 0, length, True
+    for field in layout.sizes.fields("both", "once"):
+        setattr(record, field.name, _single(memory, field, length))
     for k, place in enumerate(places):
         own = _conditions(memory["stages"][place], directions)
         if own is not None:
@@ -84,29 +73,39 @@ def write(memory: Any, sizes: MemorySizes, record: MemoryRecord, own: dict[str, 
     """
     length = record.length
     stages = memory["stages"][:length]
-    memory["length"], memory["time"] = length, record.time
+    memory["length"] = length
     for field in sizes.fields("both", "stage", "state"):
         array = record.rows[field.name]
         stages[field.name] = array[:length]
         if field.rows == "state":
             memory[f"{field.name}_end"] = array[length]
-    memory["watched"], memory["last_good"] = record.watched, record.last_good
-    memory["damping"] = record.damping
-    if "restarts" in sizes.features:
-        memory["restarted"] = record.restarted
-    memory["has_trajectory"] = record.trajectory is not None
-    if record.trajectory is not None:
-        memory["trajectory"][: length + 1] = record.trajectory
-    memory["has_smoothed"] = record.smoothed_prior is not None
-    for name in ("smoothed_prior", "trusted", "last_good_covariance"):
-        if (value := getattr(record, name)) is not None:
-            memory[name] = value
+    for field in sizes.fields("both", "once"):
+        value = getattr(record, field.name)
+        if f"has_{field.name}" in memory.dtype.names:
+            memory[f"has_{field.name}"] = value is not None
+        if value is not None and field.of_window:
+            memory[field.name][: length + 1] = value
+        elif value is not None:
+            memory[field.name] = value
     for field in _own(sizes):
         part = memory if field.rows == "once" else stages
         like, name = _plain(part[field.name]), field.name
         given = checked_array(name, own[name], like.shape, like.dtype, field.is_finite)
         kind = part[name].dtype
         part[name] = given if kind.names is None else given.view(kind).reshape(length)
+
+
+def _single(memory: Any, field: Field, length: int) -> Any:
+    """A value of which there is one, as a record has it; None for one that is missing."""
+    flag = f"has_{field.name}"
+    if flag in memory.dtype.names and not memory[flag]:
+        return None
+    value = np.asarray(memory[field.name])
+    if field.kind in ("count", "time"):
+        return tuple(value.tolist()) if field.shape else value.item()
+    if not field.shape:
+        return value.item()
+    return value[: length + 1 if field.of_window else None].copy()
 
 
 def _own(sizes: MemorySizes) -> list[Field]:

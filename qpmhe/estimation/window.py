@@ -143,14 +143,12 @@ class Window(ObserverSteps):
             self.u[:length, m - parameters.size : m] = parameters
         for field in self.sizes.fields("python", "state"):
             self.rows[field.name][0] = kept[field.name][0]
-        self.last_good, self.last_good_covariance = other.last_good_before(other.start)
-        self.smoothed_prior, self.trusted = other.smoothed_prior, other.trusted
-        self.watched, self.damping = other.watched, other.damping
-        self.restarted = other.restarted
+        self.take_single(other)
+        self.trajectory = None  # no estimate of the changed samples yet
         if self.metric is not None and other.metric is not None:
             self.metric.state = other.metric.state
         self.own = {time: own.without(changes) for time, own in other.own.items()}
-        self.start, self.end, self.time, self.unusual = 0, length, other.time, True
+        self.start, self.end, self.unusual = 0, length, True
         self.enter_states(0, self.time - length)
         for k in range(length):
             self._set_weight(k, self.time - length + k)

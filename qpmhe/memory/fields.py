@@ -40,6 +40,11 @@ class Field(NamedTuple):
     about: str = ""
     is_finite: bool = True
 
+    @property
+    def of_window(self) -> bool:
+        """Whether its first dimension is that of the window's states, of which some are used."""
+        return self.shape.startswith("states")
+
 
 #: All fields. Both engines have the samples, the observer along them and the last estimates; each
 #: has the linearised stages in the form in which it computes with them.
@@ -84,9 +89,9 @@ FIELDS = (
     # In C: where the ring of stages begins, and what a sample has of its own.
     Field("first", "once", kind="count", engine="c", about="stage of the window in the ring"),
     Field("length", "once", kind="count", engine="c", about="stages in the window"),
+    # A single value that may be missing has a flag, has_NAME.
     Field("has_trajectory", "once", kind="flag", engine="c"),
-    Field("has_smoothed", "once", kind="flag", engine="c",
-          about="whether there is a smoothed prior"),
+    Field("has_smoothed_prior", "once", kind="flag", engine="c"),
     Field("metric_settled", "once", kind="flag", engine="c",
           about="whether the metric is for good"),
     Field("metric", "once", "metric", engine="c", about="of the observer, as a covariance"),

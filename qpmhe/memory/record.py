@@ -213,13 +213,17 @@ class MemoryRecord:
                 self.rows[field.name][:rows] = other.rows[field.name][first : first + rows]
             elif field.rows == "state":  # of no use there: as at the start
                 self.rows[field.name][1 : length + 1] = self.rows[field.name][0]
+        self.take_single(other)
+        self.own, self.start, self.end, self.unusual = other.own, 0, length, True
+
+    def take_single(self, other: MemoryRecord) -> None:
+        """Take over the values of which there is one from another record."""
         for name in self._single:
             if name in other._single:
                 setattr(self, name, getattr(other, name))
         self.last_good, covariance = other.last_good_before(other.start)
         if covariance is not None:
             self.last_good_covariance = covariance
-        self.own, self.start, self.end, self.unusual = other.own, 0, length, True
 
     def state_dict(self) -> dict[str, Any]:
         """Copies of all data."""

@@ -224,7 +224,8 @@ def _patterns(
 def _upper_hessian(stages: int, n: int) -> csc_matrix:
     from scipy.sparse import triu
 
-    return triu(hessian_pattern(stages, n), format="csc")
+    upper: csc_matrix = triu(hessian_pattern(stages, n), format="csc")
+    return upper
 
 
 @lru_cache(maxsize=64)
@@ -235,4 +236,5 @@ def _every_row(stages: int, n: int, rows: int) -> csr_matrix:
     unit = np.arange(stages * n)
     ones = csc_matrix((np.full(unit.size, 2 * stages * rows * n), (unit, unit)))
     void = csc_matrix((1, unit.size), dtype=np.intp)
-    return vstack((ones, rows_pattern(stages, n, rows), void), format="csr")
+    every: csr_matrix = vstack((ones, rows_pattern(stages, n, rows), void), format="csr")
+    return every

@@ -15,7 +15,7 @@ static void mhe_set_prior(mhe_estimator *e, mhe_workspace *k)
 static real mhe_move_prior(mhe_estimator *e, mhe_workspace *k)
 {
     real offset[NX];
-    if (!e->has_smoothed) return 0;
+    if (!e->has_smoothed_prior) return 0;
     for (int j = 0; j < NX; j++) offset[j] = mhe_stage_at(e, 0)->z[j] - e->smoothed_prior[j];
     mhe_wrap_state(e->settings, mhe_stage_at(e, 0)->z, offset);
     const real cost = mhe_prior_cost(e->settings, k, offset);

@@ -52,7 +52,7 @@ static void mhe_step(mhe_estimator *e, mhe_workspace *k, const mhe_sample *sampl
     mhe_begin(e, k);
     if (e->settings->smooth && e->has_trajectory && e->length == MHE_HORIZON) {
         memcpy(e->smoothed_prior, e->trajectory + NX, sizeof e->smoothed_prior);
-        e->has_smoothed = 1;
+        e->has_smoothed_prior = 1;
     }
     mhe_trust_on(e);
     if (before == MHE_HORIZON) mhe_shift_places(e);
