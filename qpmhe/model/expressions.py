@@ -13,7 +13,7 @@ from .._checks import dimension, positive
 from ..errors import InvalidInputError, ModelError
 from .discretize import Discretization, checked_discretization
 from .functions import check_inputs, takes_input
-from .products import has_products, with_slope
+from .products import has_products, with_products, with_slope
 
 
 def import_casadi() -> Any:
@@ -211,8 +211,14 @@ def _canonical(ca: Any, name: str, given: Any, n: int, m: int) -> Any:
     else:
         raise ModelError(f"{name} is {given!r}; expected a casadi.Function or a callable.")
     error: Exception | None = None
+    graph = _graph(ca, name, call, n, m)
     # Scalar operations are quicker, but cannot break off.
-    asserting = _asserts(ca, call, n, m)
+    asserting = graph is not None and _asserts(ca, graph)
+    if graph is not None and not asserting:
+        found = with_products(graph)
+        if found is not None:
+            _check_same(ca, name, call, found, n, m)
+            return found
     for kind in (ca.MX,) if asserting else (ca.SX, ca.MX):
         x, u = kind.sym("x", n), kind.sym("u", m)
         try:
@@ -260,16 +266,20 @@ def _check_same(
             )
 
 
-def _asserts(ca: Any, call: Callable[[Any, Any], Any], n: int, m: int) -> bool:
-    """Whether there is an assertion (attachAssert) in a function, or in one that it calls."""
+def _graph(ca: Any, name: str, call: Callable[[Any, Any], Any], n: int, m: int) -> Any:
+    """A function as a graph of matrices, to look into; None if it takes scalars alone."""
     x, u = ca.MX.sym("x", n), ca.MX.sym("u", m)
     try:
         value = call(x, u)
         if isinstance(value, (list, tuple)):
             value = ca.vertcat(*value)
-        function = ca.Function("tried", [x, u], [ca.MX(value)])
+        return ca.Function(name, [x, u], [ca.vec(ca.MX(value))])
     except Exception:  # of scalar operations alone, or reported when it is used
-        return False
+        return None
+
+
+def _asserts(ca: Any, function: Any) -> bool:
+    """Whether there is an assertion (attachAssert) in a graph, or in a function that it calls."""
     found, waiting = set(), [function]
     while waiting:
         one = waiting.pop()

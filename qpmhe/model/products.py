@@ -7,6 +7,7 @@ operations each, and a graph of matrices (casadi.MX) calls these in turn.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 #: A matrix of at least so many nonzeros is kept as one. From 20 by 20 on, loops are faster than as
@@ -78,6 +79,75 @@ class Products:
                 product = ca.mtimes(ca.MX(one.matrix), columns_of)
                 known.append((ca.vec(one.symbols), ca.vec(product)))
         return ca.Function(name, arguments, part([result]))
+
+
+def with_products(function: Any) -> Any:
+    """A graph of matrices (MX) whose products with large constant matrices are one operation each.
+
+    Between these it is of scalar operations. None where there is no such product, or an operation
+    that has no scalar form.
+    """
+    if not any(_multiplies(one) for one in _graphs(function)):
+        return None
+    ca, products = _casadi(), Products()
+    columns = [ca.SX.sym(f"a{k}", function.numel_in(k)) for k in range(function.n_in())]
+    try:
+        result, = _evaluated(function, columns, products)
+    except Exception:  # whatever CasADi makes of it
+        return None
+    made = products.function(function.name(), columns, ca.densify(ca.SX(result)))
+    return made if has_products(made) else None
+
+
+def _graphs(function: Any) -> Iterator[Any]:
+    """A function and those that it calls, if they are graphs of matrices."""
+    if function.is_a("MXFunction"):
+        yield function
+        for one in function.find_functions():
+            if one.is_a("MXFunction"):
+                yield one
+
+
+def _multiplies(function: Any) -> bool:
+    """Whether there is a product with a large constant matrix in a graph."""
+    mtimes = _casadi().OP_MTIMES
+    return any(
+        function.instruction_id(k) == mtimes
+        and any(function.instruction_MX(k).dep(i).numel() >= LEAST for i in (1, 2))
+        for k in range(function.n_instructions())
+    )
+
+
+def _evaluated(function: Any, arguments: list[Any], products: Products) -> list[Any]:
+    """The values of a graph for scalar symbols, with its products among ``products``."""
+    ca = _casadi()
+    if not function.is_a("MXFunction"):
+        return list(function.call([ca.SX(one) for one in arguments]))
+    work: dict[int, Any] = {}
+    results: list[Any] = [None] * function.n_out()
+    for k in range(function.n_instructions()):
+        code, node = function.instruction_id(k), function.instruction_MX(k)
+        places, given = function.instruction_output(k), function.instruction_input(k)
+        if code == ca.OP_INPUT:
+            work[places[0]] = arguments[given[0]]
+        elif code == ca.OP_OUTPUT:
+            results[places[0]] = work[given[0]]
+        elif code == ca.OP_CONST:
+            work[places[0]] = ca.sparsify(node.to_DM())
+        elif code == ca.OP_RESHAPE:
+            work[places[0]] = ca.reshape(work[given[0]], *node.shape)
+        elif code == ca.OP_MTIMES:
+            into, left, right = (work[one] for one in given)
+            work[places[0]] = into + products.of(left, right)
+        elif code == ca.OP_CALL:
+            inner, values = node.which_function(), [work[one] for one in given]
+            work.update(zip(places, _evaluated(inner, values, products), strict=True))
+        else:
+            operands = [node.dep(i) for i in range(node.n_dep())]
+            symbols = [ca.MX.sym("a", one.sparsity()) for one in operands]
+            operation = ca.Function("one", symbols, [ca.graph_substitute(node, operands, symbols)])
+            work[places[0]], = operation.call([ca.SX(work[one]) for one in given])
+    return results
 
 
 def _is_large(matrix: Any) -> bool:

@@ -1,5 +1,6 @@
 """Products with large constant matrices: one operation, with the numbers of NumPy."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -144,3 +145,33 @@ def test_a_dense_map_of_a_hundred_states_is_traced():
     np.testing.assert_allclose(system.f_jacobian(x), expected, rtol=0, atol=1e-15)
     text = model_files(system.symbolic)["model.c"]
     assert text.count(";") < 40 * n
+
+
+GRAPHS = {
+    "matrix on the left": lambda x, u: 0.9 * ca.mtimes(A, x) + ca.sin(x) * x[0] + u[0],
+    "matrix on the right": lambda x, u: ca.mtimes(ca.tanh(x).T, A).T + u[1] * x,
+    "one after another": lambda x, u: ca.mtimes(A, ca.tanh(ca.mtimes(A, x) + u[0])) - x,
+    "a choice": lambda x, u: ca.if_else(x[0] > 0.0, ca.mtimes(A, x), 2.0 * x) + ca.fmax(x, u[0]),
+    "parts": lambda x, u: ca.vertcat(*ca.vertsplit(ca.mtimes(A, x))) + ca.sum1(x) * u[0],
+    "a square": lambda x, u: ca.mtimes(A, ca.reshape(ca.mtimes(A, x), 4, 6).T.reshape((-1, 1))),
+}
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("name", GRAPHS)
+def test_products_of_casadi_are_one_operation(name, nested):
+    x, u = ca.MX.sym("x", N), ca.MX.sym("u", 2)
+    graph = ca.Function("f", [x, u], [GRAPHS[name](x, u)])
+    f = ca.Function("outer", [x, u], [graph(x, u) + 0.5 * x]) if nested else GRAPHS[name]
+    value = f(x, u)
+    exact = ca.Function("exact", [x, u], [value, ca.jacobian(value, x)])
+    system = qpmhe.from_casadi(f, lambda x: x[:2], n=N, m=2, compiled=False)
+    assert has_products(system.symbolic.f)
+    for size in (1e-6, 1.0, 1e6):
+        at, given = size * DRAW.standard_normal(N), size * DRAW.standard_normal(2)
+        for found, expected in zip(
+            (system.f(at, given), system.f_jacobian(at, given)), exact(at, given), strict=True
+        ):
+            expected = np.array(expected).reshape(found.shape)
+            scale = np.abs(expected).max()
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * scale)
