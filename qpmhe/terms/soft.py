@@ -119,7 +119,7 @@ class Penalties:
 
     @property
     def c_form(self) -> TermForm:
-        """The penalties of all rows of a stage: of W, V and X, infinite for hard ones."""
+        """The penalties of all rows of a stage: of W, V, X and g, infinite for hard ones."""
         penalties = []
         for name in ("disturbances", "noises", "states"):
             one, soft = self._system.set_of(name), self._system.soft.get(name)
@@ -128,6 +128,10 @@ class Penalties:
             elif one is not None:
                 count = one.dimension + len(one.matrix)
                 penalties.append((np.full(count, np.inf), np.zeros(count)))
+        functions = self.functions
+        if functions is not None:
+            hard = np.where(functions.soft, 0.0, np.inf)
+            penalties.append((functions.linear + hard, functions.quadratic))
         linear, quadratic = (np.concatenate(one) for one in zip(*penalties, strict=True))
         return TermForm(SOFT, {"linear": linear, "quadratic": quadratic})
 

@@ -56,8 +56,9 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
             for (int j = 0; j < NX; j++) panel[j * WIDTH + j] += bounds[j];
             for (int r = 0; r < MHE_X_ROWS; r++)
                 if (bounds[NX + r] != 0) mhe_add_square(panel, bounds[NX + r], s->states.rows + r * NX);
-            if (i == e->length) break;
         }
+        mhe_add_slope_weights(e, k, i, weights + G_AT);
+        if (MHE_END_ROWS && i == e->length) break;
         if (MHE_W_SET) {
             const real *A = k->at[i]->f_jacobian;
             real *next = panel + NX * WIDTH;

@@ -24,6 +24,8 @@ static int mhe_is_violated(const mhe_rows *q, int i)
     return 0;
 }
 
+static real mhe_whole_force(const mhe_rows *q, int i) { return q->force[i]; }
+
 static void mhe_begin_soft(mhe_estimator *e, mhe_workspace *k, int nearest, int again)
 {
     (void)e; (void)k; (void)nearest; (void)again;
