@@ -34,7 +34,7 @@ static int mhe_counts(mhe_estimator *e, int i, int r)
 }
 
 /* x, w and v of state i, one below the other. */
-static void mhe_join(const mhe_estimator *e, int i, const mhe_trial *trial, real *joint)
+static void mhe_joint(const mhe_estimator *e, int i, const mhe_trial *trial, real *joint)
 {
     const int is_last = i == e->length;
     for (int j = 0; j < NX; j++) {
@@ -49,13 +49,19 @@ static void mhe_set_values(mhe_estimator *e, mhe_trial *trial)
 {
     for (int i = 0; i <= e->length; i++) {
         real joint[MHE_JOINT], *values = trial->values + i * MHE_G_ROWS;
-        mhe_join(e, i, trial, joint);
+        mhe_joint(e, i, trial, joint);
         mhe_call_g(joint, mhe_stage_of_state(e, i)->u, values);
         for (int r = 0; r < MHE_G_ROWS; r++) {
             if (!isfinite(values[r])) values[r] = INFINITY;
             if (!mhe_counts(e, i, r)) values[r] = 0;
         }
     }
+}
+
+/* Whether all values of a trial are finite. */
+static int mhe_has_values(const mhe_estimator *e, const mhe_trial *trial)
+{
+    return mhe_each_finite((e->length + 1) * MHE_G_ROWS, trial->values);
 }
 
 static void mhe_value_distances(mhe_estimator *e, int i, const mhe_trial *trial, real *low, real *high)
@@ -95,7 +101,7 @@ static void mhe_linearize_constraints(mhe_estimator *e, mhe_workspace *k, const 
         real *own = k->own_slopes + i * MHE_G_ROWS * NX, joint[MHE_JOINT];
         real *next = is_last ? own : k->next_slopes + i * MHE_G_ROWS * NX;
         real values[MHE_G_ROWS], slopes[SIZE(MHE_G_NONZEROS)];
-        mhe_join(e, i, around, joint);
+        mhe_joint(e, i, around, joint);
         mhe_call_g_jacobian(joint, mhe_stage_of_state(e, i)->u, values, slopes);
         for (int j = 0; j < MHE_G_ROWS * NX; j++) own[j] = next[j] = 0;
         for (int q = 0; q < MHE_G_NONZEROS; q++) {
@@ -269,7 +275,7 @@ static void mhe_bend_group(mhe_estimator *e, mhe_workspace *k, int i, const mhe_
         used[count] = c;
         place[c] = count++;
     }
-    mhe_join(e, i, around, joint);
+    mhe_joint(e, i, around, joint);
     for (int j = 0; j < count * count; j++) M[j] = 0;
     for (int a = 0; a < count; a++)
         for (int sign = 1; sign >= -1; sign -= 2) {

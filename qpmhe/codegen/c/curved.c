@@ -76,7 +76,7 @@ static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         if (failed) break;
         mhe_try(e, k, o, 1);
         if (!isfinite(o->spare->violation)) break;
-        if (isfinite(o->spare->cost) && mhe_is_within(o)) break;
+        if (isfinite(o->spare->cost) && !mhe_is_bent(o)) break;
     }
 }
 

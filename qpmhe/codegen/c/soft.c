@@ -67,14 +67,13 @@ static void mhe_soft_add(const mhe_estimator *e, mhe_workspace *k, real factor, 
     (void)e; (void)k; (void)factor; (void)matrix; (void)width;
 }
 
-/* Whether the spare trial is missed by curvature of soft rows: its penalty is larger. */
+/* Whether the spare trial is missed by curvature of soft rows: its penalty is larger, by more than
+ * rounding in a row at its limit. */
 static int mhe_is_bent(const mhe_outcome *o)
 {
-    return o->best->penalty < o->spare->penalty && isfinite(o->spare->penalty);
+    const real rounding = MHE_ROUNDING * fabs(o->spare->cost);
+    return o->best->penalty + rounding < o->spare->penalty && isfinite(o->spare->penalty);
 }
-
-/* Whether the spare trial costs no more penalty than the best one. */
-static int mhe_is_within(const mhe_outcome *o) { return o->spare->penalty <= o->best->penalty; }
 
 static int mhe_is_violated(const mhe_rows *q, int i)
 {

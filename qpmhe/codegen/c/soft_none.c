@@ -12,12 +12,6 @@ static int mhe_is_bent(const mhe_outcome *o)
     return 0;
 }
 
-static int mhe_is_within(const mhe_outcome *o)
-{
-    (void)o;
-    return 1;
-}
-
 static int mhe_is_violated(const mhe_rows *q, int i)
 {
     (void)q; (void)i;
