@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
+from ..errors import OptionError
 from ..estimation.conditions import usual_conditions
 from ..estimation.engine import PythonEngine
 from ..estimation.engines import ModelChangedError
@@ -41,6 +42,11 @@ class CompiledMembers:
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array,
         threads: int | None,
     ) -> None:
+        if system.constraints is not None:
+            raise OptionError(
+                "a compiled batch does not have nonlinear constraints, whose units depend on where "
+                "a member starts; take engine='python'."
+            )
         self._library = library = checked_library(system, observer, cost, settings)
         self._traces = WatchedFunctions(system, observer, cost, settings.time_budget is None)
         self._settings = settings

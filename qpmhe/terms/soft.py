@@ -478,12 +478,7 @@ class Softened:
             held = forces + stiff * gap
             active, violated = held > 0.0, held > most
             if before is not None and all(map(np.array_equal, before, (active, violated))):
-                pushes = np.zeros((2, base.stages * (self._size + base.rows + base.bounded * self._n)))
-                pushes[0, which[:uppers]], pushes[1, which[uppers:]] = forces[:uppers], forces[uppers:]
-                upper, lower = pushes.reshape(2, base.stages, -1)
-                soft, hard = slice(self._size), slice(self._size, self._size + base.rows)
-                duals = upper[:, hard] - lower[:, hard], -lower[:, soft], upper[:, soft]
-                return np.reshape(step, d.shape), np.hstack(duals).ravel()
+                return np.reshape(step, d.shape), self._duals(base, forces, which, uppers)
             before, new = (active, violated), active & ~known
             if new.any():
                 moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
@@ -510,6 +505,17 @@ class Softened:
                 return None
             gap[solved | (np.abs(gap) <= rounding)] = 0.0
         return None
+
+    def _duals(
+        self, base: QP, forces: Array, which: NDArray[np.intp], uppers: int
+    ) -> Array:
+        """Multipliers of the lifted QP's rows, from the forces of the inequalities of `_sides`."""
+        size, rows = self._size, base.rows
+        found = np.zeros((2, base.stages * (size + rows + (self._n if base.bounded else 0))))
+        found[0, which[:uppers]], found[1, which[uppers:]] = forces[:uppers], forces[uppers:]
+        upper, lower = found.reshape(2, base.stages, -1)
+        hard = (upper - lower)[:, size : size + rows]
+        return np.hstack((hard, -lower[:, :size], upper[:, :size])).ravel()
 
     def _sides(
         self, base: QP, bound_duals: Array, row_duals: Array

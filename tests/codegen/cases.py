@@ -823,7 +823,7 @@ FEATURES = {
         ]), gaps, MANY),
         "constraints and soft sets": (lambda: _inputs(
             constraints=[Constraint(_of_states, 2), Constraint(_of_all, 3, linear=20.0)],
-            states=NARROW.soften(linear=3.0), noises=Box([-0.3, -0.3], [0.3, 0.3]),
+            states=NARROW.soften(linear=1.0), noises=Box([-0.4, -0.4], [0.4, 0.4]),
         ), conditions, WARM),
         "constraints, unscented": (
             lambda: _inputs(constraints=[Constraint(_of_states, 2)]), filtered(UKF), gaps, MANY,

@@ -79,6 +79,7 @@ static void mhe_set_stiffness(mhe_estimator *e, mhe_workspace *k)
         }
     }
     mhe_soften(e, k);
+    (void)s;
 }
 
 /* Rows of X or g that are missed by a share of the prior's deviation may be missed by much where the prior

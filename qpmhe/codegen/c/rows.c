@@ -33,6 +33,7 @@ static void mhe_rows_times(const mhe_estimator *e, mhe_workspace *k, const real 
     for (int i = 0; i < mhe_row_stages(e); i++) {
         real *value = k->rows.value + i * ROWS;
         const real *own = d + i * NX;
+        (void)own;
         if (MHE_X_SET) {
             mhe_values_of(NX, MHE_X_ROWS, own, s->states.rows, value + W_COUNT + V_COUNT);
         }
@@ -71,6 +72,7 @@ static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *
     for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *load = k->rows.load + i * ROWS;
         real *own = out + i * NX;
+        (void)own;
         if (MHE_X_SET) {
             real x[NX];
             mhe_loads_of(NX, MHE_X_ROWS, s->states.rows, load + W_COUNT + V_COUNT, x);

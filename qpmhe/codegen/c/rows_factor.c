@@ -51,6 +51,7 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
     for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *weights = k->rows.weight + i * ROWS;
         real *panel = k->panels + i * NX * WIDTH;
+        (void)panel;
         if (MHE_X_SET) {
             const real *bounds = weights + W_COUNT + V_COUNT;
             for (int j = 0; j < NX; j++) panel[j * WIDTH + j] += bounds[j];

@@ -146,6 +146,7 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const real *
         const uint8_t *out = left_out ? left_out + i * ROWS : 0;
         uint8_t *in = missed ? missed + i * ROWS : 0;
         const mhe_stage *stage = mhe_stage_of_state(e, i);
+        (void)stage;
         mhe_stage_distances(e, i, trial->x, w, trial, low, high);
         worst = mhe_max(worst, mhe_values_missed(s, high + G_AT, out ? out + G_AT : 0,
                                                  in ? in + G_AT : 0));
