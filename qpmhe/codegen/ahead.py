@@ -7,11 +7,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from ..costs import Cost
 from ..errors import InvalidInputError, QpmheError
 from ..estimation.engines import python_only
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.start import with_scaled_constraints
 from ..model.system import System
+from ..observers import Observer
 from .compiler import NotCachedError, required_compiler
 
 

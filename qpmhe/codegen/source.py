@@ -462,8 +462,8 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
     rows = f"rows_{factor}", "rows", "active_set", "interior_point", soft, "constrained", "curved"
     constrained = layout.has_rows
     return (
-        *(["sets"] if constrained else []), _or_none("constraints", layout.constraints), "trial", "damping", factor, *blocks,
-        "outcome", _or_none("budget", layout.clock), "trials",
+        *(["sets"] if constrained else []), _or_none("constraints", layout.constraints),
+        "trial", "damping", factor, *blocks, "outcome", _or_none("budget", layout.clock), "trials",
         *((*rows, _or_none("restoring", layout.restores), "outside") if constrained
           else ["sets_none"]),
         "optimizer", _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet),

@@ -79,6 +79,9 @@ class Constraint:
     >>> preferred = qpmhe.Constraint(lambda x, u: x[0] - u[0], linear=10.0)
     """
 
+    #: Why g is no expression of its arguments; blank where it may be one.
+    no_expression: str = ""
+
     def __init__(
         self, g: Callable[..., Any], size: int = 1, *, linear: ArrayLike | None = None,
         quadratic: ArrayLike | None = None,
@@ -148,6 +151,7 @@ class _Bound:
             raise ModelError(
                 f"{name} takes u, but the system has no inputs; leave u out, or pass m."
             )
+        self._no_expression = constraint.no_expression
         self.on_state = self._names == ("x",)
         self.parts: dict[str, slice] = {}
         self._d = 0
@@ -220,6 +224,8 @@ class _Bound:
 
     def _traced(self, where: Points) -> Traced:
         """The expression of g, if it has one that gives the same."""
+        if self._no_expression:
+            return Traced(None, self._no_expression)
         found = traced(of_both(self._user[0]), (self._d, self._inputs), where, name="g")
         if found.function is not None and found.function.numel_out(0) != self.size:
             return Traced(None, f"it returns shape {found.shape} of symbols")

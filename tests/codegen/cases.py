@@ -814,7 +814,9 @@ FEATURES = {
     "constraints": {
         "constraints": (lambda: _inputs(constraints=[Constraint(_of_all, 3)]), gaps),
         "constraints, conditions": (lambda: _inputs(
-            constraints=[Constraint(_of_states, 2), Constraint(lambda w: w[0] + 5.0 * w[1] ** 2 - 0.04)],
+            constraints=[
+                Constraint(_of_states, 2), Constraint(lambda w: w[0] + 5.0 * w[1] ** 2 - 0.04)
+            ],
             noises=Box([-0.4, -0.4], [0.4, 0.4]),
         ), conditions, AGAIN, WARM),
         "soft constraints": (lambda: _inputs(constraints=[
