@@ -73,9 +73,7 @@ def _plain(title: str) -> Table:
 def _row(estimator: MovingHorizonEstimator) -> tuple[str, ...]:
     """Size, form, engine and reason of a model."""
     system = estimator.system
-    engine, reason = codegen.engine_choice(
-        system, estimator.observer, estimator.cost, estimator.settings
-    )
+    engine, reason = codegen.engine_choice(estimator)
     form = "as written"
     if system.symbolic is not None:
         form = "CasADi" if system.tracing is None else "traced"

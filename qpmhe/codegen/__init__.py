@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from .._checks import flag
 from ..errors import InvalidInputError, OptionError
-from .ahead import Compiled, compile, engine_choice
+from .ahead import Compiled, compile, engine_choice, system_of
 from .needs import Needs
 
 if TYPE_CHECKING:
@@ -68,8 +68,8 @@ def write(
     Parameters
     ----------
     estimator : MovingHorizonEstimator
-        What to write: a traced system or one of `qpmhe.from_casadi`, without soft sets and
-        nonlinear constraints; an observer of the package's own classes; a `QuadraticCost` or a
+        What to write: a traced system or one of `qpmhe.from_casadi`, whose nonlinear constraints
+        are traced, too; an observer of the package's own classes; a `QuadraticCost` or a
         `RobustCost`, whose losses may be your own if their methods have no branch on a value. Its
         measurements so far are not written.
     directory : str or path
@@ -132,7 +132,7 @@ def write(
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
     files, needs = generated(
-        estimator.system, estimator.observer, estimator.cost, estimator.settings, name, real,
+        system_of(estimator), estimator.observer, estimator.cost, estimator.settings, name, real,
         estimator.usual,
     )
     files = dict(zip(files, stripped(*files.values()), strict=True))

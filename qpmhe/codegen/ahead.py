@@ -11,7 +11,7 @@ from ..costs import Cost
 from ..errors import InvalidInputError, QpmheError
 from ..estimation.engines import python_only
 from ..estimation.estimator import MovingHorizonEstimator
-from ..estimation.settings import Settings
+from ..estimation.start import with_scaled_constraints
 from ..model.system import System
 from ..observers import Observer
 from .compiler import NotCachedError, required_compiler
@@ -91,7 +91,7 @@ def compile(
         )
     from .rehearsal import checked_library  # late: most programs do without
 
-    parts = estimator.system, estimator.observer, estimator.cost
+    parts = system_of(estimator), estimator.observer, estimator.cost
     only_cached, wanted = (
         replace(estimator.settings, engine=engine) for engine in ("auto", "compiled")
     )
@@ -104,13 +104,19 @@ def compile(
     return Compiled(library.path, perf_counter() - began, is_new)
 
 
-def engine_choice(
-    system: System, observer: Observer, cost: Cost, settings: Settings
-) -> tuple[str, str]:
+def system_of(estimator: MovingHorizonEstimator) -> System:
+    """The system of an estimator, its constraints in the units that they have there."""
+    system, observer, cost = estimator.system, estimator.observer, estimator.cost
+    return with_scaled_constraints(system, observer, cost, estimator.initial_state)
+
+
+def engine_choice(estimator: MovingHorizonEstimator) -> tuple[str, str]:
     """The engine that an estimator with these arguments runs now, and why."""
     from .library import uncovered
     from .rehearsal import checked_library
 
+    settings, observer, cost = estimator.settings, estimator.observer, estimator.cost
+    system = system_of(estimator)
     if settings.engine == "python":
         return "python", "it asks for engine='python'."
     if settings.needs_python:

@@ -62,6 +62,7 @@ _SET_TYPE = Template("""typedef struct {
 _PARTS = {
     "covariances": "the observer's covariances", "elimination": "directions that have disturbances",
     "quiet": "directions that have none", "restart": "the test by which an observer is restarted",
+    "constraints": "the nonlinear constraints, by their rows; deviations are of (x, w, v)",
 }
 
 
@@ -114,6 +115,9 @@ class Layout:
     free: int | None = None
     #: Whether the set of states is soft.
     soft_states: bool = False
+    #: Rows of nonlinear constraints at each stage, and whether some also hold at the newest state.
+    constraints: int = 0
+    constrains_end: bool = False
     #: States that are held where the window does not see them.
     held: int = 0
     #: The terms of J that not every estimator has, by their names in C.
@@ -142,7 +146,8 @@ class Layout:
             numbers = () if rows is None else tuple(rows.numbers.tolist())
             sets = ((rows is not None, len(numbers)), *sets[1:])
         own = observer_form(system, observer, cost)
-        rule = own.innovation
+        rule, functions = own.innovation, system.constraints
+        constrained = functions is not None or any(there for there, _ in sets)
         terms = directions.terms_of(system, cost)
         return cls(
             system.n, system.p, system.m, horizon, sets, real, observer=own.name,
@@ -156,10 +161,12 @@ class Layout:
             sensors=len(observer.sensors), rejects=observer.rejects,
             observer_prior=cost.observer_prior is not None,
             lapack=lapack and system.n >= _LAPACK_STATES and directions.free is None, clock=clock,
-            restores=restores and any(there for there, _ in sets), restarts=restarts,
+            restores=restores and constrained, restarts=restarts,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
             free=directions.free, soft_states="states" in system.soft, held=len(system.held),
+            constraints=0 if functions is None else functions.size,
+            constrains_end=functions is not None and bool(functions.on_state.any()),
             terms=tuple(term.name for term in terms),
             numbers_of=tuple(
                 (name, tuple(
@@ -207,6 +214,7 @@ class Layout:
             values[f"{letter}_set"] = int(there)
             values[f"{letter}_rows"] = rows
         values["x_hard"] = int(self.projects)
+        values["g_rows"], values["end_rows"] = self.constraints, int(self.ends_with_rows)
         return values
 
     def _part_types(self, prefix: str) -> tuple[str, str]:
@@ -313,18 +321,25 @@ class Layout:
 
     @property
     def has_rows(self) -> bool:
-        """Whether there is a set."""
-        return any(there for there, _ in self.sets)
+        """Whether there is a set or a nonlinear constraint."""
+        return self.constraints > 0 or any(there for there, _ in self.sets)
+
+    @property
+    def ends_with_rows(self) -> bool:
+        """Whether some rows hold at the newest state."""
+        return self.sets[2][0] or self.constrains_end
 
     @property
     def rows(self) -> tuple[int, int]:
         """Stages of a window with rows, and rows of each, at least one."""
-        return self.horizon + self.sets[2][0], max(sum(self.set_rows), 1)
+        count = sum(self.set_rows) + self.constraints
+        return self.horizon + self.ends_with_rows, max(count, 1)
 
     def dropped_rows(self, sides: NDArray[np.uint8], first: int) -> tuple[DroppedRow, ...]:
         """The rows in ``dropped`` of an estimate whose window starts at this time."""
         found, start = [], 0
-        for name, count in zip(SET_NAMES, self.set_rows, strict=True):
+        counts = *self.set_rows, self.constraints
+        for name, count in zip((*SET_NAMES, "constraints"), counts, strict=True):
             part = sides[:, start : start + count]
             numbers: Sequence[int] = range(count)
             if name == "disturbances" and self.numbers is not None:
@@ -396,6 +411,8 @@ def _numbers(
     if directions.quiet:
         found["quiet"] = directions.projections(system, cost)
     found |= {term.name: term.data for term in terms}
+    if system.constraints is not None:
+        found["constraints"] = system.constraints.numbers()
     if form.data:
         found["observer"] = form.data
     if form.innovation is not None:

@@ -49,13 +49,18 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
                 f"{name}, a function, has no C form ({residual.expression.reason}); take "
                 "qpmhe.angles, or engine='python'."
             )
-    if system.constraints:
-        return "engine='compiled' does not have nonlinear constraints; take engine='python'."
-    if system.soft and Directions(system, observer, cost).free is not None:
-        return (
-            "engine='compiled' does not have soft sets where disturbances have fewer directions "
-            "than the state; take engine='python'."
-        )
+    functions = system.constraints
+    if functions is not None and functions.untraced:
+        return f"{functions.untraced}; change that, or take engine='python'."
+    if functions is not None or system.soft:
+        directions, kind = Directions(system, observer, cost), "soft sets"
+        if functions is not None:
+            kind = "nonlinear constraints"
+        if directions.free is not None:
+            return (
+                f"engine='compiled' does not have {kind} where disturbances have fewer directions "
+                "than the state; take engine='python'."
+            )
     form = observer.c_form
     if form is None:
         return (
@@ -186,6 +191,8 @@ def symbolic_model(system: System, observer: Observer, cost: Cost) -> CasadiMode
         )
     if own is not None and own.correction is not None:
         functions["correction"] = own.correction(system.n, system.p).function
+    if system.constraints is not None:
+        functions["constraints"] = system.constraints.expression()
     return replace(model, **functions) if functions else model
 
 

@@ -18,6 +18,7 @@ from ..estimation.conditions import usual_conditions
 from ..estimation.engine import PythonEngine
 from ..estimation.engines import ModelChangedError
 from ..estimation.settings import Settings
+from ..estimation.start import with_scaled_constraints
 from ..model.captured import Due
 from ..model.system import System
 from ..observers import Observer
@@ -41,7 +42,16 @@ class CompiledMembers:
         self, system: System, observer: Observer, cost: Cost, settings: Settings, states: Array,
         threads: int | None,
     ) -> None:
+        # The units of nonlinear constraints depend on where a member starts.
+        each = [system]
+        if system.constraints is not None:
+            each = [with_scaled_constraints(system, observer, cost, state) for state in states]
+        system = each[0]
         self._library = library = checked_library(system, observer, cost, settings)
+        usual = usual_conditions(settings)
+        self._records = [library.settings, *(
+            library.settings_for(one, library.directions.cost, usual) for one in each[1:]
+        )]
         self._traces = WatchedFunctions(system, observer, cost, settings.time_budget is None)
         self._settings = settings
         self._m, self._horizon = system.m, settings.horizon
@@ -57,7 +67,12 @@ class CompiledMembers:
     def reset(self, states: Array) -> None:
         """Forget all samples and start at these states."""
         self._memory = self._library.estimators(states)
+        self._memory["settings"] = self._addresses
         self._traces.times.restart()
+
+    @property
+    def _addresses(self) -> list[int]:
+        return [record.ctypes.data for record in self._records]
 
     @property
     def time(self) -> int:
@@ -73,7 +88,7 @@ class CompiledMembers:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where an engine with the same arguments stopped."""
         self._memory = state["memory"].copy().view(self._memory.dtype)
-        self._memory["settings"] = self._library.settings.ctypes.data
+        self._memory["settings"] = self._addresses
 
     def hand_over(self, engines: Sequence[PythonEngine]) -> None:
         """Let new Python engines, one for each member, continue where these members stand."""

@@ -98,6 +98,8 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         named = _named(ca, function, name, *sizes)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}", name, named))
+    if model.constraints is not None:
+        calls += _constraint_calls(ca, generator, model)
     for which, function in zip(TERMS, model.losses, strict=True):
         if function is None:
             continue
@@ -129,6 +131,25 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif\n",
         *calls, *_model_parts(model),
     ))
+
+
+def _constraint_calls(ca: Any, generator: Any, model: CasadiModel) -> list[str]:
+    """C functions of (x, w, v), one below the other, and u to the nonlinear constraints."""
+    function = model.constraints
+    s, u = ca.SX.sym("s", function.numel_in(0)), ca.SX.sym("u", function.numel_in(1))
+    value = function(s, u)
+    slopes = ca.jacobian(value, s)
+    nonzeros = ca.sparsity_cast(slopes, ca.Sparsity.dense(slopes.nnz(), 1))
+    calls = []
+    for which, results in (("g", [value]), ("g_jacobian", [value, nonzeros])):
+        named = ca.Function(f"mhe_casadi_{which}", [s, u], results)
+        generator.add(named)
+        calls.append(_call(f"mhe_call_{which}", named.name(), named))
+    tables = zip(("row", "column"), slopes.sparsity().get_triplet(), strict=True)
+    return [*calls, f"#define MHE_G_NONZEROS {slopes.nnz()}\n", *(
+        f"static const int mhe_g_{name}[] = {{{', '.join(map(str, table)) or '0'}}};\n"
+        for name, table in tables
+    )]
 
 
 def _own_losses(model: CasadiModel) -> str:
@@ -441,8 +462,8 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
     rows = f"rows_{factor}", "rows", "active_set", "interior_point", soft, "constrained", "curved"
     constrained = layout.has_rows
     return (
-        *(["sets"] if constrained else []), "trial", "damping", factor, *blocks,
-        "outcome", _or_none("budget", layout.clock), "trials",
+        *(["sets"] if constrained else []), _or_none("constraints", layout.constraints),
+        "trial", "damping", factor, *blocks, "outcome", _or_none("budget", layout.clock), "trials",
         *((*rows, _or_none("restoring", layout.restores), "outside") if constrained
           else ["sets_none"]),
         "optimizer", _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet),

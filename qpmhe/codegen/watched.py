@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 class WatchedFunctions:
-    """f and h, and with them residual functions, losses and a correction, where they are traced.
+    """f, h, g, and with them residual functions, losses and a correction, where they are traced.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class WatchedFunctions:
         if own is not None and own.correction is not None:
             self._others["the correction"] = own.correction(system.n, system.p)
         others = [one.user_function for one in self._others.values()]
-        functions = [*system.evaluation.traced_functions, *(one for one in others if one)]
+        functions = [*system.traced_functions, *(one for one in others if one)]
         if fault := self.fault(Due.EVERYWHERE, ()):
             raise CompilationError(fault)
         self.times = ComparisonTimes(functions, calls)
@@ -63,12 +63,12 @@ class WatchedFunctions:
     def fault(self, due: Due, where: Iterable[tuple[Array, Array]]) -> str:
         """Which function differs from its trace, and how; blank if none does.
 
-        f and h are compared at these states and inputs, the others at points of the first
+        f, h and g are compared at these states and inputs, the others at points of the first
         comparison: at one, a different one each time, or at all if ``due`` is everywhere.
         """
         everywhere = due is Due.EVERYWHERE
         points = [*where, *(self.system.usual_points() if everywhere else ())]
-        fault = self.system.evaluation.fault(points)
+        fault = self.system.fault(points)
         for name, one in self._others.items():
             text = one.fault(None if everywhere else self._count)
             if text and not fault:

@@ -14,7 +14,6 @@ from qpmhe_solvers import Solver, create
 from qpmhe_solvers.solver import ContainedSolver
 
 from .._checks import check_problem
-from .._linalg import inverse
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..memory.record import Mark, MemoryRecord
@@ -33,6 +32,7 @@ from .estimate import Estimate, Status
 from .optimizer import Optimizer
 from .problem import Formulation, Solved
 from .settings import Settings
+from .start import with_scaled_constraints
 from .subproblem import Subproblem
 from .watch import NEAR, ObserverWatch
 from .window import Window
@@ -94,8 +94,9 @@ class PythonEngine:
         )
         if settings.qp_limit:
             solver.prepare((settings.horizon + 1) * system.n)
-        if system.constraints is not None:
-            self._system = system = self._with_scaled_constraints(initial_state)
+        if system.constraints is not None and not system.constraints.is_scaled:
+            system = with_scaled_constraints(system, observer, self._given_cost, initial_state)
+            self._system = system
         self._reader = ConditionReader(system, self._given_cost)
         self._tools = self._tools_for(usual_conditions(settings))
         penalties = self._tools.formulation.sum.penalties
@@ -115,19 +116,6 @@ class PythonEngine:
         """Take a system, with a model of this engine's own, which notes what is taken nearby."""
         self._system = system = system.evaluated_by(system.evaluation.copy())
         self._nearby = _nearby(system)
-
-    def _with_scaled_constraints(self, initial_state: Array) -> System:
-        """The system, its constraints in standard deviations of what they are functions of."""
-        assert self._system.constraints is not None
-        cost, functions = self._cost, self._system.constraints.copy()
-        deviations = self._given_cost.prior_deviations(
-            self._observer.initial_covariance(), self._system.disturbance_matrix
-        )
-        functions.use_scales(
-            initial_state, deviations, inverse(cost.disturbance), inverse(cost.noise),
-            self._to_disturbances,
-        )
-        return self._system.with_constraints(functions)
 
     def _tools_for(self, usual: Conditions) -> Tools:
         """What a step uses under these usual conditions."""

@@ -30,7 +30,7 @@ from .estimator_memory import EstimatorMemory
 from .reach import compared
 from .run import Run, RunSource
 from .settings import Settings
-from .start import check_cost, nominal_parameters, require
+from .start import check_cost, nominal_parameters, require, with_scaled_constraints
 from .step_length import check_step
 from .time_index import paired_record
 
@@ -230,6 +230,9 @@ class MovingHorizonEstimator(EstimatorMemory):
                 self._own_system, cost, observer.initial_covariance(), self._initial_state,
                 self._usual_input, horizon,
             )
+        self._own_system = with_scaled_constraints(
+            self._own_system, observer, cost, self._initial_state
+        )
         try:
             self._engine = engine_for(
                 self._own_system, observer, cost, self.settings, self._initial_state

@@ -463,7 +463,7 @@ class Optimizer:
         step = step.copy()  # a correction's solve overwrites it
         curved = 0.0 < full.violation < math.inf and bool(qp.rows)
         # A full step along a soft row that is curved: the penalty grows where J would not.
-        bent = not curved and best.penalty < full.penalty < math.inf
+        bent = not curved and _is_bent(best, full)
         if curved:
             if full.violation <= NEARLY:
                 yield self._trial(problem, best, LENGTHS[0] * step)
@@ -479,7 +479,7 @@ class Optimizer:
             return
         for length in LENGTHS:
             yield (trial := self._trial(problem, best, length * step))
-        if not (curved or best.penalty < trial.penalty < math.inf):
+        if not (curved or _is_bent(best, trial)):
             return
         # Along the boundary of the curved set: the decrease of J is proportional to the length of a
         # short step, the distance from the set to its square. So the way back costs less than a
@@ -506,7 +506,7 @@ class Optimizer:
                 break
             trial = self._trial(problem, best, solution.d)
             if not math.isfinite(trial.violation) or (
-                trial.cost < math.inf and trial.penalty <= best.penalty
+                trial.cost < math.inf and not _is_bent(best, trial)
             ):
                 break
         return trial
@@ -540,6 +540,11 @@ class Optimizer:
     def _trial(problem: Problem, best: Trial, step: Array) -> Trial:
         trajectory = best.trajectory + step
         return problem.evaluate(problem.clipped(trajectory) if problem.constrained else trajectory)
+
+
+def _is_bent(best: Trial, trial: Trial) -> bool:
+    """Whether a trial has more penalty, by more than rounding in a row at its limit."""
+    return best.penalty + ROUNDING * abs(trial.cost) < trial.penalty < math.inf
 
 
 def _share_left(decrease: float, predicted: float) -> float:

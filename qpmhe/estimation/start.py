@@ -11,7 +11,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import numbers
 from .._linalg import inverse
-from ..costs import Cost
+from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ModelError, ObserverWarning, ShapeError
 from ..model.system import System
 from ..observers import Observer
@@ -81,6 +81,20 @@ def check_start(
             raise
         raise ModelError(f"{name}: {error}") from error
     return state, system
+
+
+def with_scaled_constraints(system: System, observer: Observer, cost: Cost, state: Array) -> System:
+    """The system, its constraints in standard deviations of what they are functions of."""
+    if system.constraints is None:
+        return system
+    functions, matrix = system.constraints.copy(), system.disturbance_matrix
+    covariance = observer.initial_covariance()
+    of_d = lifted(cost, matrix, covariance)
+    functions.use_scales(
+        state, cost.prior_deviations(covariance, matrix), inverse(of_d.disturbance),
+        inverse(of_d.noise), None if of_d.space is None else of_d.space.to_disturbances,
+    )
+    return system.with_constraints(functions)
 
 
 def inside(

@@ -245,10 +245,11 @@ class Subproblem:
         if eliminated is not None and soft is not None:
             base, soft = eliminated.qp, soft.stacked
         assert soft is not None
-        forces, found = soft.forces(base, solution), soft.lowered(base, solution)
+        found = soft.lowered(base, solution)
+        forces = soft.forces(base, found)
         if eliminated is not None:
-            solution, found = eliminated.restored(solution), eliminated.restored(found)
-        self._note(qp, solution, forces)
+            found = eliminated.restored(found)
+        self._note(qp, found, forces)
         return found
 
     def start(self) -> None:

@@ -130,7 +130,7 @@ _C_DIMENSIONS = {
     "n": "MHE_NX", "p": "MHE_NY", "inputs": "(MHE_NU + 1)", "states": "(MHE_HORIZON + 1)",
     "sensors": "MHE_SENSORS", "held": "MHE_HELD", "2": "2",
     "metric": "MHE_SIZE(MHE_X_SET * MHE_NX * MHE_NX)",
-    "row_stages": "(MHE_HORIZON + MHE_X_SET)", "stage_rows": "MHE_SIZE(MHE_STAGE_ROWS)",
+    "row_stages": "(MHE_HORIZON + MHE_END_ROWS)", "stage_rows": "MHE_SIZE(MHE_STAGE_ROWS)",
 }
 
 

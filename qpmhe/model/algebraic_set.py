@@ -60,13 +60,15 @@ class AlgebraicSet:
         function: Callable[..., Array] = self._of_state
         if self._m:
             function = self._of_both
-        return Constraint(function, len(self.limit), **self.penalties)
+        made = Constraint(function, len(self.limit), **self.penalties)
+        made.no_expression = "it solves the algebraic equations: write it as a function of x and u"
+        return made
 
     def _of_state(self, x: Array) -> Array:
         return self._of_both(x, np.empty(0))
 
     def _of_both(self, x: Array, u: Array) -> Array:
-        states = np.asarray(x, np.float64)[None]  # raises for symbols: a solution is no expression
+        states = np.asarray(x, np.float64)[None]
         inputs = np.asarray(u, np.float64)[None]
         z = self._solver().complete(states, inputs)[0, states.shape[1] :]
         found: Array = self.matrix @ z - self.limit

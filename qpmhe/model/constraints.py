@@ -18,6 +18,7 @@ from qpmhe_solvers.values import integer, shown
 
 from ..errors import ModelError, SetError, ShapeError
 from .derivatives import Jacobian
+from .expressions import import_casadi
 from .functions import BatchedFunction, raised
 from .points import ALL, FEW, USUAL, Points, points
 from .sets import Box, ConvexSet, penalties
@@ -77,6 +78,9 @@ class Constraint:
     >>> inside_circle = qpmhe.Constraint(lambda x: x[0] ** 2 + x[1] ** 2 - 4.0)
     >>> preferred = qpmhe.Constraint(lambda x, u: x[0] - u[0], linear=10.0)
     """
+
+    #: Why g is no expression of its arguments; blank where it may be one.
+    no_expression: str = ""
 
     def __init__(
         self, g: Callable[..., Any], size: int = 1, *, linear: ArrayLike | None = None,
@@ -147,6 +151,7 @@ class _Bound:
             raise ModelError(
                 f"{name} takes u, but the system has no inputs; leave u out, or pass m."
             )
+        self._no_expression = constraint.no_expression
         self.on_state = self._names == ("x",)
         self.parts: dict[str, slice] = {}
         self._d = 0
@@ -171,8 +176,10 @@ class _Bound:
             raise ModelError(f"{error} A constraint's size is the number of its rows.") from error
         self.jacobian = Jacobian(self.function, None, m, probes, self._box)
         self._user = self.function, self.jacobian
-        #: The expression of g that is evaluated in its place; None where it is called as written.
+        #: The expression of g that is evaluated in its place; None where it is called as written,
+        #: and why.
         self.trace: Traced | None = None
+        self.untraced = ""
 
     def _without_input(self, s: Array) -> Any:
         return self._written(**self._split(s))
@@ -208,17 +215,21 @@ class _Bound:
         jacobian.use_scales(deviations, None, ())
         self._user = self.function, self.jacobian = function, jacobian
         where = points(USUAL, self._d, self._inputs, self._box, deviations)
-        self.trace = self._traced([*where, *points(ALL, self._d, self._inputs, self._box)])
+        found = self._traced([*where, *points(ALL, self._d, self._inputs, self._box)])
+        self.trace, self.untraced = (found, "") if found.function else (None, found.reason)
         if self.trace is not None:
             self.function, self.jacobian = evaluated_alone(
                 function, jacobian, self.trace, self._d, self._inputs
             )
 
-    def _traced(self, where: Points) -> Traced | None:
+    def _traced(self, where: Points) -> Traced:
         """The expression of g, if it has one that gives the same."""
+        if self._no_expression:
+            return Traced(None, self._no_expression)
         found = traced(of_both(self._user[0]), (self._d, self._inputs), where, name="g")
-        has_values = found.function is not None and found.function.numel_out(0) == self.size
-        return found if has_values else None
+        if found.function is not None and found.function.numel_out(0) != self.size:
+            return Traced(None, f"it returns shape {found.shape} of symbols")
+        return found
 
     @property
     def written(self) -> Callable[[Array, Array], Any]:
@@ -233,6 +244,7 @@ class _Bound:
         """The same, with g called as it is written."""
         other = copy(self)
         (other.function, other.jacobian), other.trace = self._user, None
+        other.untraced = "it has changed since it was traced"
         return other
 
     def scale(self, start: Array, deviations: Array, typical: Array, u: Array) -> Array:
@@ -312,7 +324,7 @@ class _Bound:
         if "v" not in self.parts:
             return np.zeros((self.size, p), np.bool_)
         found = self._traced(points(USUAL, self._d, self._inputs, self._box))
-        if found is None:
+        if found.function is None:
             return np.ones((self.size, p), np.bool_)
         touched: Mask = depends(found)[:, self.parts["v"]]
         return touched
@@ -331,6 +343,8 @@ class ConstraintFunctions:
         Their penalties; 0 for hard rows.
     on_state : (T,) bool array
         Which rows are functions of x alone, and hold at the newest state as well.
+    parts : set of str
+        Which of x, w and v they are functions of.
     """
 
     def __init__(
@@ -352,8 +366,10 @@ class ConstraintFunctions:
         self.quadratic: Array = np.concatenate([one[1] for one in chosen])
         self.soft: Mask = np.repeat([one.penalty is not None for one in constraints], counts)
         self.on_state: Mask = np.repeat([one.on_state for one in self._bound], counts)
+        self.parts = {name for one in self._bound for name in one.parts}
         #: The unit (T,) in which a miss of a row is measured; see `use_scales`.
         self.scale: Array = np.ones(self.size)
+        self.is_scaled = False
 
     def copy(self) -> ConstraintFunctions:
         """The same, whose functions may come to be called in other ways."""
@@ -387,6 +403,35 @@ class ConstraintFunctions:
             if text:
                 return f"{one.function.name} has changed since it was traced: {text}"
         return ""
+
+    @property
+    def untraced(self) -> str:
+        """Which one has no expression, and why; blank where all have one."""
+        return next(
+            (f"{one.function.name} has no C form ({one.untraced})" for one in self._bound
+             if one.trace is None), ""
+        )
+
+    def expression(self) -> Any:
+        """All of them as a casadi.Function of (x, w, v), one below the other, and u."""
+        ca = import_casadi()
+        n, r, p = self._n, self._r, self._p
+        s, u, values = ca.SX.sym("s", n + r + p), ca.SX.sym("u", self._m), []
+        parts = {"x": s[:n], "w": s[n : n + r], "v": s[n + r :]}
+        for one in self._bound:
+            assert one.trace is not None
+            values.append(one.trace.function(ca.vertcat(*(parts[k] for k in one.parts)), u))
+        return ca.Function("constraints", [s, u], [ca.densify(ca.vertcat(*values))])
+
+    def numbers(self) -> dict[str, NDArray[Any]]:
+        """What else the step in C knows of them."""
+        counts = [one.size for one in self._bound]
+        return {
+            "scale": self.scale, "deviations": self._deviations,
+            "group": np.repeat(np.arange(len(counts)), counts),
+            "on_state": self.on_state.astype(np.intp),
+            "touched": self._touched.astype(np.intp).ravel(),
+        }
 
     @cached_property
     def _touched(self) -> Mask:
@@ -440,6 +485,7 @@ class ConstraintFunctions:
         usual = np.maximum(np.abs(start), _WANDERED * np.sqrt(d.diagonal()))
         usual = np.where(usual > 0.0, np.minimum(x, usual), x)
         found, u = [], np.zeros(self._m)
+        self._deviations, self.is_scaled = np.concatenate((x, w, v)), True
         for one in self._bound:
             deviations = one.joined({"x": x, "w": w, "v": v})
             one.use_scales(deviations)

@@ -33,7 +33,8 @@ class CasadiModel:
     functions, and f also has the algebraic equations' residuals, below the rate.
     ``output_residual`` and ``state_residual`` are the user's functions of (a, b) for differences,
     where there are any; ``losses`` those of one number q to rho(q) and rho'(q), for prior, w and v;
-    ``correction`` an observer's function of (z, v).
+    ``correction`` an observer's function of (z, v); ``constraints`` one of ((x, w, v), u) to the
+    values of all nonlinear constraints.
     """
 
     f: Any
@@ -48,6 +49,7 @@ class CasadiModel:
     state_residual: Any = None
     losses: tuple[Any, Any, Any] = (None, None, None)
     correction: Any = None
+    constraints: Any = None
 
     def __post_init__(self) -> None:
         # A map that is taken for a rate, with a step of 0, would be the identity.

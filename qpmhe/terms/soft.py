@@ -119,7 +119,7 @@ class Penalties:
 
     @property
     def c_form(self) -> TermForm:
-        """The penalties of all rows of a stage: of W, V and X, infinite for hard ones."""
+        """The penalties of all rows of a stage: of W, V, X and g, infinite for hard ones."""
         penalties = []
         for name in ("disturbances", "noises", "states"):
             one, soft = self._system.set_of(name), self._system.soft.get(name)
@@ -128,6 +128,10 @@ class Penalties:
             elif one is not None:
                 count = one.dimension + len(one.matrix)
                 penalties.append((np.full(count, np.inf), np.zeros(count)))
+        functions = self.functions
+        if functions is not None:
+            hard = np.where(functions.soft, 0.0, np.inf)
+            penalties.append((functions.linear + hard, functions.quadratic))
         linear, quadratic = (np.concatenate(one) for one in zip(*penalties, strict=True))
         return TermForm(SOFT, {"linear": linear, "quadratic": quadratic})
 
@@ -428,17 +432,24 @@ class Softened:
         return forces
 
     def lowered(self, base: QP, solution: Solution) -> Solution:
-        """A solution of the lifted QP without its slack variables; exact where that succeeds."""
-        status = solution.status
+        """A solution of the lifted QP without its slack variables; exact where that succeeds.
+
+        It has the multipliers of all of that QP's rows.
+        """
+        status, duals = solution.status, solution.row_duals
         d = None if solution.d is None else solution.d[:, : self._n].copy()
         if d is not None and status in (SolveStatus.SOLVED, SolveStatus.INACCURATE):
             exact = self._exact(base, d, solution)
             if exact is not None:
-                d, status = exact, SolveStatus.SOLVED
-        return Solution(d, status, solution.iterations, message=solution.message)
+                (d, duals), status = exact, SolveStatus.SOLVED
+        return Solution(
+            d, status, solution.iterations, row_duals=duals, message=solution.message
+        )
 
-    def _exact(self, base: QP, d: Array, solution: Solution) -> Array | None:
-        """The minimiser on the rows that a solution says are active; None if they are not.
+    def _exact(self, base: QP, d: Array, solution: Solution) -> tuple[Array, Array] | None:
+        """The minimiser on the rows that a solution says are active, and the multipliers of rows.
+
+        None if they are not.
 
         What a solver misses a soft row by costs its linear penalty times as much, which may be
         more than J itself. So its solution only says which rows are active, or violated; a few
@@ -446,7 +457,7 @@ class Softened:
         """
         if solution.bound_duals is None or solution.row_duals is None:
             return None
-        rows, sides, most, curvature, forces = self._sides(
+        rows, sides, most, curvature, forces, which, uppers = self._sides(
             base, solution.bound_duals.reshape(base.stages, -1),
             solution.row_duals.reshape(base.stages, -1),
         )
@@ -467,7 +478,7 @@ class Softened:
             held = forces + stiff * gap
             active, violated = held > 0.0, held > most
             if before is not None and all(map(np.array_equal, before, (active, violated))):
-                return np.reshape(step, d.shape)
+                return np.reshape(step, d.shape), self._duals(base, forces, which, uppers)
             before, new = (active, violated), active & ~known
             if new.any():
                 moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
@@ -495,13 +506,25 @@ class Softened:
             gap[solved | (np.abs(gap) <= rounding)] = 0.0
         return None
 
+    def _duals(
+        self, base: QP, forces: Array, which: NDArray[np.intp], uppers: int
+    ) -> Array:
+        """Multipliers of the lifted QP's rows, from the forces of the inequalities of `_sides`."""
+        size, rows = self._size, base.rows
+        found = np.zeros((2, base.stages * (size + rows + (self._n if base.bounded else 0))))
+        found[0, which[:uppers]], found[1, which[uppers:]] = forces[:uppers], forces[uppers:]
+        upper, lower = found.reshape(2, base.stages, -1)
+        hard = (upper - lower)[:, size : size + rows]
+        return np.hstack((hard, -lower[:, :size], upper[:, :size])).ravel()
+
     def _sides(
         self, base: QP, bound_duals: Array, row_duals: Array
-    ) -> tuple[Array, Array, Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, Array, Array, NDArray[np.intp], int]:
         """All inequalities as ``rows d <= sides``, where some side is finite.
 
         With, for each, the largest force of an active row that is not violated, the curvature of
-        the penalty beyond, and the force that a solver found.
+        the penalty beyond, the force that a solver found, and its place among all, soft and hard
+        ones of each stage; and how many are upper sides, which come first.
         """
         n, hard, window, size = self._n, base.rows, self._window, self._size
         count = hard + (n if base.bounded else 0)  # of hard inequalities at each stage
@@ -526,6 +549,7 @@ class Softened:
             np.vstack((matrix[uppers], -matrix[lowers])),
             np.append(upper.ravel()[uppers], -lower.ravel()[lowers]), most[which],
             curvature[which], np.maximum(np.append(above[uppers], -below[lowers]), 0.0),
+            which, len(uppers),
         )
 
 

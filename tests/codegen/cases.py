@@ -12,7 +12,16 @@ import casadi as ca
 import numpy as np
 
 import qpmhe
-from qpmhe import Box, Gate, HuberInnovation, Luenberger, ObserverPrior, Polytope, QuadraticCost
+from qpmhe import (
+    Box,
+    Constraint,
+    Gate,
+    HuberInnovation,
+    Luenberger,
+    ObserverPrior,
+    Polytope,
+    QuadraticCost,
+)
 from qpmhe.models.batch_reactor import batch_reactor
 from qpmhe.models.batch_reactor import casadi_output as reactor_output
 from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
@@ -594,6 +603,24 @@ def singular(one):
     return replace(one, cost=cost).with_options(solver_tolerance=1e-10, max_qps=3)
 
 
+def _of_all(x, u, w, v):
+    """Curved rows, of which the second one is never active."""
+    return np.array([
+        x[0] * v[1] + w[0] * x[2] + 0.1 * u[0] * w[1] - 0.02, x[0] ** 2 + v[0] ** 2 - 30.0,
+        v[0] ** 2 + 0.5 * x[1] - 0.3,
+    ])
+
+
+def _of_states(x):
+    """Rows that also hold at the newest state."""
+    return np.array([x[0] ** 2 + 2.0 * x[1] ** 2 - 0.5, 0.2 - x[0] - x[2] ** 2])
+
+
+def _undefined(x):
+    """Has no value at small states."""
+    return np.log(x[1] + 0.5) + 0.1
+
+
 def _held(hold=0.2, bounds=None, **options):
     """Two unknown parameters, which are seen only while the input acts."""
     system = qpmhe.from_casadi(
@@ -783,6 +810,35 @@ FEATURES = {
         "soft, unscented": (
             lambda: _reaction_in(POSITIVE.soften(linear=0.5)), filtered(UKF), gaps,
         ),
+    },
+    "constraints": {
+        "constraints": (lambda: _inputs(constraints=[Constraint(_of_all, 3)]), gaps),
+        "constraints, conditions": (lambda: _inputs(
+            constraints=[
+                Constraint(_of_states, 2), Constraint(lambda w: w[0] + 5.0 * w[1] ** 2 - 0.04)
+            ],
+            noises=Box([-0.4, -0.4], [0.4, 0.4]),
+        ), conditions, AGAIN, WARM),
+        "soft constraints": (lambda: _inputs(constraints=[
+            Constraint(_of_states, 2, linear=[2.0, 0.5], quadratic=[1.0, 30.0]),
+            Constraint(_of_all, 3, linear=20.0),
+        ]), gaps, MANY),
+        "constraints and soft sets": (lambda: _inputs(
+            constraints=[Constraint(_of_states, 2), Constraint(_of_all, 3, linear=20.0)],
+            states=NARROW.soften(linear=1.0), noises=Box([-0.4, -0.4], [0.4, 0.4]),
+        ), conditions, WARM),
+        "constraints, unscented": (
+            lambda: _inputs(constraints=[Constraint(_of_states, 2)]), filtered(UKF), gaps, MANY,
+        ),
+        "constraints of angles": (lambda: _ship(constraints=[
+            Constraint(lambda x, v: np.sin(x[0]) * x[1] + 0.001 * v[0] - 0.3, linear=5.0),
+        ]), gaps, MANY, {"solver_tolerance": 1e-12}),
+        "constraints that fail": (lambda: _inputs(constraints=[
+            Constraint(lambda x: 0.3 - np.sqrt(x[0] - 0.2), linear=2.0), Constraint(_undefined),
+        ]),),
+        "constraints, restored": (lambda: _inputs(
+            constraints=[Constraint(lambda w: 0.2 - w[0] + w[1] ** 2)]
+        ), gaps, RESTORE),
     },
     "equations": {
         "noise-free reinitialized": (lambda: _inputs(

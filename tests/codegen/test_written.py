@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.codegen import compiler, write
+from qpmhe.codegen import compiler, system_of, write
 from qpmhe.codegen.library import planned
 
 from .cases import CASES, FEATURES, case
@@ -58,7 +58,7 @@ def estimates(one, samples, folder, flags, real="double"):
     command = [CC, "-std=c99", *flags, "-o", "main", "main.c", "mhe.c", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
     mhe = one.estimator("python")
-    layout, _ = planned(mhe.system, mhe.observer, mhe.cost, mhe.settings, real)
+    layout, _ = planned(system_of(mhe), mhe.observer, mhe.cost, mhe.settings, real)
     rows = [one.start, *(sample[key] for sample in samples for key in ("y", "u") if key in sample)]
     with np.errstate(over="ignore"):
         data = np.concatenate(rows).astype(layout.number)
@@ -102,7 +102,7 @@ SINGLE_TOO = "inputs", "states in a polytope", "algebraic", "layered"
 
 @pytest.mark.parametrize("name", [
     "inputs", "euler", "extended", "unscented", "mixed losses", "states in a polytope",
-    "fewer disturbances in sets", "held with gaps", "soft states", "restored",
+    "fewer disturbances in sets", "held with gaps", "soft states", "constraints", "restored",
     "restarted extended", "algebraic", "radau", "layered",
 ])
 def test_the_written_code_is_the_python_step(name, tmp_path):

@@ -73,6 +73,10 @@ def ball(x):
     return x[0] ** 2 + x[1] ** 2 - 2.0
 
 
+def branching(x):
+    return x[0] - 1.0 if x[1] > 0.0 else x[0]
+
+
 def within(w, v):
     return np.array([(w[0] - 0.02) ** 2 + w[1] ** 2 - 0.004, v[0] + 0.5 * v[1] - 0.2])
 
@@ -202,8 +206,11 @@ WRONG = [
     (lambda: make({"states": SOFT["states"], "disturbances": Box([0.0, -1.0], [0.0, 1.0])},
                   engine="compiled"),
      OptionError, "soft sets where disturbances have fewer directions"),
-    (lambda: make({"constraints": [Constraint(ball)]}, engine="compiled"), OptionError,
-     "nonlinear constraints"),
+    (lambda: make({"constraints": [Constraint(branching)]}, engine="compiled"), OptionError,
+     "constraints[0] has no C form ("),
+    (lambda: make({"constraints": [Constraint(ball)], "disturbances": Box([0.0, -1.0], [0.0, 1.0])},
+                  engine="compiled"),
+     OptionError, "nonlinear constraints where disturbances have fewer directions"),
     (lambda: make({"state_residual": qpmhe.angles([0]), "states": SOFT["states"]}), SetError,
      "bounds an angle"),
 ]

@@ -5,6 +5,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.codegen.compiler import find_compiler
 from qpmhe.studies import PaperStudy
 from tests.properties.problems import Problem
 
@@ -95,6 +96,16 @@ def test_every_backend_reaches_it(backend, features):
         one = Problem([seed, 8], dict.fromkeys(features, 1.0))
         _, above = compared(one, 2, backend=backend, solver_tolerance=1e-9)
         assert above == []
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("more", [("inputs",), ("noises", "soft", "missing")], ids="+".join)
+def test_the_compiled_step_reaches_it_within_nonlinear_constraints(more, seed):
+    one = Problem([seed, 9], dict.fromkeys(("constraint", *more), 1.0))
+    total, above = compared(one, 3, engine="compiled", solver_tolerance=1e-9)
+    assert above == []
+    assert total >= 1
 
 
 def test_trajectory_and_disturbances_are_those_of_python_control():

@@ -44,7 +44,7 @@ int32_t solve(mhe_estimator *e, mhe_workspace *k, const mhe_settings *s, int32_t
         mhe_set_terms(s, 0, e->stages + i, w + i * NX, v + i * NY, t);
         k->at[i] = t;
     }
-    mhe_set_limits(e, k, trial->x, trial->w, trial->v);
+    mhe_set_limits(e, k, trial->x, trial);
     const int status = mhe_solve_qp(e, k, &o, trial, nearest, 0);
     memcpy(step, k->step, sizeof(real) * (size_t)(count + 1) * NX);
     return status + 4 * o.iterations;

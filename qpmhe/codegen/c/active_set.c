@@ -72,15 +72,17 @@ static void mhe_set_stiffness(mhe_estimator *e, mhe_workspace *k)
             mhe_stage_curvature(e, k, i + 1, D);
             mhe_add_pliancy(NX, MHE_W_ROWS, 0, rows, place, D, weight);
         }
+        mhe_slope_stiffness(e, k, i, place + G_AT, weight + G_AT);
         for (int r = 0; r < ROWS; r++) { /* some outputs depend on no state */
             const real least = EPSILON * deviation[r];
             if (place[r] != BETWEEN) weight[r] = STIFFER / mhe_max(weight[r], least * least);
         }
     }
     mhe_soften(e, k);
+    (void)s;
 }
 
-/* Rows of X that are missed by a share of the prior's deviation may be missed by much where the prior
+/* Rows of X or g that are missed by a share of the prior's deviation may be missed by much where the prior
  * is vague. Their scales become what the Hessian opposes to them, above rounding in their values.
  * Only where some row is active or missed: else no scale is asked for. */
 static void mhe_sharpen(mhe_estimator *e, mhe_workspace *k, real tolerance)
@@ -101,6 +103,8 @@ static void mhe_sharpen(mhe_estimator *e, mhe_workspace *k, real tolerance)
             if (least < scale[r]) scale[r] = least;
         }
     }
+    for (int i = 0; i < mhe_row_stages(e); i++)
+        mhe_sharpen_values(e, k, i, 64 * EPSILON / tolerance);
 }
 
 static int mhe_is_missed(const mhe_rows *q, int rows)

@@ -28,6 +28,7 @@ static int mhe_solve_rows(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, co
         }
         if (status == NEARLY) status = STOPPED;
     }
+    if (!nearest) mhe_keep_pushes(e, k, status == SOLVED, o->factorised);
     if (status != SOLVED) memset(k->rows.place, 0, sizeof k->rows.place);
     o->iterations += guesses + iterations;
     return status == EXCLUDED ? STOPPED : status;

@@ -11,6 +11,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
     for (int j = 0; j < (count + 1) * NX; j++) d[j] = o->spare->x[j] - o->best->x[j];
     for (int i = 0; i <= count; i++) mhe_wrap_state(e->settings, o->spare->x + i * NX, d + i * NX);
     mhe_rows_times(e, k, d);
+    mhe_bend_values(e, k, o->best, o->spare);
     mhe_rows *rows = &k->rows;
     for (int i = 0; i < mhe_row_stages(e) * ROWS; i++)
         rows->load[i] = 2 * mhe_max(mhe_max(rows->low[i] - rows->value[i],
@@ -38,7 +39,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
         for (int j = 0; j < NX; j++) w[own + j] += o->best->w[own + j];
         for (int j = 0; j < NY; j++) v[out + j] += o->best->v[out + j];
     }
-    mhe_set_limits(e, k, o->best->x, w, v);
+    mhe_set_limits(e, k, o->best->x, &k->bent);
     memset(rows->value, 0, sizeof rows->value); /* X has no curvature */
     for (int i = 0; i < count; i++) {
         real *value = rows->value + i * ROWS;
@@ -54,6 +55,7 @@ static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
         }
         (void)value;
     }
+    for (int i = 0; i < mhe_row_stages(e); i++) mhe_missed_values(k, i, o->best);
     mhe_bend_soft(e, k);
     for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
         rows->load[i] += MHE_BEYOND * fabs(rows->value[i]);
@@ -74,7 +76,7 @@ static void mhe_correct(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         if (failed) break;
         mhe_try(e, k, o, 1);
         if (!isfinite(o->spare->violation)) break;
-        if (isfinite(o->spare->cost) && mhe_is_within(o)) break;
+        if (isfinite(o->spare->cost) && !mhe_is_bent(o)) break;
     }
 }
 

@@ -45,6 +45,8 @@ typedef $real mhe_real;
 #define MHE_W_ROWS $w_rows  /* general inequalities in each */
 #define MHE_V_ROWS $v_rows
 #define MHE_X_ROWS $x_rows
+#define MHE_G_ROWS $g_rows  /* rows of nonlinear constraints at each stage */
+#define MHE_END_ROWS $end_rows /* whether the state behind the last sample has rows */
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
 #define MHE_OWN_LOSSES $own_losses /* users' functions: 1 of the prior, 2 of w, 4 of v */
 #define MHE_LAPACK $lapack /* 1: needs mhe_set_lapack */
@@ -66,7 +68,7 @@ $limits
 #define MHE_SIZE(n) ((n) > 0 ? (n) : 1) /* C has no arrays of length 0 */
 #define MHE_STAGE_ROWS \
     (MHE_W_SET * (MHE_NX + MHE_W_ROWS) + MHE_V_SET * (MHE_NY + MHE_V_ROWS) + \
-     MHE_X_SET * (MHE_NX + MHE_X_ROWS))
+     MHE_X_SET * (MHE_NX + MHE_X_ROWS) + MHE_G_ROWS)
 /* Length of a panel's rows, for whole registers. */
 #define MHE_PANEL_WIDTH (MHE_NX < 24 ? (2 * MHE_NX + 3) / 4 * 4 : (2 * MHE_NX + 31) / 32 * 32)
 
@@ -75,8 +77,9 @@ enum {
 $status
 };
 
-/* Rows of a window: those of stage i on w(i), v(i) and x(i); a last stage has x only. */
-#define MHE_ROWS ((MHE_HORIZON + MHE_X_SET) * MHE_SIZE(MHE_STAGE_ROWS))
+/* Rows of a window: those of stage i on w(i), v(i) and x(i), then nonlinear constraints; a last stage
+ * has rows on x only. */
+#define MHE_ROWS ((MHE_HORIZON + MHE_END_ROWS) * MHE_SIZE(MHE_STAGE_ROWS))
 
 /* Sides of an inequality, as bits. */
 enum { MHE_LOWER = 1, MHE_UPPER = 2 };
@@ -174,7 +177,7 @@ typedef struct {
     int64_t time;                  /* of the newest sample */
     int32_t length, status, qps, iterations, corrections, nearest_points;
     /* Sides that were dropped and are violated, by stage: components of W, its rows, those of V
-     * and of X. */
+     * and of X, and nonlinear constraints. */
     uint8_t dropped[MHE_ROWS];
 $in_estimate} mhe_estimate;
 

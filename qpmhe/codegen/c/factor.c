@@ -206,6 +206,7 @@ static void mhe_build(mhe_estimator *e, mhe_workspace *k, const real *offset, in
 {
     mhe_assemble(e, k, offset);
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);
+    else mhe_add_bends(e, k);
 }
 
 /* Factorise the QP and solve it without inequalities; the increments are in k->step. */

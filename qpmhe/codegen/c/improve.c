@@ -16,6 +16,7 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
     /* No cost is NaN, but 0 times infinity is where a discount underflows. */
     if (isnan(trial->cost)) trial->cost = INFINITY;
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
+    mhe_set_values(e, trial);
     trial->cost += mhe_further_cost(e, k, trial);
     trial->cost += mhe_move_prior(e, k);
     trial->violation = mhe_violation(e, trial, mhe_candidate_disturbances(e, k), 0, 0);
@@ -39,6 +40,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     o->damping = e->damping;
     mhe_set_widening(k, s, 0);
     mhe_recall_places(e, k);
+    mhe_forget_pushes(k);
     o->candidate = o->best = k->trials;
     o->spare = k->trials + 1;
     o->other = k->trials + 2;

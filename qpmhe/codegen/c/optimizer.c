@@ -36,6 +36,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         o->events |= MHE_MODEL_FAILED;
         return 0;
     }
+    mhe_set_bends(e, k, o->best);
     if (is_damped && !o->has_seen) {
         mhe_set_seen(e, k);
         o->has_seen = 1;

@@ -1,13 +1,13 @@
 /* Rows of a QP: their limits, and products with them. */
 
-/* Limits of all rows about a trajectory x with residuals w and v. */
-static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
-                           const real *v)
+/* Limits of all rows about a trajectory x with the residuals and values of a trial. */
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const mhe_trial *trial)
 {
     real low[ROWS], high[ROWS];
     for (int i = 0; i < mhe_row_stages(e); i++) {
         mhe_stage_scales(e, i, k->rows.scale + i * ROWS, k->rows.deviation + i * ROWS);
-        mhe_stage_distances(e, i, x, w, v, low, high);
+        mhe_stage_distances(e, i, x, trial->w, trial, low, high);
+        mhe_leave_out(k, i, high + G_AT);
         for (int r = 0; r < ROWS; r++) {
             const int at = i * ROWS + r, out = k->left_out[at];
             k->rows.low[at] = out & MHE_LOWER ? -INFINITY : low[r];
@@ -17,7 +17,7 @@ static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, co
             k->rows.high[at] = INFINITY;
         }
     }
-    mhe_set_limits_about(k, w);
+    mhe_set_limits_about(k, trial->w);
 }
 
 static void mhe_values_of(int n, int count, const real *q, const real *rows, real *out)
@@ -33,12 +33,14 @@ static void mhe_rows_times(const mhe_estimator *e, mhe_workspace *k, const real 
     for (int i = 0; i < mhe_row_stages(e); i++) {
         real *value = k->rows.value + i * ROWS;
         const real *own = d + i * NX;
+        (void)own;
         if (MHE_X_SET) {
             mhe_values_of(NX, MHE_X_ROWS, own, s->states.rows, value + W_COUNT + V_COUNT);
-            if (i == e->length) {
-                for (int r = 0; r < W_COUNT + V_COUNT; r++) value[r] = 0;
-                break;
-            }
+        }
+        mhe_slopes_times(e, k, i, d, value + G_AT);
+        if (MHE_END_ROWS && i == e->length) {
+            for (int r = 0; r < W_COUNT + V_COUNT; r++) value[r] = 0;
+            break;
         }
         if (MHE_W_SET) {
             real q[NX];
@@ -70,12 +72,14 @@ static void mhe_add_loads(const mhe_estimator *e, const mhe_workspace *k, real *
     for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *load = k->rows.load + i * ROWS;
         real *own = out + i * NX;
+        (void)own;
         if (MHE_X_SET) {
             real x[NX];
             mhe_loads_of(NX, MHE_X_ROWS, s->states.rows, load + W_COUNT + V_COUNT, x);
             for (int j = 0; j < NX; j++) own[j] += x[j];
-            if (i == e->length) break;
         }
+        mhe_add_slope_loads(e, k, i, load + G_AT, out);
+        if (MHE_END_ROWS && i == e->length) break;
         if (MHE_W_SET) {
             real w[NX];
             const real *A = k->at[i]->f_jacobian;

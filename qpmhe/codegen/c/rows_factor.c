@@ -51,13 +51,15 @@ static void mhe_add_weights(const mhe_estimator *e, mhe_workspace *k)
     for (int i = 0; i < mhe_row_stages(e); i++) {
         const real *weights = k->rows.weight + i * ROWS;
         real *panel = k->panels + i * NX * WIDTH;
+        (void)panel;
         if (MHE_X_SET) {
             const real *bounds = weights + W_COUNT + V_COUNT;
             for (int j = 0; j < NX; j++) panel[j * WIDTH + j] += bounds[j];
             for (int r = 0; r < MHE_X_ROWS; r++)
                 if (bounds[NX + r] != 0) mhe_add_square(panel, bounds[NX + r], s->states.rows + r * NX);
-            if (i == e->length) break;
         }
+        mhe_add_slope_weights(e, k, i, weights + G_AT);
+        if (MHE_END_ROWS && i == e->length) break;
         if (MHE_W_SET) {
             const real *A = k->at[i]->f_jacobian;
             real *next = panel + NX * WIDTH;

@@ -4,6 +4,7 @@
 #define W_COUNT (MHE_W_SET * (NX + MHE_W_ROWS))
 #define V_COUNT (MHE_V_SET * (NY + MHE_V_ROWS))
 #define X_COUNT (MHE_X_SET * (NX + MHE_X_ROWS))
+#define G_AT (W_COUNT + V_COUNT + X_COUNT)
 
 /* How far a point q is from each side of a set: low <= 0 <= high where it is inside. */
 static void mhe_distances(int n, int count, const real *q, const real *lower, const real *upper,
@@ -30,7 +31,7 @@ static void mhe_distances(int n, int count, const real *q, const real *lower, co
                   (set).row_upper, known, low, high)
 
 /* Stages that have rows: behind the last sample, there is a state. */
-static int mhe_row_stages(const mhe_estimator *e) { return e->length + MHE_X_SET; }
+static int mhe_row_stages(const mhe_estimator *e) { return e->length + MHE_END_ROWS; }
 
 /* Move the active set of the last QP on with the window, when its first stage leaves it. */
 static void mhe_shift_places(mhe_estimator *e)
@@ -71,31 +72,34 @@ static void mhe_stage_scales(mhe_estimator *e, int i, real *scale, real *deviati
     if (MHE_V_SET) COPY_SCALES(mhe_v_set_at(s, stage), NY, MHE_V_ROWS, scale, deviation);
     scale += V_COUNT, deviation += V_COUNT;
     if (MHE_X_SET) COPY_SCALES(mhe_x_set_at(s, stage), NX, MHE_X_ROWS, scale, deviation);
+    mhe_value_scales(s, scale + X_COUNT, deviation + X_COUNT);
     (void)s; (void)stage;
 }
 
-/* The distances of all rows of stage i, about a trajectory x with residuals w and v. */
+/* The distances of all rows of stage i, about a trajectory x with disturbances w, and noises and values
+ * of a trial. */
 static void mhe_stage_distances(mhe_estimator *e, int i, const real *x, const real *w,
-                                const real *v, real *low, real *high)
+                                const mhe_trial *trial, real *low, real *high)
 {
     const mhe_settings *s = e->settings;
     const mhe_stage *stage = mhe_stage_of_state(e, i);
     if (MHE_X_SET) {
         DISTANCES(*mhe_x_set_at(s, stage), NX, MHE_X_ROWS, x + i * NX, 0, low + W_COUNT + V_COUNT,
                   high + W_COUNT + V_COUNT);
-        if (i == e->length) {
-            for (int r = 0; r < W_COUNT + V_COUNT; r++) low[r] = -INFINITY, high[r] = INFINITY;
-            return;
-        }
+    }
+    mhe_value_distances(e, i, trial, low + G_AT, high + G_AT);
+    if (MHE_END_ROWS && i == e->length) {
+        for (int r = 0; r < W_COUNT + V_COUNT; r++) low[r] = -INFINITY, high[r] = INFINITY;
+        return;
     }
     if (MHE_W_SET) {
         DISTANCES(*mhe_w_set_at(s, stage), NX, MHE_W_ROWS, w + i * NX, 0, low, high);
     }
     if (MHE_V_SET) {
-        DISTANCES(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, v + i * NY,
+        DISTANCES(*mhe_v_set_at(s, stage), NY, MHE_V_ROWS, trial->v + i * NY,
                   stage->is_complete ? 0 : stage->is_observed, low + W_COUNT, high + W_COUNT);
     }
-    (void)x; (void)w; (void)v; (void)s; (void)stage;
+    (void)x; (void)w; (void)trial; (void)s; (void)stage;
 }
 
 /* The largest miss among rows of one set, in their scales. `sizes`: of the numbers whose
@@ -142,15 +146,18 @@ static real mhe_violation(mhe_estimator *e, const mhe_trial *trial, const real *
         const uint8_t *out = left_out ? left_out + i * ROWS : 0;
         uint8_t *in = missed ? missed + i * ROWS : 0;
         const mhe_stage *stage = mhe_stage_of_state(e, i);
-        mhe_stage_distances(e, i, trial->x, w, trial->v, low, high);
+        (void)stage;
+        mhe_stage_distances(e, i, trial->x, w, trial, low, high);
+        worst = mhe_max(worst, mhe_values_missed(s, high + G_AT, out ? out + G_AT : 0,
+                                                 in ? in + G_AT : 0));
         if (MHE_X_SET) {
             worst = mhe_max(worst, MISSED(*mhe_x_set_at(s, stage), s->states, W_COUNT + V_COUNT, NX, MHE_X_ROWS,
                                           low + W_COUNT + V_COUNT, high + W_COUNT + V_COUNT,
                                           trial->x + i * NX,
                                           out ? out + W_COUNT + V_COUNT : 0,
                                           in ? in + W_COUNT + V_COUNT : 0));
-            if (i == e->length) break;
         }
+        if (MHE_END_ROWS && i == e->length) break;
         if (MHE_W_SET) {
             worst = mhe_max(worst, MISSED(*mhe_w_set_at(s, stage), s->disturbances, 0, NX, MHE_W_ROWS,
                                           low, high, trial->x + (i + 1) * NX, out, in));

@@ -57,10 +57,9 @@ static int mhe_solve_rows(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, co
     return mhe_solve_free(e, k, offset, nearest) ? SOLVED : FAILED;
 }
 
-static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const real *w,
-                           const real *v)
+static void mhe_set_limits(mhe_estimator *e, mhe_workspace *k, const real *x, const mhe_trial *trial)
 {
-    (void)e; (void)k; (void)x; (void)w; (void)v;
+    (void)e; (void)k; (void)x; (void)trial;
 }
 
 static void mhe_clip_trial(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial)

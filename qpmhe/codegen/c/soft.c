@@ -48,7 +48,7 @@ static real mhe_soft_cost(mhe_estimator *e, const mhe_workspace *k, mhe_trial *t
     real cost = 0, low[ROWS], high[ROWS];
     for (int i = 0; i < mhe_row_stages(e); i++) {
         real sum = 0;
-        mhe_stage_distances(e, i, trial->x, trial->w, trial->v, low, high);
+        mhe_stage_distances(e, i, trial->x, trial->w, trial, low, high);
         for (int r = 0; r < ROWS; r++) {
             const real missed = mhe_max(low[r], -high[r]);
             if (missed > 0 && mhe_is_soft(s, r))
@@ -67,14 +67,13 @@ static void mhe_soft_add(const mhe_estimator *e, mhe_workspace *k, real factor, 
     (void)e; (void)k; (void)factor; (void)matrix; (void)width;
 }
 
-/* Whether the spare trial is missed by curvature of soft rows: its penalty is larger. */
+/* Whether the spare trial is missed by curvature of soft rows: its penalty is larger, by more than
+ * rounding in a row at its limit. */
 static int mhe_is_bent(const mhe_outcome *o)
 {
-    return o->best->penalty < o->spare->penalty && isfinite(o->spare->penalty);
+    const real rounding = MHE_ROUNDING * fabs(o->spare->cost);
+    return o->best->penalty + rounding < o->spare->penalty && isfinite(o->spare->penalty);
 }
-
-/* Whether the spare trial costs no more penalty than the best one. */
-static int mhe_is_within(const mhe_outcome *o) { return o->spare->penalty <= o->best->penalty; }
 
 static int mhe_is_violated(const mhe_rows *q, int i)
 {
@@ -160,17 +159,20 @@ static real mhe_linear_penalty(const mhe_estimator *e, const mhe_rows *q)
     return penalty;
 }
 
+/* The force of a row, with that of its quadratic penalty where it is missed. */
+static real mhe_whole_force(const mhe_rows *q, int i)
+{
+    if (!mhe_is_violated(q, i)) return q->force[i];
+    return q->force[i] + q->bend[i] * (q->value[i] - mhe_limit_of(q, i));
+}
+
 /* The decrease of J that the QP promises. With H d + g + c' force = 0, twice its objective is
  * g'd - force'c(d). */
 static real mhe_promised(const mhe_estimator *e, const mhe_workspace *k, const mhe_outcome *o)
 {
     const mhe_rows *q = &k->rows;
     real objective = mhe_dot((e->length + 1) * NX, k->gradient, k->step);
-    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) {
-        const real beyond =
-            mhe_is_violated(q, i) ? q->bend[i] * (q->value[i] - mhe_limit_of(q, i)) : 0;
-        objective -= (q->force[i] + beyond) * q->value[i];
-    }
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) objective -= mhe_whole_force(q, i) * q->value[i];
     return mhe_max(o->best->penalty - objective - mhe_linear_penalty(e, q), 0);
 }
 

@@ -12,17 +12,13 @@ static int mhe_is_bent(const mhe_outcome *o)
     return 0;
 }
 
-static int mhe_is_within(const mhe_outcome *o)
-{
-    (void)o;
-    return 1;
-}
-
 static int mhe_is_violated(const mhe_rows *q, int i)
 {
     (void)q; (void)i;
     return 0;
 }
+
+static real mhe_whole_force(const mhe_rows *q, int i) { return q->force[i]; }
 
 static void mhe_begin_soft(mhe_estimator *e, mhe_workspace *k, int nearest, int again)
 {

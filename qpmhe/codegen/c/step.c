@@ -23,6 +23,7 @@ static void mhe_estimate_now(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
     mhe_improve(e, k, o, before);
     if (mhe_is_missing(newest)) o->events |= MHE_MISSING;
     o->events |= events;
+    if (!mhe_has_values(e, o->candidate)) o->events |= MHE_MODEL_FAILED;
     if (!isfinite(o->candidate->cost)) {
         o->events &= ~MHE_NO_DECREASE; /* the model failed, not the solver */
         if (!(o->events & MHE_MODEL_FAILED)) o->events |= MHE_FAILED_STAGE;

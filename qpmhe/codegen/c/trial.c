@@ -26,6 +26,7 @@ static void mhe_judge(mhe_estimator *e, const mhe_workspace *k, mhe_trial *trial
     for (int j = 0; j < NX; j++) offset[j] = trial->x[j] - prior[j];
     mhe_wrap_state(s, trial->x, offset);
     cost += factors[0] * mhe_prior_cost(s, k, offset);
+    mhe_set_values(e, trial);
     cost += mhe_further_cost(e, k, trial);
     trial->cost = cost;
     trial->violation = 0;

@@ -47,7 +47,8 @@ static int mhe_linearize(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
             return 0;
         mhe_set_terms(e->settings, k, stage, around->w + i * NX, around->v + i * NY, t);
     }
-    mhe_set_limits(e, k, around->x, around->w, around->v);
+    mhe_linearize_constraints(e, k, around);
+    mhe_set_limits(e, k, around->x, around);
     return 1;
 }
 
