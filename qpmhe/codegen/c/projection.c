@@ -124,7 +124,7 @@ static void mhe_take_shares(const mhe_nearest *n, int count, real *column, real 
 /* Factors of the active sides from one on; whether these are independent. */
 static int mhe_orthogonalise(mhe_nearest *n, int from)
 {
-    for (int i = from; i < n->count; i++) {
+    for (int i = from; i < n->count && i < NX; i++) { /* never more than NX: GCC for ARM warns else */
         real *b = n->basis + i * NX, shares[NX];
         memcpy(b, n->columns + i * NX, sizeof(real) * NX);
         mhe_take_shares(n, i, b, shares);
