@@ -5,7 +5,7 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates import CertificateError, Monitor, Sizes
-from qpmhe.certificates.guard import Guard
+from qpmhe.certificates.guard import Guard, Guarded
 from qpmhe.certificates.observer_bound import Tube, bound_observer
 from qpmhe_solvers import Backend, RawSolution
 
@@ -224,6 +224,23 @@ def test_usual_estimates_are_not_moved_and_nothing_feeds_back(bound):
     assert "at 0 of 16 samples, and is off from sample 15 on: a measurem" in watch.summary()
     plain = Monitor(bound, estimator(bound), initial_error=START)
     assert plain.unguarded == "the monitor has no guard"
+
+
+def test_a_guard_that_was_off_stays_off(bound, monkeypatch):
+    """Where no state is in the set, it is off though the observer's bound is not lost."""
+    mhe = estimator(bound)
+    watch = Monitor(bound, mhe, initial_error=1e-6, guard=True)
+    monkeypatch.setattr(Guard, "__call__", lambda _, x, *__: Guarded(x, False, "nothing is left"))
+    reading = watch.check(mhe.update([0.1]))
+    assert reading.lost is None
+    assert reading.unguarded == "from sample 0 on: nothing is left"
+    following = Monitor(bound, mhe, initial_error=1e-6, guard=True)
+    following.load_state_dict(watch.state_dict())
+    assert following.unguarded == watch.unguarded
+    plain = Monitor(bound, mhe, initial_error=1e-6)
+    following = Monitor(bound, mhe, initial_error=1e-6, guard=True)
+    following.load_state_dict(plain.state_dict())
+    assert following.unguarded == ""
 
 
 def test_where_nothing_is_proved_in_advance_there_is_no_guard(bound):
