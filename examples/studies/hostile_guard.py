@@ -20,7 +20,7 @@ import numpy as np
 from adversary import Array
 
 import qpmhe
-from qpmhe.certificates import Monitor, ObserverBound, Sizes, synthesise_gain
+from qpmhe.certificates import Evidence, Monitor, ObserverBound, Sizes, synthesise_gain
 from qpmhe.certificates.guard import Guard
 from qpmhe.certificates.observer_bound import bound_observer
 from qpmhe.certificates.report import region_of
@@ -275,6 +275,9 @@ def main() -> None:
           "| of these noticed |\n|---|---|---|---|---|---|---|---|---|---|")
     for name in given.models:
         CERTIFIED[name] = certified(name)
+        if CERTIFIED[name][2].evidence is not Evidence.PROVED:
+            print(f"| {name} | not proved in {SECONDS:g} s |", flush=True)
+            continue
         for words, options in (
             ("", {}), (", w and v ten times", {"larger": 10.0}),
             (", start five times", {"farther": 5.0}),

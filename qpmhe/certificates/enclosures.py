@@ -17,7 +17,7 @@ from ..model.system import System
 from .graph import Graph, Slopes
 from .intervals import Interval
 from .programs import Program
-from .reading import expression_of, read
+from .reading import SOLVES, expression_of, read
 from .regions import Region
 
 _REMEDY = "Take a smaller region, or make the model defined on all of it."
@@ -188,7 +188,8 @@ class SmoothModel:
         """Why a function has no enclosure, or the nodes of its values."""
         expression = expression_of(self._system, name)
         if expression.function is None:
-            return f"{name} is not traced: {expression.reason}. {_TRACEABLE}", []
+            helps = "" if expression.reason.endswith(SOLVES) else f". {_TRACEABLE}"
+            return f"{name} is not traced: {expression.reason}{helps}", []
         roots = read(self._graph, expression.function)
         self._programs[name] = Program(self._graph, roots)
         obstacle = self._programs[name].obstacle(self.points[0], self.points[0])

@@ -398,13 +398,14 @@ class Monitor:
         return {
             "time": self._time, "observer": self._z.copy(), "radius": self._tube.radius,
             "box": self._tube.box.copy(), "lost": self.lost, "reason": self.reason,
-            "metric": self.bound.metric.copy(),
+            "metric": self.bound.metric.copy(), "moved": self.moved, "unguarded": self.unguarded,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where another monitor of this observer stopped.
 
-        It may have another P. An `InvalidInputError` is raised if it is not such a state.
+        It may have another P, and no guard; a guard that was off stays off. An
+        `InvalidInputError` is raised if it is not such a state.
         """
         mine = self.state_dict()["metric"]
         try:
@@ -412,7 +413,8 @@ class Monitor:
             time, radius = int(state["time"]), float(state["radius"])
             box = np.array(state["box"], np.float64).reshape(self._z.shape)
             lost = None if state["lost"] is None else int(state["lost"])
-            reason = str(state["reason"])
+            reason, unguarded = str(state["reason"]), str(state["unguarded"])
+            moved = int(state["moved"])
             metric = np.array(state["metric"], np.float64).reshape(mine.shape)
             if not np.array_equal(metric, mine):  # another search found another P
                 radius *= largest_ratio(mine, metric)
@@ -421,7 +423,9 @@ class Monitor:
                 f"the state does not come from a monitor of this observer: {error}."
             ) from error
         self._time, self._z, self._tube = time, z, Tube(radius, box)
-        self.lost, self.reason = lost, reason
+        self.lost, self.reason, self.moved = lost, reason, moved
+        if self._guard is not None and unguarded != _NO_GUARD:
+            self.unguarded = unguarded
 
 
 def _barred(estimator: MovingHorizonEstimator) -> str:

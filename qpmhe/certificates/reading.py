@@ -10,11 +10,14 @@ from ..model.system import System
 from ..model.tracing import Traced
 from .graph import CONDITIONS, Graph
 
+#: How the reason ends for functions that no other way of writing them gives an expression.
+SOLVES = "which solves equations"
+
 
 def expression_of(system: System, name: str) -> Traced:
     """F or h of a system as a CasADi function of one column of states and inputs."""
     if system.origin.equations is not None:
-        return Traced(None, "it has algebraic states, which solve equations")
+        return Traced(None, f"it has algebraic states, {SOLVES}")
     tracing, model = system.tracing, system.symbolic if system.tracing is None else None
     if tracing is not None:
         found = tracing.watched(name)
@@ -27,7 +30,7 @@ def expression_of(system: System, name: str) -> Traced:
     if model is None:
         return Traced(None, "it was not made of functions that are known")
     if name == "f" and model.is_implicit:
-        return Traced(None, "it is an implicit step, which solves equations")
+        return Traced(None, f"it is an implicit step, {SOLVES}")
     ca = import_casadi()
     x, u = ca.SX.sym("x", system.n), ca.SX.sym("u", system.m)
     try:

@@ -5,8 +5,9 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates import CertificateError, Monitor, Sizes
-from qpmhe.certificates.guard import Guard
+from qpmhe.certificates.guard import Guard, Guarded
 from qpmhe.certificates.observer_bound import Tube, bound_observer
+from qpmhe_solvers import Backend, RawSolution
 
 from .helpers import box, unit_cost
 
@@ -35,7 +36,8 @@ def bound():
 def estimator(bound, **options):
     usual = {"horizon": 4, "initial_state": [0.0, 0.0], "max_qps": 1}
     return qpmhe.MovingHorizonEstimator(
-        bound.stability.system, qpmhe.Luenberger(GAIN), unit_cost(2), **(usual | options))
+        bound.stability.system, qpmhe.Luenberger(GAIN), options.pop("cost", unit_cost(2)),
+        **(usual | options))
 
 
 def plain(vectors, weight):
@@ -167,6 +169,43 @@ def test_adversaries_and_hostile_estimates_stay_within_twice_the_bound(
     assert acted > 10 * runs
 
 
+class Worst(qpmhe.solvers.Solver):
+    """Of all steps that lower the objective, one that leads the last state farthest away."""
+
+    def _solve(self, qp, start):
+        inverse, g = np.linalg.inv(qp.dense()), qp.gradient.ravel()
+        # Of |d - best|_H <= |best|_H, the end along the last state's largest variance.
+        ends = inverse[:, -qp.n :] @ np.linalg.eigh(inverse[-qp.n :, -qp.n :])[1][:, -1]
+        length = np.sqrt(ends @ qp.dense() @ ends)
+        return RawSolution(-inverse @ g + 0.99 * np.sqrt(g @ inverse @ g) / length * ends, True)
+
+
+def test_the_worst_that_the_verdict_accepts_is_guarded(bound):
+    """A backend may lower J, and be wrong by more than twice the bound."""
+    qpmhe.solvers.register(Backend("worst", Worst, "adversary"))
+    try:
+        mhe = estimator(
+            bound, backend="worst", cost=qpmhe.QuadraticCost(
+                prior=1e-3 * np.eye(2), disturbance=1e-2 * np.eye(2), noise=1.0))
+        watch, x, rng = Monitor(bound, mhe, initial_error=START, guard=True), np.array([
+            0.2, -0.1]), np.random.default_rng(4)
+        errors, limits = np.empty((2, 20)), np.empty(20)
+        for t in range(20):
+            y = x[:1] + rng.choice([-0.05, 0.05], 1)
+            x = bound.stability.system.f(x, np.zeros(0)) + rng.choice([-0.02, 0.02], 2)
+            estimate = mhe.update(y)
+            assert estimate.cost <= estimate.candidate_cost
+            reading = watch.check(estimate)
+            errors[:, t] = plain(x - np.array([estimate.state, reading.state]), bound.metric)
+            limits[t] = 2.0 * reading.radius
+            assert not reading.unguarded
+    finally:
+        qpmhe.solvers.unregister("worst")
+    assert (errors[0] > limits).sum() > 5
+    assert (errors[1] <= limits).all()
+    assert watch.moved > 10
+
+
 def test_usual_estimates_are_not_moved_and_nothing_feeds_back(bound):
     rng, x = np.random.default_rng(3), np.array([0.1, 0.0])
     free, watched = estimator(bound), estimator(bound)
@@ -185,6 +224,23 @@ def test_usual_estimates_are_not_moved_and_nothing_feeds_back(bound):
     assert "at 0 of 16 samples, and is off from sample 15 on: a measurem" in watch.summary()
     plain = Monitor(bound, estimator(bound), initial_error=START)
     assert plain.unguarded == "the monitor has no guard"
+
+
+def test_a_guard_that_was_off_stays_off(bound, monkeypatch):
+    """Where no state is in the set, it is off though the observer's bound is not lost."""
+    mhe = estimator(bound)
+    watch = Monitor(bound, mhe, initial_error=1e-6, guard=True)
+    monkeypatch.setattr(Guard, "__call__", lambda _, x, *__: Guarded(x, False, "nothing is left"))
+    reading = watch.check(mhe.update([0.1]))
+    assert reading.lost is None
+    assert reading.unguarded == "from sample 0 on: nothing is left"
+    following = Monitor(bound, mhe, initial_error=1e-6, guard=True)
+    following.load_state_dict(watch.state_dict())
+    assert following.unguarded == watch.unguarded
+    plain = Monitor(bound, mhe, initial_error=1e-6)
+    following = Monitor(bound, mhe, initial_error=1e-6, guard=True)
+    following.load_state_dict(plain.state_dict())
+    assert following.unguarded == ""
 
 
 def test_where_nothing_is_proved_in_advance_there_is_no_guard(bound):
