@@ -81,7 +81,7 @@ def write(memory: Any, sizes: MemorySizes, record: MemoryRecord, own: dict[str, 
             memory[f"{field.name}_end"] = array[length]
     for field in sizes.fields("both", "once"):
         value = getattr(record, field.name)
-        if f"has_{field.name}" in memory.dtype.names:
+        if field.may_be_missing:
             memory[f"has_{field.name}"] = value is not None
         if value is not None and field.of_window:
             memory[field.name][: length + 1] = value
@@ -97,8 +97,7 @@ def write(memory: Any, sizes: MemorySizes, record: MemoryRecord, own: dict[str, 
 
 def _single(memory: Any, field: Field, length: int) -> Any:
     """A value of which there is one, as a record has it; None for one that is missing."""
-    flag = f"has_{field.name}"
-    if flag in memory.dtype.names and not memory[flag]:
+    if field.may_be_missing and not memory[f"has_{field.name}"]:
         return None
     value = np.asarray(memory[field.name])
     if field.kind in ("count", "time"):

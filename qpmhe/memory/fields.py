@@ -45,6 +45,11 @@ class Field(NamedTuple):
         """Whether its first dimension is that of the window's states, of which some are used."""
         return self.shape.startswith("states")
 
+    @property
+    def may_be_missing(self) -> bool:
+        """Whether a single value is None at first; C has a flag for it."""
+        return any(one.name == f"has_{self.name}" for one in FIELDS)
+
 
 #: All fields. Both engines have the samples, the observer along them and the last estimates; each
 #: has the linearised stages in the form in which it computes with them.
@@ -171,6 +176,15 @@ class MemorySizes(NamedTuple):
     def shape(self, field: Field) -> tuple[int, ...]:
         """The shape of one row of a field."""
         return tuple(self.dimensions[name] for name in field.shape.split())
+
+    def first_value(self, field: Field) -> Any:
+        """The single value of a field before the first sample; None for one that is not there."""
+        if field.kind in ("count", "time"):
+            return (0,) * self.shape(field)[0] if field.shape else 0
+        if not field.shape:
+            return 0.0
+        is_there = not field.when or field.when in self.features
+        return np.zeros(self.shape(field)) if is_there and not field.may_be_missing else None
 
     def record_type(self, engine: str, room: int) -> np.dtype[Any]:
         """A record in Python: its fields are contiguous arrays with ``room`` stages."""

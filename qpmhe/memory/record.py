@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .fields import MemorySizes
+from .fields import FIELDS, Field, MemorySizes
 from .snapshot import check_size, checked_array, mismatch
 
 Array = NDArray[np.float64]
@@ -75,6 +75,14 @@ class MemoryRecord:
     panel: Array
     gradient: Array
     next_gradient: Array
+    time: int  # number of samples pushed: the window ends at x(time)
+    watched: tuple[int, int]
+    damping: float
+    restarted: int
+    trajectory: Array | None
+    smoothed_prior: Array | None  # in place of z(t-N), with ``arrival="smoothed"``
+    trusted: Array | None  # values of held parameters (2, k): of this window, and of the next
+    last_good_covariance: Array | None
 
     def __init__(
         self, sizes: MemorySizes, initial_state: Array, covariance: Array | None, step: float,
@@ -107,17 +115,9 @@ class MemoryRecord:
         #: Whether any stage may be unusual; those from ``end`` on never are.
         self.unusual: bool = False
         self.start = self.end = 0
-        self.time = 0  # number of samples pushed: the window ends at x(time)
-        self.watched: tuple[int, int] = (0, 0)
-        self.damping = 0.0
-        self.restarted = 0
-        self.trajectory: Array | None = None
-        #: Prior mean in place of z(t-N), with ``arrival="smoothed"``.
-        self.smoothed_prior: Array | None = None
-        #: Trusted values of held parameters, (2, k): of this window, and of the next.
-        self.trusted: Array | None = None
-        if held := sizes.dimensions["held"]:
-            self.trusted = np.zeros((2, held))
+        for field in FIELDS:
+            if field.rows == "once" and field.engine == "both":
+                setattr(self, field.name, sizes.first_value(field))
         self.last_good = initial_state.copy()
         self.last_good_covariance = None if covariance is None else covariance.copy()
         self._single = tuple(one.name for one in sizes.fields("both", "once"))
@@ -292,29 +292,29 @@ class MemoryRecord:
 
     def _load_single(self, state: dict[str, Any], time: int, length: int) -> None:
         """Load the fields of which there is one."""
-        n, trajectory = self.z.shape[1], state["trajectory"]
-        if (trajectory is None) != (time == 0):
+        if (state["trajectory"] is None) != (time == 0):
             raise TypeError("there must be a trajectory if and only if there was a measurement")
-        if trajectory is not None:
-            self.trajectory = checked_array("trajectory", trajectory, (length + 1, n))
-        self.last_good = checked_array("last_good", state["last_good"], (n,))
-        if (prior := state["smoothed_prior"]) is not None:
-            self.smoothed_prior = checked_array("smoothed_prior", prior, (n,))
-        if self.covariance is not None:
-            self.last_good_covariance = checked_array(
-                "last_good_covariance", state["last_good_covariance"], (n, n)
+        for field in self.sizes.fields("both", "once"):
+            setattr(self, field.name, self._checked(field, state[field.name], time, length))
+
+    def _checked(self, field: Field, value: Any, time: int, length: int) -> Any:
+        """A single value from a saved state; counts and times are no more than the samples."""
+        shape = self.sizes.shape(field)
+        if value is None and field.may_be_missing:
+            return None
+        if field.kind in ("count", "time"):
+            found = [
+                check_size(field.name, one, lambda size: 0 <= size <= time)
+                for one in (value if shape else [value])
+            ]
+            if len(found) != math.prod(shape):
+                raise ValueError(f"{field.name} is {value!r}")
+            return tuple(found) if shape else found[0]
+        if shape:
+            return checked_array(
+                field.name, value, (length + 1, *shape[1:]) if field.of_window else shape
             )
-        if self.trusted is not None:
-            self.trusted = checked_array("trusted", state["trusted"], self.trusted.shape)
-        far, dropped = (
-            check_size("watched", found, lambda count: 0 <= count <= time)
-            for found in state["watched"]
-        )
-        self.watched = far, dropped
-        if "restarted" in self._single:
-            self.restarted = check_size(
-                "restarted", state["restarted"], lambda found: 0 <= found <= time
-            )
-        self.damping = float(state["damping"])
-        if not 0.0 <= self.damping < math.inf:
-            raise ValueError(f"damping is {self.damping!r}")
+        number = float(value)
+        if not 0.0 <= number < math.inf:
+            raise ValueError(f"{field.name} is {number!r}")
+        return number

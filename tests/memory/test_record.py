@@ -151,7 +151,8 @@ def test_the_structures_of_c_have_the_table_s_names_and_sizes():
     )
     numbers = {
         "MHE_NX": n, "MHE_NY": p, "MHE_NU": m, "MHE_HORIZON": horizon, "MHE_SENSORS": 2,
-        "MHE_HELD": 1, "MHE_X_SET": 1, "MHE_STAGE_ROWS": 4, "MHE_SIZE": lambda size: max(size, 1),
+        "MHE_HELD": 1, "MHE_X_SET": 1, "MHE_STAGE_ROWS": 4, "MHE_END_ROWS": 1,
+        "MHE_SIZE": lambda size: max(size, 1),
     }
     kinds = {"real": np.float64, "terms": "V8", "x_set": "V8"}
     names = {
