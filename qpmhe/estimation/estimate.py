@@ -71,8 +71,9 @@ _TEXTS = {
         "the converged cost, raise max_solver_iterations, or use another backend, such as 'auto'."
     ),
     Status.MODEL_FAILED: (
-        "A function of the model, the observer or the cost raised or was not finite; bound the "
-        "states, define the model for all of them, or check the observer's gain or covariances."
+        "A function of the model, a constraint, the observer or the cost raised or was not finite; "
+        "bound the states, define the model and its constraints for all of them, or check the "
+        "observer's gain or covariances."
     ),
     Status.FAILED_STAGE: (
         "The model failed at an earlier stage that is still in the window: the candidate has "

@@ -189,8 +189,9 @@ class Case:
         # Of each soft set: the set, its linear and its quadratic penalties.
         self.soft = {}
         w = self.sets["w"]
-        everywhere = self.G is None and (w is None or not len(w.fixed_components))
-        if (self.engine == "python" or everywhere) and r.random() < 0.25:
+        # Whether all directions have disturbances.
+        self.is_everywhere = self.G is None and (w is None or not len(w.fixed_components))
+        if (self.engine == "python" or self.is_everywhere) and r.random() < 0.25:
             self._soften(r)
 
     def _soften(self, r):
@@ -215,7 +216,9 @@ class Case:
     def _draw_constraint(self, r):
         """g, whether it is of x and v, and whether it is hard; None."""
         self.constraint = None
-        if self.engine != "python" or r.random() >= 0.15:
+        if self.engine == "compiled":  # other draws are what they were before C had constraints
+            r = np.random.default_rng([self.seed, 15])
+        if not (self.engine == "python" or self.is_everywhere) or r.random() >= 0.15:
             return
         units, radius, R = 1.0 / self.x_units, 2.0 + np.sum(self.model.start**2), np.sqrt(
             np.diag(self.R)
