@@ -175,3 +175,11 @@ def test_products_of_casadi_are_one_operation(name, nested):
             expected = np.array(expected).reshape(found.shape)
             scale = np.abs(expected).max()
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * scale)
+
+
+def test_a_layer_of_jax_is_one_operation():
+    jnp = pytest.importorskip("jax.numpy")
+    system = qpmhe.from_jax(
+        lambda x: 0.9 * x + jnp.tanh(jnp.array(A) @ x), lambda x: x[:1], n=N, p=1
+    )
+    assert has_products(system.symbolic.f)
