@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .._version import __version__
 from ..errors import CompilationError
-from ..model.algebraic import CURVED, MOST_HALVINGS, MOST_ITERATIONS, ROUNDING, SMALL
+from ..model.algebraic import CURVED, LESS, MOST_HALVINGS, MOST_ITERATIONS, ROUNDING, SMALL
 from ..model.expressions import CasadiModel, import_casadi
 from ..model.implicit_steps import COLLOCATIONS
 from ..terms.soft import SOFT
@@ -197,7 +197,7 @@ def _step_parts(model: CasadiModel) -> list[str]:
     method = COLLOCATIONS[how.method]
     values = names | {
         "iterations": MOST_ITERATIONS, "halvings": MOST_HALVINGS, "rounding": repr(ROUNDING),
-        "small": repr(SMALL), "curved": repr(CURVED),
+        "small": repr(SMALL), "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
         "stages": len(method.A), "ends": ", ".join(map(repr, method.d.tolist())),
         "weights": ", ".join(f"{{{', '.join(map(repr, row))}}}" for row in method.A.tolist()),
         "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),

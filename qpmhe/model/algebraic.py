@@ -29,6 +29,8 @@ SMALL = 1e-7
 ROUNDING = 4e-16
 #: How far the equations may be from linear along a step, as a share of it.
 CURVED = 0.5
+#: By how much a step that is not becomes shorter: at least, and at most.
+LESS = 0.1, 0.5
 
 
 class Eliminated(NamedTuple):
@@ -108,9 +110,9 @@ class AlgebraicStates:
         for _ in range(MOST_ITERATIONS):
             found = eliminated(values, J, n)
             x, z, step = w[at, :n], w[at, n:], found.step
-            length = _share(step, algebraic_sizes(found, np.abs(x), np.abs(z + step)))
+            length = share(step, algebraic_sizes(found, np.abs(x), np.abs(z + step)))
             scale = np.abs(z) + np.abs(step)
-            before = _share(step, scale)
+            before = share(step, scale)
             done = converged(length, last)
             lost, factor = ~np.isfinite(length), np.ones(len(at))
             trial = w[at]
@@ -118,14 +120,13 @@ class AlgebraicStates:
                 trial[:, n:] = z + factor[:, None] * step
                 values, slopes = self._joint(trial, u[at]), self._jacobian(trial, u[at])
                 again = eliminated(values, J, n).step
-                curved = _share(again - (1.0 - factor[:, None]) * step, scale)
-                good = curved <= CURVED * factor * before
-                good |= (length <= SMALL) & np.isfinite(curved)
+                curved = share(again - (1.0 - factor[:, None]) * step, scale)
+                good = straight(curved, factor, before, length)
                 good &= np.linalg.slogdet(slopes[:, n:, n:])[0] == found.side
                 outside = ~(good | done | lost)
                 if not outside.any():
                     break
-                factor[outside] *= 0.5
+                factor = np.where(outside, shorter(curved, factor, before), factor)
             left = ~(lost | outside)
             w[at[left]] = trial[left]
             solved[at] = done & left
@@ -196,9 +197,27 @@ def solved(matrix: Array, right: Array, inverses: Array) -> Array:
     return found
 
 
-def _share(step: Array, size: Array) -> Array:
-    """The largest share (K,) that a correction (K, k) has of sizes (K, k)."""
+def straight(curved: Array, factor: Array, before: Array, length: Array) -> Mask:
+    """Whether the equations are nearly linear along steps of these factors (K,).
+
+    ``curved`` is how far the correction behind is from that of linear equations, a share as
+    ``before`` is of the whole step. Of the last steps only a finite value is asked for.
+    """
+    found: Mask = (curved <= CURVED * factor * before) | ((length <= SMALL) & np.isfinite(curved))
+    return found
+
+
+def shorter(curved: Array, factor: Array, before: Array) -> Array:
+    """The factors (K,) at which equations of second order would be nearly linear, within bounds."""
+    predicted = CURVED * factor * before / curved
+    known = np.isfinite(curved) & (predicted < LESS[1])
+    found: Array = factor * np.where(known, np.maximum(predicted, LESS[0]), LESS[1])
+    return found
+
+
+def share(step: Array, size: Array) -> Array:
+    """The largest share (K,) that a correction (K, ...) has of sizes that broadcast to it."""
     shares = np.abs(step) / size
-    shares[(step == 0.0) & (size == 0.0)] = 0.0
-    found: Array = shares.max(axis=1)
+    shares[(step == 0.0) & (size == 0.0)] = 0.0  # a state that stays 0
+    found: Array = shares.reshape(len(shares), -1).max(axis=1)
     return found

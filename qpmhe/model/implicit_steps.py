@@ -27,7 +27,10 @@ from .algebraic import (
     converged,
     eliminated,
     inverse,
+    share,
+    shorter,
     solved,
+    straight,
 )
 
 Array = NDArray[np.float64]
@@ -144,46 +147,66 @@ class ImplicitStep:
         known = np.isfinite(w).all(axis=1)
         W[..., : x.shape[1]] = 0.0
         W[~known] = np.nan
+        start = W.copy()
         with np.errstate(all="ignore"):
-            self._iterate(x, u, h, W, np.flatnonzero(known))
+            for damped in False, True:
+                left = np.flatnonzero(known & ~np.isfinite(W).all(axis=(1, 2)))
+                at = left if damped else np.flatnonzero(known)
+                W[at] = start[at]
+                self._iterate(x, u, h, W, at, damped)
         return W
 
-    def _iterate(self, x: Array, u: Array, h: Array, W: Array, at: NDArray[np.intp]) -> None:
+    def _iterate(
+        self, x: Array, u: Array, h: Array, W: Array, at: NDArray[np.intp], damped: bool
+    ) -> None:
         """Newton's iteration for all these states, in place.
 
-        Steps are whole ones, which converge from far on stiff kinetics where a test of descent
-        would refuse them; a step that leads out of the functions' domain is halved.
+        Whole steps converge from far on stiff kinetics; one that leads out of the functions' domain
+        is halved. Where they do not converge, as between both sides of a rate that saturates,
+        damped ones start again: as short as those of `AlgebraicStates`, by the same test.
         """
         if not at.size:
             return
-        n, A, last = x.shape[1], self._method.A, np.full(len(at), np.inf)
+        n, last = x.shape[1], np.full(len(at), np.inf)
         side = np.ones((len(x), 1))
         values = self._at_stages(self._rate, x[at], u[at], W[at])
         for iteration in range(MOST_ITERATIONS):
-            found = eliminated(values, self._slopes(x[at], u[at], W[at]), n)
-            Z, J = W[at, :, :n], found.jacobian
-            residual = Z - h[at, None, None] * np.einsum("ij,kjn->kin", A, found.rate)
-            step = -_times(inverse(_newton_matrix(A, h[at], J)), residual)
+            J = self._slopes(x[at], u[at], W[at])
+            found = eliminated(values, J, n)
+            inverses = inverse(_newton_matrix(self._method.A, h[at], found.jacobian))
+            moves = self._correction(found, inverses, h[at], W[at])
+            step, k = moves[..., :n], W.shape[2] - n
             # What rounding of the states and of their flows amounts to in each equation.
-            size = np.abs(x[at]) + np.abs(Z + step).max(axis=1)
-            size += h[at, None] * (np.abs(J).max(axis=1) @ size[..., None])[..., 0]
-            length = _length(step, size[:, None])
-            if W.shape[2] > n:
-                step, others = _with_algebraic(found, step, W[at, :, n:], size)
-                length = np.maximum(length, others)
+            size = np.abs(x[at]) + np.abs(W[at, :, :n] + step).max(axis=1)
+            flows = h[at, None] * (np.abs(found.jacobian).max(axis=1) @ size[..., None])[..., 0]
+            length = share(step, (size + flows)[:, None])
+            if k:
+                sizes = algebraic_sizes(
+                    found, np.repeat((size + flows)[:, None], len(self._method.A), axis=1),
+                    np.abs(W[at, :, n:] + moves[..., n:]),
+                )
+                length = np.maximum(length, share(moves[..., n:], sizes))
             done = converged(length, last)
             if iteration == 0:
                 side[at] = found.side[:, :1]
             # Another solution for z is no stage of this step.
             lost = ~np.isfinite(length) | (done & (found.side != side[at]).any(axis=1))
-            factor = np.ones(len(at))
+            scale = np.abs(W[at]) + np.abs(moves)
+            scale[..., :n] = np.abs(x[at])[:, None] + scale[..., :n]
+            before, factor = share(moves, scale), np.ones(len(at))
             for _ in range(MOST_HALVINGS):
-                trial = W[at] + factor[:, None, None] * step
+                trial = W[at] + factor[:, None, None] * moves
                 values = self._at_stages(self._rate, x[at], u[at], trial)
-                outside = ~(np.isfinite(values).all(axis=(1, 2)) | done | lost)
+                good, less = np.isfinite(values).all(axis=(1, 2)), 0.5 * factor
+                if damped:
+                    again = self._correction(eliminated(values, J, n), inverses, h[at], trial)
+                    curved = share(again - (1.0 - factor[:, None, None]) * moves, scale)
+                    good = straight(curved, factor, before, length)
+                    less = shorter(curved, factor, before)
+                outside = ~(good | done | lost)
                 if not outside.any():
                     break
-                factor[outside] *= 0.5
+                factor = np.where(outside, less, factor)
             trial[lost | outside] = np.nan
             W[at] = trial
             left = ~(done | lost | outside)
@@ -192,14 +215,15 @@ class ImplicitStep:
             at, values, last = at[left], values[left], length[left]
         W[at] = np.nan
 
-
-def _with_algebraic(
-    found: Eliminated, step: Array, z: Array, size: Array
-) -> tuple[Array, Array]:
-    """The correction (K, s, n + k) of Z and z, and the largest share (K,) of that of z."""
-    move = found.step + (found.slope @ step[..., None])[..., 0]
-    sizes = algebraic_sizes(found, np.repeat(size[:, None], z.shape[1], axis=1), np.abs(z + move))
-    return np.concatenate((step, move), axis=2), _length(move, sizes)
+    def _correction(self, found: Eliminated, inverses: Array, h: Array, W: Array) -> Array:
+        """Newton's correction (K, s, n + k) of the stages, by inverses of its matrix."""
+        n = found.rate.shape[-1]
+        flows = np.einsum("ij,kjn->kin", self._method.A, found.rate)
+        step = -_times(inverses, W[..., :n] - h[:, None, None] * flows)
+        if W.shape[2] == n:
+            return step
+        move = found.step + (found.slope @ step[..., None])[..., 0]
+        return np.concatenate((step, move), axis=2)
 
 
 def _newton_matrix(A: Array, h: Array, J: Array) -> Array:
@@ -213,12 +237,4 @@ def _newton_matrix(A: Array, h: Array, J: Array) -> Array:
 
 def _times(matrix: Array, stages: Array) -> Array:
     found: Array = (matrix @ stages.reshape(len(stages), -1, 1)).reshape(stages.shape)
-    return found
-
-
-def _length(step: Array, size: Array) -> Array:
-    """The largest share (K,) that a correction (K, s, n) has of sizes that broadcast to it."""
-    shares = np.abs(step) / size
-    shares[(step == 0.0) & (size == 0.0)] = 0.0  # a state that stays 0
-    found: Array = shares.max(axis=(1, 2))
     return found

@@ -67,6 +67,8 @@ def made_from_ode(
         if scales is not None:  # else steps are shares of 1 and of the states
             differences.use_scales(scales, None, ())
         slope = partial(_of_inputs, differences.batch, m)
+        if h_jacobian is None:
+            jacobians = "finite differences"  # a trace replaces them, however far they are from it
     length, over_leading = positive("dt", dt), _over_leading(batched)
     chosen: Choice | None = None
     if how.method == AUTO:
@@ -84,7 +86,7 @@ def made_from_ode(
     def timed(system: System) -> System:
         return cls.made(
             Trusted(timed_by_input(step, m)), Trusted(without_last(system.h.batch, m)),
-            Origin(is_timed=True), n=n, p=p, m=m + 1,
+            Origin(is_timed=True, jacobians=jacobians), n=n, p=p, m=m + 1,
             f_jacobian=step_jacobian and Trusted(timed_by_input(step_jacobian, m)),
             h_jacobian=h_jacobian and Trusted(
                 without_last(system.evaluation.functions.h_jacobian.batch, m)

@@ -315,6 +315,28 @@ def _kinetics(method, steps=1):
     return Case(system, observer, cost, np.array([0.9, 0.004, 0.25]), tuple(samples), options)
 
 
+def _uptake():
+    """What is fed and runs out: damped Newton steps, where whole ones go back and forth."""
+
+    def rate(x, u):
+        taken = x[..., 0] / (1e-3 + np.abs(x[..., 0]))
+        return np.stack([u[..., 0] - taken, 0.1 * taken - 0.05 * x[..., 1]], -1)
+
+    system = qpmhe.System.from_ode(
+        rate, lambda x, u: x, dt=1.0, n=2, p=2, m=1, method="radau", scales=[1.0, 1.0]
+    )
+    cost = QuadraticCost.from_covariances(
+        prior=0.1**2 * np.eye(2), disturbance=0.05**2 * np.eye(2), noise=0.1**2 * np.eye(2)
+    )
+    generator, x, samples = np.random.default_rng(4), np.array([2.0, 0.5]), []
+    for u in generator.uniform(0.0, 0.5, (14, 1)):
+        samples.append({"y": x + 0.1 * generator.standard_normal(2), "u": u})
+        x = system.f(x, u)
+    observer = Luenberger([[0.3, 0.0], [0.0, 0.3]])
+    options = {"horizon": 4, "max_qps": 2}
+    return Case(system, observer, cost, np.array([1.9, 0.6]), tuple(samples), options)
+
+
 def _swing(method="radau", steps=1):
     """A generator at a bus with a load, whose angle and voltage are algebraic states."""
 
@@ -934,6 +956,7 @@ FEATURES = {
         "radau": (lambda: _kinetics("radau"), with_conditions),
         "radau substeps": (lambda: _kinetics("radau", 2), filtered(), gaps, AGAIN, WARM),
         "midpoint": (lambda: _kinetics("midpoint", 3), filtered(UKF), gaps),
+        "radau damped": (_uptake, with_conditions),
         "rk4 substeps": (lambda: _plain(
             _rate, lambda x: [x[0]], 3, 1, dt=0.3, method="rk4", substeps=3
         ), with_conditions),

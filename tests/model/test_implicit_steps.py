@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import qpmhe
 from qpmhe.errors import ModelError, OptionError
@@ -168,6 +169,43 @@ def test_parameters_go_through_the_step():
     slope = augmented.model().functions.f_jacobian(np.append(x, 0.7), NONE)
     moved = [augmented.f(np.append(x, 0.7 + d)) for d in (1e-6, -1e-6)]
     np.testing.assert_allclose(slope[:, 2], (moved[0] - moved[1]) / 2e-6, rtol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["traced", "called"])
+def test_a_rate_that_saturates(kind):
+    """Uptake of what runs out: whole Newton steps go back and forth between its two flat sides."""
+    def rate(x):
+        return 0.01 - x / (1e-4 + np.abs(x))
+
+    made = system(rate if kind == "traced" else untraced(rate), 1, dt=1.0, method="midpoint")
+    values = made.model().functions.f
+    for x in 0.0, 1e-5, 0.01, 0.3, 5.0:
+        # The rate falls with the state, so that the step is the only root.
+        root = brentq(lambda z, x=x: z - rate(x + 0.5 * z), -2.0, 2.0, xtol=1e-15, rtol=1e-14)
+        assert values(np.array([x]), NONE)[0] == pytest.approx(x + root, rel=1e-10, abs=1e-14)
+    fine = system(rate, 1, dt=1.0, method="radau", steps=4).f(np.array([0.3]))
+    # It runs out within the step, and stays where the uptake is the supply.
+    assert fine[0] == pytest.approx(1e-4 * 0.01 / 0.99, rel=1e-3)
+
+
+def test_a_trace_replaces_differences_that_are_far_off():
+    """They take steps for states of size 1, where nobody gives scales."""
+    def rate(x, theta):
+        return np.stack([-x[..., 0], -theta[0] * x[..., 1] / (1e-6 + x[..., 1])], -1)
+
+    made = qpmhe.augment_parameters(
+        rate, lambda x, theta: x[..., 0], n=2, p=1, nominal=[2e-6], dt=1.0, method="radau",
+        states=qpmhe.Box([0.0, 0.0], [1.0, 1e-4]),
+    )
+    assert made.derivatives["f"] == "traced"
+    x, moves = np.array([0.5, 3e-6, 2e-6]), 1e-5 * np.array([0.5, 3e-6, 2e-6])
+    slope = made.model().functions.f_jacobian(x, NONE)
+    for j, move in enumerate(moves):
+        step = move * np.eye(3)[j]
+        ahead, behind = made.f(x + step), made.f(x - step)
+        np.testing.assert_allclose(
+            slope[:, j], (ahead - behind) / (2.0 * move), rtol=1e-5, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("engine", ["python", "compiled"])

@@ -79,27 +79,29 @@ static real mhe_algebraic_share(const mhe_reduced *r, const real *z, const real 
     return length;
 }
 
+/* Let a correction of z, step = (dx, dz), follow that of x. */
+static void mhe_follow(const mhe_reduced *r, real *step)
+{
+    for (int i = 0; i < NZ; i++)
+        for (int j = 0; j < NX; j++) step[NX + i] += r->slope[i * NX + j] * step[j];
+}
+
 /* The correction of z behind one of x, step = (dx, dz); its largest share. */
 static real mhe_move_algebraic(const mhe_reduced *r, const real *w, const real *sizes, real *step)
 {
-    for (int i = 0; i < NZ; i++) {
-        real sum = 0;
-        for (int j = 0; j < NX; j++) sum += r->slope[i * NX + j] * step[j];
-        step[NX + i] = r->step[i] + sum;
-    }
+    for (int i = 0; i < NZ; i++) step[NX + i] = r->step[i];
+    mhe_follow(r, step);
     return mhe_algebraic_share(r, w + NX, sizes, step + NX);
 }
 
-/* The largest share of a correction in other sizes. */
-static real mhe_share(const real *step, const real *sizes)
+/* The rate at another point by the Jacobian of r, and Newton's correction of z in step = (dx, dz). */
+static void mhe_freeze(const mhe_reduced *r, const mhe_reduced *next, real *rate, real *step)
 {
-    real length = 0;
-    for (int i = 0; i < NZ; i++) {
-        const real share = step[i] != 0 ? (real)fabs(step[i]) / sizes[i] : 0;
-        if (!isfinite(share)) return NAN;
-        length = (real)fmax(length, share);
+    mhe_algebraic_step(r, next->values, step + NX);
+    for (int i = 0; i < NX; i++) {
+        rate[i] = next->values[i];
+        for (int l = 0; l < NZ; l++) rate[i] += r->full[i * NW + NX + l] * step[NX + l];
     }
-    return length;
 }
 
 /* w = (x, z(x, u)) by Newton steps from the guess, damped so that f is nearly linear along them;
@@ -124,18 +126,18 @@ static int mhe_complete(const real *x, const real *u, real *w)
         if (!isfinite(length)) return 0;
         const int done = mhe_converged(length, last);
         for (int i = 0; i < NZ; i++) scale[i] = (real)(fabs(w[NX + i]) + fabs(r->step[i]));
-        const real before = mhe_share(r->step, scale);
+        const real before = mhe_share(NZ, r->step, scale);
         for (int halving = 0; halving < $halvings && !good; halving++) {
+            real curved = NAN;
             for (int i = 0; i < NZ; i++) trial[NX + i] = w[NX + i] + factor * r->step[i];
             good = done;
             if (!done && mhe_reduce(trial, u, next) && next->side == r->side) {
                 mhe_algebraic_step(r, next->values, again);
                 for (int i = 0; i < NZ; i++) again[i] -= (1 - factor) * r->step[i];
-                const real curved = mhe_share(again, scale);
-                good = curved <= (real)$curved * factor * before ||
-                       (length <= (real)$small && isfinite(curved));
+                curved = mhe_share(NZ, again, scale);
+                good = mhe_straight(curved, factor, before, length);
             }
-            factor /= 2;
+            if (!good) factor = mhe_shorter(curved, factor, before);
         }
         if (!good) return 0;
         for (int i = 0; i < NZ; i++) w[NX + i] = trial[NX + i];

@@ -11,6 +11,32 @@ static int mhe_converged(real length, real last)
             (length > last / 2 || (isfinite(last) && length * rate * rate <= (real)$rounding)));
 }
 
+/* Whether equations are nearly linear along a step of this factor: how far the correction behind it
+ * is from that of linear ones, as a share of the whole step. The last steps need a finite value. */
+static int mhe_straight(real curved, real factor, real before, real length)
+{
+    return curved <= (real)$curved * factor * before || (length <= (real)$small && isfinite(curved));
+}
+
+/* The factor at which equations of second order would be nearly linear, within bounds. */
+static real mhe_shorter(real curved, real factor, real before)
+{
+    const real predicted = (real)$curved * factor * before / curved;
+    return factor * (predicted < (real)$most ? (real)fmax(predicted, $least) : (real)$most);
+}
+
+/* The largest share that a correction has of some sizes. */
+static real mhe_share(int size, const real *step, const real *sizes)
+{
+    real length = 0;
+    for (int i = 0; i < size; i++) {
+        const real share = step[i] != 0 ? (real)fabs(step[i]) / sizes[i] : 0;
+        if (!isfinite(share)) return NAN;
+        length = (real)fmax(length, share);
+    }
+    return length;
+}
+
 /* The factors of M, in place; whether M is regular. */
 static int mhe_factor_equations(int size, real *M, int *pivot)
 {

@@ -30,3 +30,14 @@ static real mhe_move_algebraic(const mhe_reduced *r, const real *w, const real *
     (void)r; (void)w; (void)sizes; (void)step;
     return 0;
 }
+
+static void mhe_follow(const mhe_reduced *r, real *step)
+{
+    (void)r; (void)step;
+}
+
+static void mhe_freeze(const mhe_reduced *r, const mhe_reduced *next, real *rate, real *step)
+{
+    (void)r; (void)step;
+    for (int i = 0; i < NX; i++) rate[i] = next->rate[i];
+}

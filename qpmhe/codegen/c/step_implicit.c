@@ -1,6 +1,6 @@
 /* An implicit step of a rate: the stages Z_i = h sum_j A_ij f(x + Z_j, z_j), with algebraic states
- * z_i where there are any, by Newton's method from Z = 0 and z at x, to rounding, and
- * next = x + sum_i d_i Z_i. The derivative is that of the implicit function theorem at the converged
+ * z_i where there are any, by Newton's method from Z = 0 and z at x, to rounding, with whole steps or,
+ * where these fail, damped ones, and next = x + sum_i d_i Z_i. The derivative is that of the implicit function theorem at the converged
  * stages. qpmhe/model/implicit_steps.py says the same in Python. A stage is Z_i, and z_i below. */
 
 #define MHE_STAGES $stages
@@ -26,12 +26,12 @@ static int mhe_stage_rates(const real *x, const real *u, const real *W, mhe_redu
 }
 
 /* The negative residual h A f(x + Z) - Z of the linearised rates. */
-static void mhe_stage_residual(const mhe_reduced *r, real h, const real *W, real *residual)
+static void mhe_stage_residual(const real *rates, real h, const real *W, real *residual)
 {
     for (int i = 0; i < MHE_STAGES; i++)
         for (int a = 0; a < NX; a++) {
             real sum = 0;
-            for (int j = 0; j < MHE_STAGES; j++) sum += mhe_stage_weights[i][j] * r[j].rate[a];
+            for (int j = 0; j < MHE_STAGES; j++) sum += mhe_stage_weights[i][j] * rates[j * NX + a];
             residual[i * NX + a] = -(W[i * NW + a] - h * sum);
         }
 }
@@ -91,42 +91,81 @@ static real mhe_stage_moves(const mhe_reduced *r, const real *W, const real *siz
     return length;
 }
 
-/* The stages W of a step; whether the iteration has converged. */
-static int mhe_solve_stages(const real *x, const real *u, real h, real *W)
+/* How far the correction behind a step of this factor is from that of linear equations, by the
+ * Jacobians r and the factors M at its start: a share of the sizes in scale. */
+static real mhe_stage_curved(const mhe_reduced *r, const mhe_reduced *next, real h, const real *M,
+                             const int *pivot, const real *trial, const real *moves, real factor,
+                             const real *scale)
 {
-    real w[NW], step[MHE_UNKNOWNS], moves[MHE_STAGES * NW], trial[MHE_STAGES * NW], sizes[NX];
-    real M[MHE_UNKNOWNS * MHE_UNKNOWNS], last = INFINITY;
-    mhe_reduced r[MHE_STAGES];
-    int pivot[MHE_UNKNOWNS];
-    if (!mhe_complete(x, u, w)) return 0;
+    real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], again[MHE_STAGES * NW];
+    for (int i = 0; i < MHE_STAGES; i++) mhe_freeze(r + i, next + i, rates + i * NX, again + i * NW);
+    mhe_stage_residual(rates, h, trial, step);
+    mhe_solve_equations(MHE_UNKNOWNS, M, pivot, 1, step);
+    for (int i = 0; i < MHE_STAGES; i++) {
+        for (int a = 0; a < NX; a++) again[i * NW + a] = step[i * NX + a];
+        mhe_follow(r + i, again + i * NW);
+    }
+    for (int i = 0; i < MHE_STAGES * NW; i++) again[i] -= (1 - factor) * moves[i];
+    return mhe_share(MHE_STAGES * NW, again, scale);
+}
+
+/* The stages W of a step from w = (x, z), by whole Newton steps or by damped ones, along which f is
+ * nearly linear; whether they converge. */
+static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, real *W)
+{
+    mhe_reduced both[2][MHE_STAGES];
+    real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], moves[MHE_STAGES * NW], trial[MHE_STAGES * NW];
+    real M[MHE_UNKNOWNS * MHE_UNKNOWNS], scale[MHE_STAGES * NW], sizes[NX], last = INFINITY;
+    int pivot[MHE_UNKNOWNS], now = 0;
     for (int i = 0; i < MHE_STAGES; i++)
         for (int j = 0; j < NW; j++) W[i * NW + j] = j < NX ? 0 : w[j];
-    if (!mhe_stage_rates(x, u, W, r)) return 0;
-    const int side = r[0].side;
+    if (!mhe_stage_rates(w, u, W, both[0])) return 0;
+    const int side = both[0][0].side;
     for (int iteration = 0; iteration < $iterations; iteration++) {
+        const mhe_reduced *r = both[now];
+        mhe_reduced *next = both[!now];
         if (!mhe_stage_factor(h, r, M, pivot)) return 0;
-        mhe_stage_residual(r, h, W, step);
+        for (int i = 0; i < MHE_UNKNOWNS; i++) rates[i] = r[i / NX].rate[i % NX];
+        mhe_stage_residual(rates, h, W, step);
         mhe_solve_equations(MHE_UNKNOWNS, M, pivot, 1, step);
-        mhe_stage_sizes(x, h, W, step, r, sizes);
+        mhe_stage_sizes(w, h, W, step, r, sizes);
         const real length = mhe_stage_moves(r, W, sizes, step, moves);
         if (!isfinite(length)) return 0;
         const int done = mhe_converged(length, last);
-        int inside = 0;
-        for (int halving = 0; halving < $halvings && !inside; halving++) {
-            for (int i = 0; i < MHE_STAGES * NW; i++) trial[i] = W[i] + moves[i];
-            inside = done || mhe_stage_rates(x, u, trial, r);
-            for (int i = 0; i < MHE_STAGES * NW && !inside; i++) moves[i] /= 2;
+        for (int i = 0; i < MHE_STAGES * NW; i++)
+            scale[i] = (real)(fabs(W[i]) + fabs(moves[i]) + (i % NW < NX ? fabs(w[i % NW]) : 0));
+        const real before = mhe_share(MHE_STAGES * NW, moves, scale);
+        real factor = 1;
+        int good = 0;
+        for (int halving = 0; halving < $halvings && !good; halving++) {
+            real curved = NAN;
+            for (int i = 0; i < MHE_STAGES * NW; i++) trial[i] = W[i] + factor * moves[i];
+            good = done || mhe_stage_rates(w, u, trial, next);
+            if (good && damped && !done) {
+                curved = mhe_stage_curved(r, next, h, M, pivot, trial, moves, factor, scale);
+                good = mhe_straight(curved, factor, before, length);
+            }
+            if (!good) factor = mhe_shorter(curved, factor, before);
         }
-        if (!inside) return 0;
+        if (!good) return 0;
         for (int i = 0; i < MHE_STAGES * NW; i++) W[i] = trial[i];
         if (done) {
             /* Another solution for z is no stage of this step. */
-            for (int i = 0; i < MHE_STAGES; i++) inside = inside && r[i].side == side;
-            return inside;
+            for (int i = 0; i < MHE_STAGES; i++) good = good && r[i].side == side;
+            return good;
         }
         last = length;
+        now = !now;
     }
     return 0;
+}
+
+/* The stages W of a step; whether one of both iterations has converged. */
+static int mhe_solve_stages(const real *x, const real *u, real h, real *W)
+{
+    real w[NW];
+    return mhe_complete(x, u, w) &&
+           (mhe_iterate_stages(w, u, h, 0, W) || mhe_iterate_stages(w, u, h, 1, W));
 }
 
 static void mhe_step_end(const real *x, const real *W, real *next)
