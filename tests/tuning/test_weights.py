@@ -98,6 +98,7 @@ def test_a_file_without_weights_is_refused_by_name(tmp_path, text, words):
         load(path)
 
 
+@pytest.mark.slow
 def test_tune_then_estimate(folder):
     shown = call(
         *TUNE, "--objective", "likelihood", "--parameter", "k=0.6", "--picture", "weights.png",
