@@ -34,7 +34,7 @@ from .watched import WatchedFunctions
 
 Array = NDArray[np.float64]
 
-_ROWS_DROPPED = Status.ROWS_DROPPED.value
+_ROWS_DROPPED, _OUTSIDE = Status.ROWS_DROPPED.value, Status.CANDIDATE_OUTSIDE.value
 # So that a long record can be interrupted, and its times are means of pieces.
 _PIECE = 256
 
@@ -248,14 +248,18 @@ class CompiledEngine:
     def _collect(self, time: int) -> CompiledEstimate:
         block, numbers = self._block.copy(), self._numbers.tolist()
         dropped: tuple[DroppedRow, ...] = ()
+        missed, layout = dropped, self._library.layout
         if numbers[1] & _ROWS_DROPPED:
             sides = self._out[0]["dropped"][: numbers[0] + 1]
-            dropped = self._library.layout.dropped_rows(sides, time + 1 - numbers[0])
+            dropped = layout.dropped_rows(sides, time + 1 - numbers[0])
+        if layout.restores and numbers[1] & _OUTSIDE:
+            sides = self._out[0]["missed"][: numbers[0] + 1]
+            missed = layout.dropped_rows(sides, time + 1 - numbers[0])
         rejected = None
         if self._rejects:
             rejected = self._out[0]["rejected"].astype(np.bool_)
         return CompiledEstimate(
-            block, numbers, time, self._sizes, dropped, self._to_disturbances, rejected,
+            block, numbers, time, self._sizes, dropped, self._to_disturbances, rejected, missed,
         )
 
     def _rejecting(self, rejected: NDArray[np.uint8]) -> NDArray[np.bool_] | None:

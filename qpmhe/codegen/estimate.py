@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ObserverWarning
-from ..estimation.estimate import DroppedRow, Estimate, Status
+from ..estimation.estimate import DroppedRow, Estimate, Status, naming_missed
 from ..estimation.watch import ObserverWatch
 
 Array = NDArray[np.float64]
@@ -43,18 +43,19 @@ def _read(value: Callable[[CompiledEstimate], Any]) -> Any:
 class CompiledEstimate(Estimate):
     """An estimate whose arrays are views of one block, made on access."""
 
-    __slots__ = ("_block", "_numbers", "_sizes", "_to_disturbances")
+    __slots__ = ("_block", "_missed", "_numbers", "_sizes", "_to_disturbances")
 
     engine = "compiled"
 
     def __init__(
         self, block: Array, numbers: list[int], time: int, sizes: tuple[int, int, int],
         dropped: tuple[DroppedRow, ...] = (), to_disturbances: Array | None = None,
-        rejected: NDArray[np.bool_] | None = None,
+        rejected: NDArray[np.bool_] | None = None, missed: tuple[DroppedRow, ...] = (),
     ) -> None:
         self._block, self._numbers, self.time = block, numbers, time
         self._sizes, self.dropped = sizes, dropped
         self._to_disturbances, self._rejected = to_disturbances, rejected
+        self._missed = missed
         n = sizes[0]
         end = _COSTS + (numbers[0] + 1) * n
         self.state = block[end - n : end]
@@ -62,7 +63,7 @@ class CompiledEstimate(Estimate):
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (
             self._block, self._numbers, self.time, self._sizes, self.dropped,
-            self._to_disturbances, self._rejected,
+            self._to_disturbances, self._rejected, self._missed,
         )
         return _restored, (arguments, self.step_time)
 
@@ -74,12 +75,16 @@ class CompiledEstimate(Estimate):
     restored_cost = _read(lambda self: float(self._block[2]))
     trajectory = _read(lambda self: self._rows(_COSTS, self._numbers[0] + 1, self._sizes[0]))
     status = _read(lambda self: Status(self._numbers[1]))
-    message = _read(lambda self: _MESSAGE if self._numbers[1] & _SOLVER_FAILED else "")
     qps = _read(lambda self: self._numbers[2])
     solver_iterations = _read(lambda self: self._numbers[3])
     corrections = _read(lambda self: self._numbers[4])
     nearest_points = _read(lambda self: self._numbers[5])
     solve_time = math.nan  # C does not measure it
+
+    @_read
+    def message(self) -> str:
+        """Why the solver failed, and which rows no trajectory satisfies."""
+        return naming_missed(self._missed, _MESSAGE if self._numbers[1] & _SOLVER_FAILED else "")
 
     @_read
     def candidate(self) -> Array:

@@ -121,7 +121,8 @@ def _description(
             add(f"{label}[{j + 1}]", "Real", reference, causality, value, text)
             reference += 1
     for label, text in (
-        ("cost", "true cost of the estimate"), ("candidate_cost", "true cost of the candidate")
+        ("cost", "true cost of the estimate"), ("candidate_cost", "true cost of the candidate"),
+        ("restored_cost", "limit of the cost of a restored candidate; NaN for any other"),
     ):
         add(label, "Real", reference, "output", None, text)
         reference += 1

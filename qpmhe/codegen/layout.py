@@ -268,6 +268,7 @@ class Layout:
         """``mhe_estimate``."""
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
         rejected = [("rejected", np.uint8, self.sensors)] if self.sensors else []
+        missed = [("missed", np.uint8, self.rows)] if self.restores else []
         return _struct([
             ("cost", r), ("candidate_cost", r), ("restored_cost", r),
             ("trajectory", r, (count + 1, n)), ("candidate", r, (count + 1, n)),
@@ -275,7 +276,7 @@ class Layout:
             ("observer_state", r, n), ("filtered", r, n),
             ("time", np.int64), ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, self.rows), *rejected,
+            ("dropped", np.uint8, self.rows), *rejected, *missed,
         ])
 
     def set_type(self, name: str) -> np.dtype[Any]:
@@ -336,7 +337,7 @@ class Layout:
         return self.horizon + self.ends_with_rows, max(count, 1)
 
     def dropped_rows(self, sides: NDArray[np.uint8], first: int) -> tuple[DroppedRow, ...]:
-        """The rows in ``dropped`` of an estimate whose window starts at this time."""
+        """The rows in ``dropped`` or ``missed`` of an estimate whose window starts at this time."""
         found, start = [], 0
         counts = *self.set_rows, self.constraints
         for name, count in zip((*SET_NAMES, "constraints"), counts, strict=True):

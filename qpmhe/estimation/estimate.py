@@ -182,6 +182,22 @@ class DroppedRow(NamedTuple):
         return f"{self.side} bound of {self.set}, row {self.row}, at time {self.time}"
 
 
+# A message names so many missed rows.
+_NAMED = 6
+
+
+def naming_missed(rows: tuple[DroppedRow, ...], message: str) -> str:
+    """A message that first names the rows that no trajectory was found to satisfy, if any."""
+    if not rows:
+        return message
+    listed = [f"the {row}" for row in rows[:_NAMED]]
+    listed += [f"{len(rows) - _NAMED} more"] * (len(rows) > _NAMED)
+    return (
+        "no trajectory that satisfies all sets was found; the nearest to one misses "
+        f"{', '.join(listed)}. {message}"
+    ).strip()
+
+
 class Estimate:
     """The result of one `MovingHorizonEstimator.update`, after the measurement y(t).
 

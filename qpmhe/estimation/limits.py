@@ -70,12 +70,15 @@ LARGER = 0.99
 #: A correction is in the range of the disturbances if less than this share of it is not.
 IN_RANGE = 1e-12
 
+#: Powers of the discount below it are taken for it: stages without weight make the QP singular.
+LEAST_DISCOUNT = 1e-280
+
 #: A larger measurement counts as missing: its square would not be finite.
 LARGEST = 1e150
 
 _SINGLE = {
     "ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15, "SAME_COVARIANCE": 1e-4,
-    "IN_RANGE": 1e-4, "VAGUE": 2.0**-11,
+    "IN_RANGE": 1e-4, "VAGUE": 2.0**-11, "LEAST_DISCOUNT": 1e-27,
 }
 
 
@@ -88,6 +91,7 @@ def c_definitions(prefix: str, real: str) -> str:
         "IN_RANGE": IN_RANGE, "GROWTH": GROWTH, "VAGUE": VAGUE, "DAMPING": DAMPING,
         "MOST_DAMPING": MOST_DAMPING, "MORE_DAMPING": MORE_DAMPING,
         "LESS_DAMPING": LESS_DAMPING, "OLD_DAMPING": OLD_DAMPING, "TOWARDS": TOWARDS,
+        "LEAST_DISCOUNT": LEAST_DISCOUNT,
     }
     if real == "float":
         values |= _SINGLE

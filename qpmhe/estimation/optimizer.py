@@ -14,7 +14,7 @@ from qpmhe_solvers import QP, Solution, SolveStatus
 from qpmhe_solvers.solver import ContainedSolver
 
 from ..terms.base import Trial
-from .estimate import DroppedRow, Status
+from .estimate import DroppedRow, Status, naming_missed
 from .limits import (
     ALONG,
     CORRECTIONS,
@@ -48,9 +48,6 @@ _ENDS = (
 
 # What no longer holds where another sequence begins.
 _OUTDATED = Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED | Status.CAP_REACHED
-
-# A message names so many missed rows.
-_NAMED = 6
 
 
 class Outcome:
@@ -248,13 +245,7 @@ class Optimizer:
                 outcome.dropped = problem.missed_rows(outcome.trial)
                 if outcome.dropped:
                     outcome.events |= Status.ROWS_DROPPED
-        if missed:
-            listed = [f"the {row}" for row in missed[:_NAMED]]
-            listed += [f"{len(missed) - _NAMED} more"] * (len(missed) > _NAMED)
-            outcome.message = (
-                "no trajectory that satisfies all sets was found; the nearest to one misses "
-                f"{', '.join(listed)}. {outcome.message}"
-            ).strip()
+        outcome.message = naming_missed(missed, outcome.message)
 
     def _restore(
         self,

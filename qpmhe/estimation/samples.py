@@ -14,7 +14,7 @@ from ..memory.record import MemoryRecord
 from ..model.system import System
 from ..terms.linearization import StageTerms
 from .conditions import USUAL, Conditions
-from .limits import LARGEST
+from .limits import LARGEST, LEAST_DISCOUNT
 from .stages import StageView, Views, WindowArrays
 
 Array = NDArray[np.float64]
@@ -61,7 +61,8 @@ class WindowSamples(MemoryRecord):
         self._ones = np.ones(horizon)
         # gamma^N for the prior of a full window, then gamma^(N-1), ..., gamma^0 for its stages.
         self._discounts = (
-            cost.discount ** np.arange(horizon, -1, -1.0) if cost.discount < 1 else None
+            np.maximum(cost.discount ** np.arange(horizon, -1, -1.0), LEAST_DISCOUNT)
+            if cost.discount < 1 else None
         )
 
     @property
@@ -200,9 +201,7 @@ class WindowSamples(MemoryRecord):
         costs = view.costs
         if self._discounts is None:
             return float(costs.dot(self._ones[: costs.size]))
-        cost = float(costs.dot(self.discounts[1:]))
-        # NaN is 0 times infinity: a failed stage whose factor has underflowed.
-        return math.inf if math.isnan(cost) else cost
+        return float(costs.dot(self.discounts[1:]))
 
     @property
     def discounts(self) -> Array:

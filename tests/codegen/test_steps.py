@@ -119,6 +119,44 @@ def test_where_the_discount_underflows_a_failed_stage_costs_infinity():
             assert np.isinf(one.candidate_cost) == (Status.FAILED_STAGE in one.status)
 
 
+@pytest.mark.parametrize(("engine", "sets"), [("python", ""), ("python", "W"), ("compiled", "WV")])
+def test_where_the_discount_underflows_the_estimate_is_that_of_a_short_window(engine, sets):
+    """A sample of age 10 has a weight of 1e-20, one of age 163 none that a double can have."""
+    A = np.array([[0.9, 0.2], [-0.1, 0.8]])
+    options = {
+        "W": {"disturbances": qpmhe.Box([-np.inf, 0.0], [np.inf, 0.0])},
+        "V": {"noises": qpmhe.Box([-0.3], [0.3])},
+    }
+    system = qpmhe.System(
+        lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1,
+        **{key: value for one in sets for key, value in options[one].items()},
+    )
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=np.eye(2), disturbance=0.01 * np.eye(2), noise=[[0.04]], discount=0.01
+    )
+
+    def last(horizon):
+        made = [
+            qpmhe.MovingHorizonEstimator(
+                system, qpmhe.Luenberger([[0.3], [0.0]]), cost, horizon=horizon, max_qps=count,
+                initial_state=[1.0, 0.5], engine=engine,
+            )
+            for count in (0, 2)
+        ]
+        for y in Y[:-1]:
+            made[0].update(y)
+        made[1].load_state_dict(made[0].state_dict())
+        return made[1].update(Y[-1])
+
+    Y = np.random.default_rng(0).normal(0.0, 0.3, (181, 1))
+    short, found = last(10), last(170)
+    assert 0.01**163 == 0
+    assert Status.CONVERGED in found.status
+    assert Status.SOLVER_STOPPED not in found.status
+    assert found.cost == pytest.approx(short.cost, rel=1e-9)
+    np.testing.assert_allclose(found.filtered, short.filtered, rtol=1e-9)
+
+
 @pytest.mark.parametrize(("name", "where", "part"), [
     ("tank conditions", "compiled", "noise_weight"), ("tank conditions", "usual", "parameters"),
     ("extended prior", "window", "covariance"),

@@ -1,6 +1,7 @@
 """A candidate that is restored into the sets, against dense problems solved in other variables."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy.optimize import lsq_linear, minimize
 import qpmhe
 from qpmhe import Box, Status
 from qpmhe.codegen.compiler import find_compiler
+from qpmhe.estimation.limits import RESTORING
 from qpmhe.estimation.problem import Problem
 
 pytestmark = pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
@@ -198,6 +200,34 @@ def test_one_stage_whose_set_excludes_the_measured_rest(name, side, engine):
             "noises": estimate.noises,
         }[name]
         np.testing.assert_allclose(points[-1], side, atol=1e-6)
+
+
+@pytest.mark.parametrize("excluded", ["disturbances", "noises"])
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+def test_sets_that_exclude_each_other_are_named(excluded):
+    """Both steps name the same rows and stages, and go on within their caps."""
+    sets = {"states": Box([0.0], [1.0]), excluded: Box([5.0], [9.0])}
+    made = [
+        Linear(0.8, 1.0).estimator(sets, [0.1], [0.5], horizon=3, max_qps=3, engine=engine)
+        for engine in ("python", "compiled")
+    ]
+    for t, y in enumerate([0.5, 0.7, 0.3, 0.2]):
+        one, other = (mhe.update([y]) for mhe in made)
+        times = range(max(0, t - 2), t + 1)
+        rows = [f"the lower bound of {excluded}, row 0, at time {i}" for i in times]
+        assert one.message == other.message == (
+            "no trajectory that satisfies all sets was found; the nearest to one misses "
+            f"{', '.join(rows)}."
+        )
+        for found in (one, other, pickle.loads(pickle.dumps(other))):
+            assert Status.CANDIDATE_OUTSIDE in found.status
+            assert found.message in found.explain()
+            assert found.cost <= found.candidate_cost
+            assert found.qps <= 3
+            assert found.nearest_points <= 2 * RESTORING + 5 * (3 + 1)
+    made[1].reset([0.5])
+    if excluded == "noises":  # from here on they do not exclude each other
+        assert made[1].update([6.0]).message == ""
 
 
 @ENGINES

@@ -6,19 +6,13 @@
  *
  * to it. D is the diagonal of what prior and data say about d(0) where the disturbances are free. */
 
-/* Discounts below it are taken for it in a QP, whose Hessian is singular without them; the cost has
- * them as they are, and cannot tell. */
-#define LEAST_FACTOR (sizeof(real) == 8 ? (real)1e-280 : (real)1e-27)
-
-static real mhe_floored(real factor) { return factor < LEAST_FACTOR ? LEAST_FACTOR : factor; }
-
 /* Covariance of the disturbances of stage i, for the weights along the trajectory of the QP. */
 static void mhe_disturbance_covariance(mhe_estimator *e, const mhe_workspace *k, int i, real *spread)
 {
     enum { COUNT = MHE_FREE };
     const mhe_settings *s = e->settings;
     const real *Q = mhe_disturbance_weight(s, mhe_stage_at(e, i));
-    const real next = mhe_floored(k->factors[i + 1]);
+    const real next = k->factors[i + 1];
     real scaled[NX * NX], F[SIZE(NX * COUNT)], product[SIZE(NX * COUNT)];
     real weight[SIZE(COUNT * COUNT)], across[SIZE(COUNT * NX)];
     for (int r = 0; r < NX; r++)
@@ -49,7 +43,7 @@ static void mhe_set_seen(mhe_estimator *e, mhe_workspace *k)
     for (int i = e->length - 1; i >= 0; i--) {
         const mhe_stage *stage = mhe_stage_at(e, i);
         const real *A = k->at[i]->f_jacobian, *C = k->at[i]->h_jacobian;
-        const real next = mhe_floored(k->factors[i + 1]);
+        const real next = k->factors[i + 1];
         mhe_disturbance_covariance(e, k, i, spread);
         mhe_through_disturbance(NX, M, spread, root, moved, inner, later);
         for (int j = 0; j < NX * NX; j++) M[j] = 0;

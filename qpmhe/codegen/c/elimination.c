@@ -196,7 +196,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
 {
     const mhe_settings *s = e->settings;
     const int count = e->length;
-    const real factor = mhe_floored(k->factors[0]), *weight = k->prior.weight;
+    const real factor = k->factors[0], *weight = k->prior.weight;
     real scale[NX], first[NX * NX];
     mhe_set_scale(&s->prior_loss, 1, NX, weight, offset, scale);
     const real *root = mhe_root_of_prior(&k->prior);
@@ -216,7 +216,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     mhe_root(NX, first, k->prior_root);
     if (root) mhe_join_prior_root(root, factor, k->prior_root);
     for (int i = 0; i < count; i++) {
-        const real next = mhe_floored(k->factors[i + 1]);
+        const real next = k->factors[i + 1];
         const mhe_terms *t = k->at[i];
         for (int j = 0; j < NX; j++) {
             k->gradient[i * NX + j] += next * t->own[j];
@@ -296,7 +296,7 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
         const mhe_block *later = b + 1;
         b->count = b->rank = b->free = b->inequalities = 0;
         if (i < count) {
-            const real *A = k->at[i]->f_jacobian, next = sqrt(mhe_floored(k->factors[i + 1]));
+            const real *A = k->at[i]->f_jacobian, next = sqrt(k->factors[i + 1]);
             const mhe_stage *stage = mhe_stage_at(e, i);
             real *root = k->free_roots + i * SIZE(MHE_FREE * MHE_FREE);
             real *noise = k->noise_roots + i * NY * NY;
@@ -381,7 +381,7 @@ static void mhe_set_targets(mhe_estimator *e, mhe_workspace *k, const real *step
     for (int i = 0; i < e->length; i++) {
         const mhe_terms *t = k->at[i];
         const real *Q = mhe_disturbance_weight(s, mhe_stage_at(e, i));
-        const real *own = step + i * NX, next = mhe_floored(k->factors[i + 1]);
+        const real *own = step + i * NX, next = k->factors[i + 1];
         real *drift = k->drift + i * NX, *target = k->targets + i * (MHE_FREE + NY);
         real w[NX], v[NY], moved[NX], free_part[SIZE(MHE_FREE)], weighed[NX];
         for (int j = 0; j < NX; j++) {

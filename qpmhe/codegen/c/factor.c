@@ -95,7 +95,7 @@ static void mhe_damp(mhe_estimator *e, mhe_workspace *k)
     for (int i = 0; i < e->length; i++) {
         const mhe_terms *t = k->at[i];
         const real *Q = mhe_disturbance_weight(e->settings, mhe_stage_at(e, i));
-        const real share = mu * mhe_floored(k->factors[i + 1]);
+        const real share = mu * k->factors[i + 1];
         real *panel = k->panels + i * NX * WIDTH, *next = panel + NX * WIDTH;
         for (int r = 0; r < NX; r++) {
             real *row = panel + r * WIDTH;
@@ -123,7 +123,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         const real *weight = i == 0 ? k->prior.weight
                                     : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
         const real *scale = i == 0 ? prior_scale : k->at[i - 1]->disturbance_scale;
-        const real factor = mhe_floored(factors[i]);
+        const real factor = factors[i];
         for (int r = 0; r < NX; r++) {
             real *row = panel + r * WIDTH;
             const real scaled = mhe_scaled(factor, scale, r);
@@ -140,7 +140,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
         }
         if (i == count) break;
         const mhe_terms *t = k->at[i];
-        const real next = mhe_floored(factors[i + 1]);
+        const real next = factors[i + 1];
         for (int r = 0; r < NX; r++) {
             real *row = panel + r * WIDTH;
             for (int c = 0; c < NX; c++) {
@@ -156,7 +156,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
                                     : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
         for (int r = 0; r < NX; r++) {
             real *pivot = k->panels + (i * NX + r) * WIDTH + r;
-            *pivot += RIDGE * *pivot + EPSILON * mhe_floored(factors[i]) * weight[r * NX + r];
+            *pivot += RIDGE * *pivot + EPSILON * factors[i] * weight[r * NX + r];
         }
     }
 }

@@ -43,7 +43,8 @@ typedef struct {
 /* Value references, in the order of modelDescription.xml. */
 enum {
     INITIAL = 0, Y = INITIAL + MHE_NX, U = Y + MHE_NY, STATE = U + MHE_NU,
-    FILTERED = STATE + MHE_NX, COST = FILTERED + MHE_NX, CANDIDATE_COST, REALS,
+    FILTERED = STATE + MHE_NX, COST = FILTERED + MHE_NX, CANDIDATE_COST, RESTORED_COST,
+    REALS,
     STATUS = 0, QPS, INTEGERS
 };
 
@@ -206,6 +207,7 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2
     }
     m->reals[COST] = m->estimate.cost;
     m->reals[CANDIDATE_COST] = m->estimate.candidate_cost;
+    m->reals[RESTORED_COST] = m->estimate.restored_cost;
     m->integers[STATUS] = m->estimate.status;
     m->integers[QPS] = m->estimate.qps;
     return fmi2OK;

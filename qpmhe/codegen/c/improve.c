@@ -13,8 +13,6 @@ static void mhe_set_candidate(mhe_estimator *e, mhe_workspace *k, mhe_trial *tri
         memcpy(trial->v + i * NY, stage->v, sizeof stage->v);
         trial->cost += k->factors[i + 1] * stage->cost;
     }
-    /* No cost is NaN, but 0 times infinity is where a discount underflows. */
-    if (isnan(trial->cost)) trial->cost = INFINITY;
     memcpy(trial->x + count * NX, e->z_end, sizeof e->z_end);
     mhe_set_values(e, trial);
     trial->cost += mhe_further_cost(e, k, trial);
@@ -30,7 +28,7 @@ static void mhe_improve(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     real factor = 1;
     for (int i = e->length; i > 0; i--) {
         k->factors[i] = factor;
-        factor *= s->discount;
+        factor = mhe_max(factor * s->discount, MHE_LEAST_DISCOUNT);
     }
     k->factors[0] = factor;
     mhe_set_prior(e, k);

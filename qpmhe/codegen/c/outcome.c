@@ -9,6 +9,7 @@ typedef struct {
     mhe_trial *candidate, *best, *spare, *other; /* best may be the candidate */
     int outside; /* the candidate misses rows: as a trial, it has no finite cost */
     int events, qps, iterations, corrections, nearest_points, rows_dropped;
+    int unreached;  /* no trajectory in the sets is known, and the missed rows are to be named */
     int unsolved;   /* the last QPs that were not solved to the tolerance */
     int followed;   /* the next step starts from a surrogate's minimiser */
     real restored_cost; /* of the trajectory into which the candidate was restored */

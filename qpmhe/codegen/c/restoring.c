@@ -1,5 +1,12 @@
 /* A candidate outside of the sets that is restored into them, whatever that costs. */
 
+@mhe_estimate
+    /* As `dropped`: sides that the nearest trajectory to the candidate misses, where none is in the sets. */
+    uint8_t missed[MHE_ROWS];
+@mhe_workspace
+    uint8_t missed[MHE_ROWS];
+@
+
 /* Approach the sets from a trial, by QPs in the metric of the Hessian, with shorter steps where a full
  * one does not lower the miss; the last trial on the way. */
 static mhe_trial *mhe_approach(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
@@ -24,6 +31,23 @@ static mhe_trial *mhe_approach(mhe_estimator *e, mhe_workspace *k, mhe_outcome *
     return around;
 }
 
+/* Note the sides that a trial misses. */
+static void mhe_note_missed(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o,
+                            const mhe_trial *trial)
+{
+    const real *w = trial == o->candidate ? mhe_candidate_disturbances(e, k) : trial->w;
+    memset(k->missed, 0, sizeof k->missed);
+    mhe_violation(e, trial, w, 0, k->missed);
+}
+
+static void mhe_fill_missed(const mhe_workspace *k, const mhe_outcome *o, mhe_estimate *out)
+{
+    if (o->unreached)
+        memcpy(out->missed, k->missed, sizeof out->missed);
+    else
+        memset(out->missed, 0, sizeof out->missed);
+}
+
 /* Improve the nearest feasible trajectory to the candidate; whether there is one. `nearest`: the cost of
  * that which the search has started from, infinite if there is none. */
 static int mhe_enter_sets(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real nearest, int before)
@@ -33,16 +57,20 @@ static int mhe_enter_sets(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, re
     mhe_trial *trial = o->candidate;
     if (!isfinite(nearest)) trial = mhe_approach(e, k, o, trial);
     if (trial == o->candidate || !isfinite(trial->cost)) {
+        const real missed = trial->violation;
+        mhe_note_missed(e, k, o, trial);
         trial = 0;
         if (!isfinite(nearest) && !isfinite(found) && before >= 0) {
             mhe_shift(e, k, o, before);
             trial = mhe_approach(e, k, o, o->spare);
+            if (trial->violation < missed) mhe_note_missed(e, k, o, trial);
             if (!isfinite(trial->cost)) trial = 0;
         }
     }
     if (trial) nearest = trial->cost;
     if (!isfinite(nearest)) nearest = found;
-    if (!isfinite(nearest)) return 0;
+    o->unreached = !isfinite(nearest);
+    if (o->unreached) return 0;
     o->restored_cost = nearest;
     o->events |= MHE_RESTORED;
     if (nearest <= found) {

@@ -22,6 +22,11 @@ static void mhe_fill_dropped(const mhe_workspace *k, int rows_dropped, mhe_estim
     (void)k; (void)rows_dropped; (void)out;
 }
 
+static void mhe_fill_missed(const mhe_workspace *k, const mhe_outcome *o, mhe_estimate *out)
+{
+    (void)k; (void)o; (void)out;
+}
+
 static int mhe_try_curved(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real target,
                           int useless)
 {

@@ -99,6 +99,7 @@ static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome
     mhe_filtered(e, o, out->filtered);
     mhe_fill_sensors(e, out);
     mhe_fill_dropped(k, o->rows_dropped, out);
+    mhe_fill_missed(k, o, out);
     (void)k;
 }
 
