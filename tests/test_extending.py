@@ -37,10 +37,10 @@ import qpmhe
 class PseudoHuber(qpmhe.Loss):
     "2 (sqrt(1 + q) - 1): quadratic near zero, and linear far away."
 
-    def _value(self, q):
+    def value(self, q):
         return 2.0 * (np.sqrt(1.0 + q) - 1.0)
 
-    def _slope(self, q):
+    def slope(self, q):
         return 1.0 / np.sqrt(1.0 + q)
 """
 BACKEND = """

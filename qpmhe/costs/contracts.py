@@ -58,7 +58,7 @@ def check_loss(loss: Loss) -> None:
     q = forms if loss.per_component else forms[:, 0]
     form = loss.c_form
     if form is not None and form.kind == "own":  # with its own `cost` it may need neither
-        for method in ("_value", "_slope"):
+        for method in ("value", "slope"):
             _not_negative(loss, method, _called(loss, method, q), shape)
     _not_negative(loss, "cost", _called(loss, "cost", residuals, loss.weight), (count,))
     found = _called(loss, "majorise", residuals, loss.weight)

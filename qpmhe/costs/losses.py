@@ -20,6 +20,8 @@ _STEP = float(np.finfo(np.float64).eps) ** (1 / 3)
 class Loss(ABC):
     r"""An increasing function :math:`\rho(q)` of the form :math:`q = s^\top W s`.
 
+    A loss of your own has `value` and `slope`. The form q has no unit: it counts variances.
+
     Parameters
     ----------
     weight : (d, d) array_like
@@ -71,15 +73,15 @@ class Loss(ABC):
         return LossForm("own", 0.0, self.per_component, self._value_and_slope, self.graduation)
 
     def _value_and_slope(self, q: Array) -> Array:
-        return np.stack((self._value(q), self._slope(q)))
+        return np.stack((self.value(q), self.slope(q)))
 
     @abstractmethod
-    def _value(self, q: Array) -> Array:
-        """rho(q)."""
+    def value(self, q: Array) -> Array:
+        r""":math:`\rho(q) \ge 0` for an array of forms q of any shape, entry by entry."""
 
     @abstractmethod
-    def _slope(self, q: Array) -> Array:
-        """rho'(q), the factor that turns W into the weight of the majorising form."""
+    def slope(self, q: Array) -> Array:
+        r""":math:`\rho'(q) \ge 0`, likewise: it turns W into the weight of the majorising form."""
 
     def cost(self, s: Array, weight: Array) -> Array:
         """The loss of each row of s, (K, d), for one weight of all or of each.
@@ -91,18 +93,18 @@ class Loss(ABC):
             weight = weight / self._widening
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
-            value: Array = np.sum(self._value(diagonal * s * s), axis=-1)
+            value: Array = np.sum(self.value(diagonal * s * s), axis=-1)
         else:
-            value = self._value(quadratic_form(s, weight))
+            value = self.value(quadratic_form(s, weight))
         return value if self._widening == 1.0 else self._widening * value
 
     def majorise(self, s: Array, weight: Array) -> Array:
         """Weights (K, d, d) of quadratic forms that touch the loss at each row s; see `cost`."""
         if self.per_component:
             diagonal = np.diagonal(weight, axis1=-2, axis2=-1)
-            scaled = diagonal * self._slope(diagonal * s * s / self._widening)
+            scaled = diagonal * self.slope(diagonal * s * s / self._widening)
             return scaled[:, :, None] * np.eye(s.shape[1])
-        slope = self._slope(quadratic_form(s, weight) / self._widening)
+        slope = self.slope(quadratic_form(s, weight) / self._widening)
         return slope[:, None, None] * weight
 
     def widened(self, factor: float) -> Loss:
@@ -148,18 +150,18 @@ class Loss(ABC):
         ):
             raise InvalidInputError(
                 f"{type(self).__name__} overrides its cost, so its second derivatives are not "
-                "known; write it as a function of the quadratic form, with _value and _slope, or "
+                "known; write it as a function of the quadratic form, with value and slope, or "
                 "use qpmhe.Huber or qpmhe.Power."
             )
         weighted = np.matmul(weight, s[:, :, None])[:, :, 0]
         form = s * weighted if self.per_component else np.einsum("ki,ki->k", s, weighted)
-        return self._slope(form), self._curvature(form), weighted
+        return self.slope(form), self.curvature(form), weighted
 
-    def _curvature(self, q: Array) -> Array:
-        """rho''(q), by differences unless a loss knows better; forms have no unit."""
+    def curvature(self, q: Array) -> Array:
+        r""":math:`\rho''(q)`, likewise; by differences of `slope` unless a loss knows better."""
         step = _STEP * np.maximum(q, 1.0)
         below = np.maximum(q - step, 0.0)
-        return np.asarray((self._slope(q + step) - self._slope(below)) / (q + step - below))
+        return np.asarray((self.slope(q + step) - self.slope(below)) / (q + step - below))
 
     def constants(self) -> tuple[float, float] | None:
         """Constants c, C with c |s|^a <= loss(s) <= C |s|^a; None if there are none."""
@@ -187,13 +189,16 @@ class Quadratic(Loss):
         """See `Loss.c_form`."""
         return LossForm() if type(self) is Quadratic else super().c_form
 
-    def _value(self, q: Array) -> Array:
+    def value(self, q: Array) -> Array:
+        """See `Loss.value`."""
         return q
 
-    def _slope(self, q: Array) -> Array:
+    def slope(self, q: Array) -> Array:
+        """See `Loss.slope`."""
         return np.ones_like(q)
 
-    def _curvature(self, q: Array) -> Array:
+    def curvature(self, q: Array) -> Array:
+        """See `Loss.curvature`."""
         return np.zeros_like(q)
 
 
@@ -232,14 +237,17 @@ class Huber(Loss):
             return super().c_form
         return LossForm("huber", self.threshold, self.per_component)
 
-    def _value(self, q: Array) -> Array:
+    def value(self, q: Array) -> Array:
+        """See `Loss.value`."""
         k = self.threshold
         return np.where(q <= k * k, q, 2.0 * k * np.sqrt(q) - k * k)
 
-    def _slope(self, q: Array) -> Array:
+    def slope(self, q: Array) -> Array:
+        """See `Loss.slope`."""
         return np.minimum(1.0, self.threshold / np.sqrt(np.maximum(q, self.threshold**2)))
 
-    def _curvature(self, q: Array) -> Array:
+    def curvature(self, q: Array) -> Array:
+        """See `Loss.curvature`."""
         k = self.threshold
         return np.where(q <= k * k, 0.0, -0.5 * k * np.maximum(q, k * k) ** -1.5)
 
@@ -277,13 +285,16 @@ class Power(Loss):
             return super().c_form
         return LossForm("power", self.exponent, self.per_component)
 
-    def _value(self, q: Array) -> Array:
+    def value(self, q: Array) -> Array:
+        """See `Loss.value`."""
         return q ** (0.5 * self.exponent)
 
-    def _slope(self, q: Array) -> Array:
+    def slope(self, q: Array) -> Array:
+        """See `Loss.slope`."""
         return 0.5 * self.exponent * np.maximum(q, 1e-8) ** (0.5 * self.exponent - 1.0)
 
-    def _curvature(self, q: Array) -> Array:
+    def curvature(self, q: Array) -> Array:
+        """See `Loss.curvature`."""
         half = 0.5 * self.exponent
         return np.where(q < 1e-8, 0.0, half * (half - 1.0) * np.maximum(q, 1e-8) ** (half - 2.0))
 
@@ -352,7 +363,8 @@ class Barron(Loss):
                 "factor for a shape below 1; other losses are convex and need no graduation."
             )
 
-    def _value(self, q: Array) -> Array:
+    def value(self, q: Array) -> Array:
+        """See `Loss.value`."""
         alpha, square = self.shape, self.threshold**2
         if alpha == 2.0:
             return q
@@ -364,7 +376,8 @@ class Barron(Loss):
         exponent = 0.5 * alpha * np.log1p(q / (square * width))
         return (2.0 * square * width / alpha) * np.expm1(exponent)
 
-    def _slope(self, q: Array) -> Array:
+    def slope(self, q: Array) -> Array:
+        """See `Loss.slope`."""
         alpha, square = self.shape, self.threshold**2
         if alpha == 2.0:
             return np.ones_like(q)
@@ -372,7 +385,8 @@ class Barron(Loss):
             return np.exp(-q / (2.0 * square))
         return np.exp((0.5 * alpha - 1.0) * np.log1p(q / (square * (2.0 - alpha))))
 
-    def _curvature(self, q: Array) -> Array:
+    def curvature(self, q: Array) -> Array:
+        """See `Loss.curvature`."""
         alpha, square = self.shape, self.threshold**2
         if alpha == 2.0:
             return np.zeros_like(q)

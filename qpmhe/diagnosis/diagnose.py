@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from html import escape
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -66,6 +67,16 @@ class Diagnosis(Examination):
         count = len(self.findings)
         head = f"{count} finding{'s' * (count != 1)}" if count else "No fault was found"
         return f"{head} in {len(self.run)} samples."
+
+    def __repr__(self) -> str:
+        found = ", ".join(one.kind for one in self.findings)
+        return f"Diagnosis({self.verdict.rstrip('.')}{f': {found}' if found else ''})"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self.verdict)}</p>" + "".join(
+            f"<{tag}>{''.join(f'<li>{escape(str(one))}</li>' for one in group)}</{tag}>"
+            for tag, group in (("ol", self.findings), ("ul", self.notes)) if group
+        )
 
     def __str__(self) -> str:
         lines = [self.verdict]

@@ -168,7 +168,8 @@ class Study:
 
     def __post_init__(self) -> None:
         for name, check in _CHECKS.items():
-            object.__setattr__(self, name, check(getattr(self, name)))
+            if name != "backends":
+                object.__setattr__(self, name, check(getattr(self, name)))
         if not (self.folder is None or isinstance(self.folder, (str, Path))):
             raise StudyError(
                 f"folder is {shown(self.folder)}; expected the name of a folder, or None."
@@ -186,6 +187,8 @@ class Study:
         )
         for source in sources:
             experiment(source)
+        # A model's file may register backends of its own.
+        object.__setattr__(self, "backends", _backends(self.backends))
         object.__setattr__(self, "sources", sources)
         assert isinstance(self.estimators, Mapping)
         named = {
@@ -236,7 +239,9 @@ class Study:
             )
         options = {key: _translated(key, value) for key, value in found.items()}
         data = {key: value for key, value in options.items() if key in _DATA}
-        for key, value in options.items():  # one by one, so that the error names the line
+        # One by one, so that the error names the line; models first, which may register backends.
+        for key in sorted(options, key=lambda key: key not in _DATA):
+            value = options[key]
             try:
                 for name in _models(value) if key == "models" else ():
                     check_named_in_file(name, path.parent)
@@ -244,7 +249,9 @@ class Study:
                     names = _CHECKS[key](value)
                     for name in names.values() if isinstance(names, dict) else names:
                         check_named_in_file(name, path.parent, key[:-1], _RETURNS[key])
-                cls(**(data if key in _DATA else {key: value}), folder=path.parent)
+                alone = {} if key in _DATA else {key: value}
+                known = data if key in _DATA or key == "backends" else {}
+                cls(**known, **alone, folder=path.parent)
             except InvalidInputError as error:
                 words = str(error)
                 if key in _DATA and data.keys() & {"records"} and not isinstance(error, ModelError):

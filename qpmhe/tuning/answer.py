@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from html import escape
 from itertools import product
 from pathlib import Path
 from time import perf_counter
@@ -381,33 +382,58 @@ class Tuning:
             [one[mask] for one, mask in zip(samples, self._judged, strict=True)]
         )))
 
+    def __repr__(self) -> str:
+        start = self.start
+        values = [f"{name}: {start[name]:.4g} -> {one:.4g}" for name, one in self.values.items()]
+        return f"Tuning({', '.join(values)})"
+
     def __str__(self) -> str:
         from rich.console import Console
 
-        weights = [
-            (name, f"{self.start[name]:.4g}", f"{value:.4g}",
-             " to ".join(f"{end:.3g}" for end in self.intervals.get(name, ())))
-            for name, value in self.values.items()
-        ]
-        scores = [(name, f"{a:.4g}", f"{b:.4g}") for name, (a, b) in self.scores.items()]
-        title = "Weights, as standard deviations"
-        title += " and correlations" * bool(self._structure.correlations)
         console = Console(file=io.StringIO(), width=110, no_color=True)
-        for heading, last, rows in (
-            (title, ["95 % interval"], weights),
-            (f"Scores on {self._judges}, less is better", [], scores),
-        ):
+        for heading, last, rows in self._tables():
             console.print(_table(heading, ["", "before", "after", *last], rows))
             console.print()
-        for text in (
-            f"Chosen {self.judgement}", *([self.innovations.text] if self.innovations else []),
-            *(f"Not identified: {one}" for one in self.unidentified),
-            *(f"Note: {one}" for one in self.notes),
-        ):
+        for text in self._texts():
             console.print(text, highlight=False, markup=False)
         file = console.file
         assert isinstance(file, io.StringIO)
         return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
+
+    def _repr_html_(self) -> str:
+        def row(cells: Iterable[str], tag: str = "td") -> str:
+            return f"<tr>{''.join(f'<{tag}>{escape(one)}</{tag}>' for one in cells)}</tr>"
+
+        tables = (
+            f"<table><caption>{escape(heading)}</caption>"
+            f"{row(['', 'before', 'after', *last], 'th')}{''.join(map(row, rows))}</table>"
+            for heading, last, rows in self._tables()
+        )
+        return "".join(tables) + "".join(f"<p>{escape(one)}</p>" for one in self._texts())
+
+    def _tables(self) -> list[tuple[str, list[str], list[tuple[str, ...]]]]:
+        """Heading, last columns' headings and rows of each table."""
+        weights: list[tuple[str, ...]] = [
+            (name, f"{self.start[name]:.4g}", f"{value:.4g}",
+             " to ".join(f"{end:.3g}" for end in self.intervals.get(name, ())))
+            for name, value in self.values.items()
+        ]
+        scores: list[tuple[str, ...]] = [
+            (name, f"{a:.4g}", f"{b:.4g}") for name, (a, b) in self.scores.items()
+        ]
+        title = "Weights, as standard deviations"
+        title += " and correlations" * bool(self._structure.correlations)
+        return [
+            (title, ["95 % interval"], weights),
+            (f"Scores on {self._judges}, less is better", [], scores),
+        ]
+
+    def _texts(self) -> list[str]:
+        return [
+            f"Chosen {self.judgement}", *([self.innovations.text] if self.innovations else []),
+            *(f"Not identified: {one}" for one in self.unidentified),
+            *(f"Note: {one}" for one in self.notes),
+        ]
 
     def plot(self, axes: Any = None) -> Any:
         """Draw how each value has changed with its interval, and the held-out scores.

@@ -87,7 +87,9 @@ def backend(name: str) -> Backend:
     found = _REGISTRY.get(name) if isinstance(name, str) else None
     if found is None:
         raise BackendError(
-            f"backend {shown(name)} is not known; expected one of {', '.join(_REGISTRY)}."
+            f"backend {shown(name)} is not known; expected one of {', '.join(_REGISTRY)}. Your "
+            "own must be registered before, by qpmhe.solvers.register(...); on the command line, "
+            "by the model's file."
         )
     return found
 

@@ -459,10 +459,10 @@ def _steady(one):
 class PseudoHuber(qpmhe.Loss):
     """Quadratic near zero, and linear far away."""
 
-    def _value(self, q):
+    def value(self, q):
         return 2.0 * (np.sqrt(1.0 + q) - 1.0)
 
-    def _slope(self, q):
+    def slope(self, q):
         return 1.0 / np.sqrt(1.0 + q)
 
 

@@ -1,6 +1,7 @@
 """A diagnosis names the fault that was planted, and none in a healthy run."""
 
 import sys
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,11 @@ def named(kind, case):
     if first is None or kind not in (first.kind, *first.equals):
         return str(found)
     assert str(found).splitlines()[1].startswith("1. ")
+    assert repr(found).startswith(f"Diagnosis({len(found.findings)} finding")
+    assert found.findings[0].kind in repr(found)
+    page = found._repr_html_()
+    assert page.count("<li>") == len(found.findings) + len(found.notes)
+    assert escape(found.findings[0].text) in page
     assert first.remedy
     return ""
 

@@ -113,10 +113,10 @@ class OwnLoss(qpmhe.Loss):
         super().__init__(NOISE, **options)
         self.value, self.slope = value, slope
 
-    def _value(self, q):
+    def value(self, q):
         return self.value(q)
 
-    def _slope(self, q):
+    def slope(self, q):
         return self.slope(q)
 
 
@@ -128,13 +128,13 @@ def robust(loss):
 @pytest.mark.parametrize(
     ("value", "slope", "found"),
     [
-        (lambda q: q, lambda q: -np.ones_like(q), r"_slope returned -1 .* at least 0"),
-        (lambda q: -q, np.ones_like, r"_value returned -10000 .* at least 0"),
-        (lambda q: 1.0, np.ones_like, r"_value returned shape \(\)"),
-        (lambda q: q, lambda q: 1.0, r"_slope returned shape \(\)"),
-        (lambda q: np.sum(q), np.ones_like, r"_value returned shape \(\)"),
-        (lambda q: q * np.nan, np.ones_like, "_value returned nan"),
-        (lambda q: q.nothing, np.ones_like, "_value raised AttributeError"),
+        (lambda q: q, lambda q: -np.ones_like(q), r"slope returned -1 .* at least 0"),
+        (lambda q: -q, np.ones_like, r"value returned -10000 .* at least 0"),
+        (lambda q: 1.0, np.ones_like, r"value returned shape \(\)"),
+        (lambda q: q, lambda q: 1.0, r"slope returned shape \(\)"),
+        (lambda q: np.sum(q), np.ones_like, r"value returned shape \(\)"),
+        (lambda q: q * np.nan, np.ones_like, "value returned nan"),
+        (lambda q: q.nothing, np.ones_like, "value raised AttributeError"),
     ],
 )
 def test_a_wrong_loss_is_refused_by_name(value, slope, found, per_component):

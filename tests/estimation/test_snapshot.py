@@ -309,11 +309,11 @@ class Ramp(qpmhe.Loss):
 
     bend = 1.0
 
-    def _value(self, q):
+    def value(self, q):
         bend = type(self).bend
         return np.where(q < bend, q, 2.0 * np.sqrt(bend * q) - bend)
 
-    def _slope(self, q):
+    def slope(self, q):
         bend = type(self).bend
         return np.where(q < bend, 1.0, np.sqrt(bend / np.maximum(q, 1e-9)))
 

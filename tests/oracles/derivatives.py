@@ -172,10 +172,10 @@ def close(found, expected, what=None, accuracy=ACCURACY):
 class PseudoHuber(qpmhe.Loss):
     """A user's loss: its second derivative is found by differences."""
 
-    def _value(self, q):
+    def value(self, q):
         return 2.0 * (np.sqrt(1.0 + q) - 1.0)
 
-    def _slope(self, q):
+    def slope(self, q):
         return 1.0 / np.sqrt(1.0 + q)
 
 

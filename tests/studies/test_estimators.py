@@ -204,3 +204,29 @@ def test_what_does_not_fit_is_refused(folder):
     study = Study(qps=[0], estimators=["ekf(iterations=0)"], **SMALL | {"seeds": 1})
     row = computed(study)[-1]
     assert "estimator 'ekf(iterations=0)' cannot be made: iterations is 0" in row.reason
+
+
+def test_a_models_file_registers_a_backend(folder):
+    (folder / "model.py").write_text(
+        "import qpmhe\nfrom qpmhe.models import batch_reactor\n"
+        "from qpmhe_solvers.banded import BandedSolver\n"
+        "qpmhe.solvers.register(qpmhe.solvers.Backend('of_a_file', BandedSolver, 'Cholesky',\n"
+        "                                             inequalities=False))\n"
+        "def make():\n    return batch_reactor()\n"
+    )
+    file = folder / "study.toml"
+    file.write_text('backends = ["of_a_file"]\nmodels = ["model.py:make"]\nseeds = 1\nqps = 1\n')
+    with pytest.raises(StudyError, match=r"line 1: backend 'of_a_file' is not known.*model's file"):
+        Study.from_toml(_without_models(file))
+    try:
+        study = Study.from_toml(file)
+        assert study.backends == ("of_a_file",)
+        assert len(study.cells()) == 1
+    finally:
+        qpmhe.solvers.unregister("of_a_file")
+
+
+def _without_models(file):
+    other = file.with_name("other.toml")
+    other.write_text(file.read_text().replace('models = ["model.py:make"]\n', ""))
+    return other

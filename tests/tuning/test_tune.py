@@ -71,6 +71,14 @@ def test_known_covariances_are_within_the_intervals_of_a_table():
     before, after = tuning.scores["negative log likelihood per sample"]
     assert after < before
     text = str(tuning)
+    assert repr(tuning).startswith("Tuning(")
+    assert "\n" not in repr(tuning)
+    page = tuning._repr_html_()
+    for name, value in tuning.values.items():
+        assert f"{name}: " in repr(tuning)
+        assert f"<td>{name}</td>" in page
+        assert f"<td>{value:.4g}</td>" in page
+    assert page.count("<table>") == page.count("</table>") == 2
     for part in ("95 % interval", "disturbance x2", "held-out blocks", "Chosen by the likelihood"):
         assert part in text
     left, right = tuning.plot()
