@@ -11,12 +11,16 @@ from numpy.typing import ArrayLike
 from .._checks import Array, positive
 from ..errors import InvalidInputError
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
-from .style import PROVED, REAL, STYLES, line_styles, panels, run_times, time_words
+from .style import PROVED, REAL, STYLES, date_axis, line_styles, panels, run_times, time_words
 
 if TYPE_CHECKING:
     from ..estimation.estimate import Estimate
     from ..estimation.run import Run
     from ..model.residuals import Residual
+
+
+# Samples times points of a line's width.
+_WIDE = 600.0
 
 
 def trajectories(
@@ -113,13 +117,16 @@ def states(
     sigmas = positive("sigmas", sigmas)
     lines = {"estimate": run.states} | ({} if guarded is None else {"guarded": guarded})
     drawn = trajectories(times, truth, lines, _names(labels, n), when, axes, residual=residual)
+    date_axis(run, dt, drawn[-1])
     if run.covariances is not None and len(run):
         half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
         for j, panel in enumerate(drawn):
+            # A line of the usual width hides the band where samples stand close.
+            panel.lines[-len(lines)].set_linewidth(max(0.5, min(1.3, _WIDE / count)))
             middle = panel.lines[-len(lines)].get_ydata()[1:]
             panel.fill_between(
                 times[1:], middle - half[:, j], middle + half[:, j],
-                color=STYLES[0]["color"], alpha=0.18, linewidth=0.0,
+                color=STYLES[0]["color"], alpha=0.35, linewidth=0.0,
                 label=f"± {sigmas:g} standard deviations",
             )
     if band is not None:
