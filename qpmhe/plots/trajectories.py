@@ -118,17 +118,7 @@ def states(
     lines = {"estimate": run.states} | ({} if guarded is None else {"guarded": guarded})
     drawn = trajectories(times, truth, lines, _names(labels, n), when, axes, residual=residual)
     date_axis(run, dt, drawn[-1])
-    if run.covariances is not None and len(run):
-        half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
-        for j, panel in enumerate(drawn):
-            # A line of the usual width hides the band where samples stand close.
-            panel.lines[-len(lines)].set_linewidth(max(0.5, min(1.3, _WIDE / count)))
-            middle = panel.lines[-len(lines)].get_ydata()[1:]
-            panel.fill_between(
-                times[1:], middle - half[:, j], middle + half[:, j],
-                color=STYLES[0]["color"], alpha=0.35, linewidth=0.0,
-                label=f"± {sigmas:g} standard deviations",
-            )
+    add_bands(run, times, [panel.lines[-len(lines)] for panel in drawn], sigmas)
     if band is not None:
         lower, upper = (
             curve(f"band[{side}]", values, count, n) for side, values in enumerate(_pair(band))
@@ -142,6 +132,23 @@ def states(
     if band is not None or (run.covariances is not None and len(run)):
         _legend(drawn, axes)
     return drawn
+
+
+def add_bands(run: Run, times: Array, lines: Sequence[Any], sigmas: float) -> None:
+    """Fill between so many standard deviations about the lines of the first states."""
+    if run.covariances is None or not len(run):
+        return
+    with np.errstate(invalid="ignore"):
+        half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
+    for j, line in enumerate(lines):
+        # A line of the usual width hides the band where samples stand close.
+        line.set_linewidth(max(0.5, min(1.3, _WIDE / len(run))))
+        middle = line.get_ydata()[1:]
+        line.axes.fill_between(
+            times[1:], middle - half[:, j], middle + half[:, j],
+            color=STYLES[0]["color"], alpha=0.35, linewidth=0.0,
+            label=f"± {sigmas:g} standard deviations",
+        )
 
 
 def _pair(band: Any) -> tuple[ArrayLike, ArrayLike]:
