@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from .steps import costs
 from .style import LIGHT, run_times
-from .trajectories import add_bands, trajectories
+from .trajectories import add_bands, run_labels, trajectories
 
 if TYPE_CHECKING:
     from ..estimation.run import Run
@@ -38,7 +38,7 @@ def run_page(run: Run) -> str:
         times = run_times(run, None, None)[0]
         trajectories(
             times, None, {"estimate": run.states[:, :count]},
-            [f"x{i + 1}" for i in range(count)], "", panels[:-1],
+            run_labels(run)[:count], "", panels[:-1],
         )
         add_bands(run, times, [panel.lines[0] for panel in panels[:-1]], 2.0)
         costs(run, axes=panels[-1])

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from io import StringIO
 from os import PathLike
 from pathlib import Path
@@ -93,9 +94,8 @@ def run_times(
     """
     source, count = run.source, len(run)
     if _has_dates(run, dt):
-        from matplotlib.dates import date2num
-
-        return np.asarray(date2num(run.index), np.float64), time_label or ""
+        dates: Any = import_module("matplotlib.dates")
+        return np.asarray(dates.date2num(run.index), np.float64), time_label or ""
     if dt is None and source is not None:
         dt = source.system.dt
         if source.steps is not None:
@@ -113,12 +113,11 @@ def _has_dates(run: Run, dt: float | None) -> bool:
 def date_axis(run: Run, dt: float | None, panel: Any) -> None:
     """Label the times of `run_times` as dates, where they are, in the zone of the run's index."""
     if _has_dates(run, dt):
-        from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
-
+        dates: Any = import_module("matplotlib.dates")
         zone = run.index.tz  # type: ignore[union-attr]
-        locator = AutoDateLocator(tz=zone, minticks=3)
+        locator = dates.AutoDateLocator(tz=zone, minticks=3)
         panel.xaxis.set_major_locator(locator)
-        panel.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=zone))
+        panel.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator, tz=zone))
 
 
 def time_words(dt: float | None) -> str:

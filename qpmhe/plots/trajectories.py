@@ -92,7 +92,8 @@ def states(
     time_label : str, optional
         Label of the time axis; seconds where the time between samples is known, else samples.
     labels, truth, axes, residual
-        As for `trajectories`.
+        As for `trajectories`. Labels that are left out are the model's names of its states, where
+        it has such: see `qpmhe.System.signals`.
     sigmas : float
         Half the width of a band, in standard deviations.
     band : (lower, upper), optional
@@ -116,7 +117,8 @@ def states(
     times, when = run_times(run, dt, time_label)
     sigmas = positive("sigmas", sigmas)
     lines = {"estimate": run.states} | ({} if guarded is None else {"guarded": guarded})
-    drawn = trajectories(times, truth, lines, _names(labels, n), when, axes, residual=residual)
+    names = run_labels(run) if labels is None else label_list(labels, n)
+    drawn = trajectories(times, truth, lines, names, when, axes, residual=residual)
     date_axis(run, dt, drawn[-1])
     add_bands(run, times, [panel.lines[-len(lines)] for panel in drawn], sigmas)
     if band is not None:
@@ -204,6 +206,15 @@ def window(
         for line in panel.lines[-2:]:
             line.set(marker="o", markersize=3.0)
     return drawn
+
+
+def run_labels(run: Run) -> list[str]:
+    """The names of a run's states with units, where the model knows them; else x1, x2, ..."""
+    n = run.states.shape[1]
+    signals = None if run.source is None else run.source.system.signals
+    if signals is not None and len(signals.states) == n:
+        return [f"{one.name} ({one.unit})" if one.unit else one.name for one in signals.states]
+    return _names(None, n)
 
 
 def _names(labels: Sequence[str] | None, n: int) -> list[str]:

@@ -2,6 +2,7 @@
 
 from copy import copy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 import qpmhe
 from qpmhe import Status, plots
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
+from qpmhe.model.signals import Signal, Signals
 
 SYSTEM, OBSERVER, COST, SCENARIO = qpmhe.models.batch_reactor()
 
@@ -149,6 +151,17 @@ def test_dates_stand_on_the_axis_and_one_window_without_data_does_not_stretch_it
     known = run.costs[run.costs > 0.0]
     assert low > 0.01 * known.min()
     assert high >= known.max()
+
+
+def test_states_have_the_names_of_the_model(case):
+    signals = Signals(states=(Signal("pressure", "bar"), Signal("level")))
+    run = copy(case[1])
+    run.source = case[1].source._replace(system=SimpleNamespace(signals=signals, dt=None))
+    assert [one.get_ylabel() for one in plots.states(run)] == ["pressure (bar)", "level"]
+    run.source = case[1].source._replace(system=SimpleNamespace(signals=signals._replace(
+        states=signals.states[:1]), dt=None))
+    assert [one.get_ylabel() for one in plots.states(run)] == ["x1", "x2"]
+    assert [one.get_ylabel() for one in plots.states(run, labels=["a", "b"])] == ["a", "b"]
 
 
 def test_a_logarithmic_axis_of_one_decade_has_more_than_one_label(case):
