@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from .steps import costs
 from .style import LIGHT, run_times
-from .trajectories import trajectories
+from .trajectories import add_bands, run_labels, trajectories
 
 if TYPE_CHECKING:
     from ..estimation.run import Run
@@ -35,10 +35,12 @@ def run_page(run: Run) -> str:
         count = min(run.states.shape[1], _MOST)
         figure = Figure(figsize=(5.6, 0.5 + 1.1 * (count + 1)), layout="constrained")
         panels = list(figure.subplots(count + 1, 1, sharex=True))
+        times = run_times(run, None, None)[0]
         trajectories(
-            run_times(run, None, None)[0], None, {"estimate": run.states[:, :count]},
-            [f"x{i + 1}" for i in range(count)], "", panels[:-1],
+            times, None, {"estimate": run.states[:, :count]},
+            run_labels(run)[:count], "", panels[:-1],
         )
+        add_bands(run, times, [panel.lines[0] for panel in panels[:-1]], 2.0)
         costs(run, axes=panels[-1])
         data = BytesIO()
         figure.savefig(data, format="png", dpi=110)

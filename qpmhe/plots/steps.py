@@ -9,13 +9,14 @@ import numpy as np
 from .._checks import positive
 from ..estimation.estimate import Status
 from .checks import check_run
-from .style import COLORS, OBSERVER, STYLES, panels, run_times
+from .style import COLORS, OBSERVER, STYLES, date_axis, label_decades, panels, run_times
 
 if TYPE_CHECKING:
     from ..estimation.run import Run
 
-# Below this many times the largest, a cost is drawn as this: a logarithm ends somewhere.
-_FLOOR = 1e-12
+# A cost is drawn as at least this part of the small ones, the quantile _SMALL: a window without
+# data would stretch the axis over all decades.
+_FLOOR, _SMALL = 0.3, 0.02
 _EVENTS = (
     ("improved", Status.IMPROVED, COLORS["estimate"], "|"),
     ("kept", Status.CANDIDATE, COLORS["observer"], "x"),
@@ -44,8 +45,8 @@ def costs(
     times, when = run_times(run, dt, time_label)
     (panel,) = panels(1, axes, 2.6)
     times = times[1:]
-    finite = run.candidate_costs[np.isfinite(run.candidate_costs)]
-    floor = _FLOOR * max(finite.max(initial=0.0), 1e-300)
+    known = run.costs[np.isfinite(run.costs) & (run.costs > 0.0)]
+    floor = _FLOOR * float(np.quantile(known, _SMALL)) if known.size else 1e-300
     for values, label, style in (
         (run.candidate_costs, "candidate", OBSERVER), (run.costs, "estimate", STYLES[0]),
     ):
@@ -57,6 +58,8 @@ def costs(
             markersize=4.0,
             label="candidate kept",
         )
+    date_axis(run, dt, panel)
+    label_decades(panel.yaxis)
     panel.set(xlabel=when, ylabel="true cost J")
     panel.margins(x=0.01)
     panel.legend(frameon=False)
@@ -94,6 +97,7 @@ def outcomes(
             rows.append(f"{label} ({there.mean():.0%})")
     panel.set_yticks(range(len(rows)), rows)
     panel.set_ylim(max(len(rows), 1) - 0.5, -0.5)
+    date_axis(run, dt, panel)
     panel.set_xlabel(when)
     panel.margins(x=0.01)
     return panel
@@ -126,6 +130,8 @@ def step_times(run: Run, *, deadline: float | None = None, axes: Any = None) -> 
             deadline * 1e6, color="0.4", linewidth=1.0, linestyle=":",
             label=f"deadline ({late:.1%} late)",
         )
+    label_decades(panel.xaxis)
+    label_decades(panel.yaxis)
     panel.set(xlabel="time (µs)", ylabel="share of steps that took longer")
     if panel.get_legend_handles_labels()[0]:
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from io import StringIO
 from os import PathLike
 from pathlib import Path
@@ -87,8 +88,14 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
 def run_times(
     run: Run, dt: float | None, time_label: str | None
 ) -> tuple[NDArray[np.float64], str]:
-    """Times of the states of a run, and the label of their axis: seconds if steps are known."""
+    """Times of the states of a run, and the label of their axis: seconds if steps are known.
+
+    The days of Matplotlib where the run has dates, for `date_axis`.
+    """
     source, count = run.source, len(run)
+    if _has_dates(run, dt):
+        dates: Any = import_module("matplotlib.dates")
+        return np.asarray(dates.date2num(run.index), np.float64), time_label or ""
     if dt is None and source is not None:
         dt = source.system.dt
         if source.steps is not None:
@@ -99,9 +106,35 @@ def run_times(
     )
 
 
+def _has_dates(run: Run, dt: float | None) -> bool:
+    return dt is None and hasattr(run.index, "tz")
+
+
+def date_axis(run: Run, dt: float | None, panel: Any) -> None:
+    """Label the times of `run_times` as dates, where they are, in the zone of the run's index."""
+    if _has_dates(run, dt):
+        dates: Any = import_module("matplotlib.dates")
+        zone = run.index.tz  # type: ignore[union-attr]
+        locator = dates.AutoDateLocator(tz=zone, minticks=3)
+        panel.xaxis.set_major_locator(locator)
+        panel.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator, tz=zone))
+
+
 def time_words(dt: float | None) -> str:
     """The label of an axis of times."""
     return f"time t ({'samples' if dt is None else 's'})"
+
+
+def label_decades(axis: Any) -> None:
+    """Label a logarithmic axis also within a decade, where fewer than two decades are in view."""
+    low, high = sorted(axis.get_view_interval())
+    if axis.get_scale() != "log" or not 0.0 < low < high or np.log10(high / low) >= 2.0:
+        return
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:

@@ -11,12 +11,16 @@ from numpy.typing import ArrayLike
 from .._checks import Array, positive
 from ..errors import InvalidInputError
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
-from .style import PROVED, REAL, STYLES, line_styles, panels, run_times, time_words
+from .style import PROVED, REAL, STYLES, date_axis, line_styles, panels, run_times, time_words
 
 if TYPE_CHECKING:
     from ..estimation.estimate import Estimate
     from ..estimation.run import Run
     from ..model.residuals import Residual
+
+
+# Samples times points of a line's width.
+_WIDE = 600.0
 
 
 def trajectories(
@@ -88,7 +92,8 @@ def states(
     time_label : str, optional
         Label of the time axis; seconds where the time between samples is known, else samples.
     labels, truth, axes, residual
-        As for `trajectories`.
+        As for `trajectories`. Labels that are left out are the model's names of its states, where
+        it has such: see `qpmhe.System.signals`.
     sigmas : float
         Half the width of a band, in standard deviations.
     band : (lower, upper), optional
@@ -112,16 +117,10 @@ def states(
     times, when = run_times(run, dt, time_label)
     sigmas = positive("sigmas", sigmas)
     lines = {"estimate": run.states} | ({} if guarded is None else {"guarded": guarded})
-    drawn = trajectories(times, truth, lines, _names(labels, n), when, axes, residual=residual)
-    if run.covariances is not None and len(run):
-        half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
-        for j, panel in enumerate(drawn):
-            middle = panel.lines[-len(lines)].get_ydata()[1:]
-            panel.fill_between(
-                times[1:], middle - half[:, j], middle + half[:, j],
-                color=STYLES[0]["color"], alpha=0.18, linewidth=0.0,
-                label=f"± {sigmas:g} standard deviations",
-            )
+    names = run_labels(run) if labels is None else label_list(labels, n)
+    drawn = trajectories(times, truth, lines, names, when, axes, residual=residual)
+    date_axis(run, dt, drawn[-1])
+    add_bands(run, times, [panel.lines[-len(lines)] for panel in drawn], sigmas)
     if band is not None:
         lower, upper = (
             curve(f"band[{side}]", values, count, n) for side, values in enumerate(_pair(band))
@@ -135,6 +134,23 @@ def states(
     if band is not None or (run.covariances is not None and len(run)):
         _legend(drawn, axes)
     return drawn
+
+
+def add_bands(run: Run, times: Array, lines: Sequence[Any], sigmas: float) -> None:
+    """Fill between so many standard deviations about the lines of the first states."""
+    if run.covariances is None or not len(run):
+        return
+    with np.errstate(invalid="ignore"):
+        half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
+    for j, line in enumerate(lines):
+        # A line of the usual width hides the band where samples stand close.
+        line.set_linewidth(max(0.5, min(1.3, _WIDE / len(run))))
+        middle = line.get_ydata()[1:]
+        line.axes.fill_between(
+            times[1:], middle - half[:, j], middle + half[:, j],
+            color=STYLES[0]["color"], alpha=0.35, linewidth=0.0,
+            label=f"± {sigmas:g} standard deviations",
+        )
 
 
 def _pair(band: Any) -> tuple[ArrayLike, ArrayLike]:
@@ -190,6 +206,15 @@ def window(
         for line in panel.lines[-2:]:
             line.set(marker="o", markersize=3.0)
     return drawn
+
+
+def run_labels(run: Run) -> list[str]:
+    """The names of a run's states with units, where the model knows them; else x1, x2, ..."""
+    n = run.states.shape[1]
+    signals = None if run.source is None else run.source.system.signals
+    if signals is not None and len(signals.states) == n:
+        return [f"{one.name} ({one.unit})" if one.unit else one.name for one in signals.states]
+    return _names(None, n)
 
 
 def _names(labels: Sequence[str] | None, n: int) -> list[str]:

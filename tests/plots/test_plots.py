@@ -1,6 +1,8 @@
 """What the figures show, read from their lines."""
 
+from copy import copy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from matplotlib.figure import Figure
 import qpmhe
 from qpmhe import Status, plots
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
+from qpmhe.model.signals import Signal, Signals
 
 SYSTEM, OBSERVER, COST, SCENARIO = qpmhe.models.batch_reactor()
 
@@ -129,6 +132,47 @@ def test_costs_outcomes_and_times_of_steps(case, monkeypatch):
     steps = lines(panel)["whole step"]
     np.testing.assert_allclose(steps[:, 0], 1e6 * np.sort(run.times))
     assert steps[0, 1] == 1.0
+
+
+def test_dates_stand_on_the_axis_and_one_window_without_data_does_not_stretch_it(case):
+    pandas = pytest.importorskip("pandas")
+    run = copy(case[1])
+    run.index = pandas.date_range("2026-03-01 22:00", periods=len(run) + 1, freq="10s",
+                                  tz="Europe/Berlin")
+    for panel in (plots.states(run)[-1], plots.costs(run), plots.outcomes(run)):
+        panel.figure.canvas.draw()
+        texts = [one.get_text() for one in panel.get_xticklabels()]
+        assert any(text.startswith("22:0") for text in texts)
+        assert panel.xaxis.get_major_formatter().get_offset().startswith("2026-Mar-01")
+        assert panel.get_xlabel() == ""
+    assert plots.states(run, dt=2.0)[-1].lines[0].get_xdata()[1] == 2.0
+    run.costs = np.where(np.arange(len(run)) == 3, 0.0, run.costs)
+    low, high = plots.costs(run).get_ylim()
+    known = run.costs[run.costs > 0.0]
+    assert low > 0.01 * known.min()
+    assert high >= known.max()
+
+
+def test_states_have_the_names_of_the_model(case):
+    signals = Signals(states=(Signal("pressure", "bar"), Signal("level")))
+    run = copy(case[1])
+    run.source = case[1].source._replace(system=SimpleNamespace(signals=signals, dt=None))
+    assert [one.get_ylabel() for one in plots.states(run)] == ["pressure (bar)", "level"]
+    run.source = case[1].source._replace(system=SimpleNamespace(signals=signals._replace(
+        states=signals.states[:1]), dt=None))
+    assert [one.get_ylabel() for one in plots.states(run)] == ["x1", "x2"]
+    assert [one.get_ylabel() for one in plots.states(run, labels=["a", "b"])] == ["a", "b"]
+
+
+def test_a_logarithmic_axis_of_one_decade_has_more_than_one_label(case):
+    run = copy(case[1])
+    run.costs = run.candidate_costs = np.linspace(3.0, 7.0, len(run))
+    panel = plots.costs(run)
+    panel.figure.canvas.draw()
+    low, high = panel.get_ylim()
+    labels = {float(one): text.get_text() for one, text in zip(
+        panel.get_yticks(), panel.get_yticklabels(), strict=True)}
+    assert {text for tick, text in labels.items() if low <= tick <= high} == {"3", "5", "7"}
 
 
 def test_given_axes_are_drawn_into_and_a_run_without_steps_is_an_empty_picture(case, tmp_path):
