@@ -44,6 +44,8 @@ Array = NDArray[np.float64]
 
 # Relative change of all that goes in, which shows how rounding spreads, and its weight.
 _NUDGE, _WEIGHT = 1e-11, 300.0
+# Other changes that are tried before a difference is a fault.
+_NUDGES = 8
 # Samples of a record, and how many of them first go through the functions for many samples.
 _SAMPLES, _BY_RUN, _BY_MEMBERS = 22, 7, 2
 _MANY_STATES, _FEW_SAMPLES = 40, 12
@@ -239,6 +241,31 @@ class _Sample(NamedTuple):
     own: Conditions | None = None
 
 
+class _Nudged:
+    """The Python step, given all that goes in and comes from C with relative changes.
+
+    The changes have no pattern: equal ones would leave differences as they are.
+    """
+
+    def __init__(
+        self, generator: np.random.Generator, system: System, observer: Observer, cost: Cost,
+        settings: Settings, start: Array,
+    ) -> None:
+        nudge_x, self._nudge_y = (
+            1 + _NUDGE * generator.uniform(-1.0, 1.0, size) for size in (system.n, system.p)
+        )
+        # Differences between sigma points that are far apart lose digits.
+        if isinstance(observer, KalmanType):
+            spread = np.outer(nudge_x, nudge_x) * observer.initial_covariance()
+            observer = observer.with_prior(spread)
+        self._step = _Follower(nudge_x, system, observer, cost, settings, start * nudge_x)
+
+    def after(self, sample: _Sample, found: Estimate) -> Estimate:
+        """The estimate after one more sample, for which C has found this."""
+        self._step.guide.found = found
+        return self._step.step(sample.y * self._nudge_y, *sample[1:], 0.0)
+
+
 class _Rehearsal:
     """One record run through the library and the Python step.
 
@@ -258,20 +285,12 @@ class _Rehearsal:
         start = first * (1 + 0.1 * self._generator.uniform(-1.0, 1.0, n))
         with suppress(ModelError):  # of a model that has no finite values there
             start, system = check_start(system, observer, cost, start)
-        # Relative changes without a pattern: equal ones would leave differences as they are.
-        nudge_x, self._nudge_y = (
-            1 + _NUDGE * self._generator.uniform(-1.0, 1.0, size) for size in (n, p)
-        )
         self._start = start
-        arguments = system, observer, cost, settings
+        self._arguments = arguments = system, observer, cost, settings
         self._compiled = CompiledEngine(*arguments, start, library)
         self._first = observer.initial_covariance()
         self._python = _Follower(1.0, *arguments, start)
-        # Differences between sigma points that are far apart lose digits.
-        if isinstance(observer, KalmanType):
-            spread = np.outer(nudge_x, nudge_x) * observer.initial_covariance()
-            observer = observer.with_prior(spread)
-        self._nudged = _Follower(nudge_x, system, observer, cost, settings, start * nudge_x)
+        self._nudged = _Nudged(self._generator, *arguments, start)
         most = _SAMPLES if n <= _MANY_STATES else _FEW_SAMPLES
         count = min(settings.horizon + _BY_RUN + _BY_MEMBERS, most)
         self._own = _own_conditions(system, cost, settings)
@@ -321,17 +340,20 @@ class _Rehearsal:
 
     def fault(self) -> str:
         """What is wrong; empty if nothing is."""
-        estimates = []
+        estimates: list[Estimate] = []
         for sample in self._record:
             found = self._compiled.step(*sample, 0.0)
             estimates.append(found)
-            self._python.guide.found = self._nudged.guide.found = found
+            self._python.guide.found = found
             expected = self._python.step(*sample, 0.0)
-            nudged = self._nudged.step(sample.y * self._nudge_y, *sample[1:], 0.0)
+            nudged = self._nudged.after(sample, found)
             if self._is_lost(expected, nudged):
                 estimates.pop()
                 break
             fault = self._step_fault(found, expected, nudged, sample.y)
+            if fault and self._is_rounding(estimates, expected):
+                estimates.pop()
+                break
             if fault:
                 return fault
             if not math.isfinite(expected.candidate_cost):
@@ -341,6 +363,27 @@ class _Rehearsal:
         if guide.missed >= _MISSED and not guide.improved:
             return "it improves no estimate where the Python step does"
         return self._many_fault(estimates)
+
+    def _is_rounding(self, estimates: list[Estimate], expected: Estimate) -> bool:
+        """Whether the last estimate is as far off as others that rounding may have led to.
+
+        One nudge may miss the direction in which an ill-conditioned step is sensitive, and none
+        shows the rounding inside of an observer's covariance.
+        """
+        window = self._python.memory.window
+        if window.covariance is not None and _loses_digits(
+            window.covariance[window.start : window.end + 1]
+        ):
+            return True
+        for _ in range(_NUDGES):
+            other, nudged = _Nudged(self._generator, *self._arguments, self._start), expected
+            for sample, found in zip(self._record, estimates, strict=False):
+                nudged = other.after(sample, found)
+            if self._is_lost(expected, nudged) or not self._step_fault(
+                estimates[-1], expected, nudged, self._record[len(estimates) - 1].y
+            ):
+                return True
+        return False
 
     def _is_lost(self, expected: Estimate, nudged: Estimate) -> bool:
         """Whether the record is chaotic by now: two that nearly agreed have separate ways.
@@ -459,3 +502,19 @@ def _differs(got: Array, true: Array, allowed: Array | float) -> bool:
     if (np.isfinite(got) != finite).any():
         return True
     return bool((abs(got - true) > allowed)[finite].any())
+
+
+def _loses_digits(covariances: Array) -> bool:
+    """Whether rounding of covariances (..., n, n) changes a variance in the digits compared.
+
+    In units of the deviations, rounding is as large as the precision, a share of the least
+    variance of a combination of states.
+    """
+    variances = covariances.diagonal(0, -2, -1)
+    if not (variances > 0.0).all():
+        return True
+    deviations = np.sqrt(variances)
+    correlations = covariances / deviations[..., :, None] / deviations[..., None, :]
+    if not np.isfinite(correlations).all():
+        return True
+    return bool(np.linalg.eigvalsh(correlations).min() < _EPSILONS / ROUNDING)

@@ -407,6 +407,8 @@ class ObserverSteps(WindowSamples):
         if not self._has_filter or self.newest_failed:
             return None
         view = self._stage_views[self.end - 1]
+        if self._observer.needs_jacobians and self.has_terms and not view.terms.minus_c.any():
+            return None  # of h that does not depend on x, or where a derivative is missing
         try:
             found = self._observer.filter(view.arguments[0], view.error, self._sample)
             if found is None:

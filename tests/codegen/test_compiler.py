@@ -18,6 +18,7 @@ from qpmhe.codegen.compiler import compiled_library, find_compiler
 from qpmhe.errors import CompilationError, EngineWarning, InvalidInputError, OptionError
 from qpmhe.memory.snapshot import read, written
 
+from ..properties.campaign.cases import Case
 from .cases import CASES, case
 
 CC = os.environ.get("CC") or shutil.which("cc")  # without optimisation where few cases run
@@ -643,6 +644,18 @@ def test_a_covariance_that_runs_away_is_not_taken_for_wrong_code(script):
         candidate="reinitialized", engine="compiled",
     )
     assert mhe.engine == "compiled"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [12000077, 12000093, 12000098])
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.PriorWarning")
+def test_rounding_in_a_covariance_is_not_taken_for_wrong_code(seed):
+    """Extended filters whose covariances have deviations of 1e9 in one direction, 1e-3 in another.
+
+    In the second one a derivative of f is missing at the newest state: neither engine then
+    corrects z(t) by a measurement update.
+    """
+    assert Case(seed, "compiled").estimator().engine == "compiled"
 
 
 def test_sigma_points_far_apart_are_not_taken_for_wrong_code(script):
