@@ -39,7 +39,7 @@ _checked: set[tuple[str, str]] = set()
 
 
 class WrongCodeError(CompilationError):
-    """The compiled code is not right at any level of optimisation."""
+    """The compiled code does not pass its check at any level of optimisation."""
 
 
 class NotCachedError(CompilationError):
@@ -122,8 +122,8 @@ def compiled_library(
     if not fault:
         raise CompilationError(f"{' '.join(compiler)} failed: {message}")
     raise WrongCodeError(
-        f"the code that {' '.join(compiler)} makes is not right at any level of optimisation "
-        f"({fault}); take engine='python', or set CC to another compiler."
+        f"the code that {' '.join(compiler)} makes does not pass its check at any level of "
+        f"optimisation ({fault}); take engine='python', or set CC to another compiler."
     )
 
 

@@ -685,7 +685,7 @@ def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypa
     for _ in range(2):
         with pytest.warns(EngineWarning, match=r"virtual machine.*residuals"):
             interpreted = system(None)
-        with pytest.raises(CompilationError, match="not right at any level"):
+        with pytest.raises(CompilationError, match="not pass its check at any level"):
             system(compiled=True)
         with pytest.warns(EngineWarning, match="Python step"):
             mhe = estimator(parts=(interpreted, *arguments()[0][1:]), engine="compiled")
