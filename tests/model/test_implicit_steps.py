@@ -179,10 +179,12 @@ def test_a_rate_that_saturates(kind):
 
     made = system(rate if kind == "traced" else untraced(rate), 1, dt=1.0, method="midpoint")
     values = made.model().functions.f
+    # By differences, the iteration's last step is no longer quadratic beside a slope of 1e4.
+    share = 1e-10 if kind == "traced" else 1e-8
     for x in 0.0, 1e-5, 0.01, 0.3, 5.0:
         # The rate falls with the state, so that the step is the only root.
         root = brentq(lambda z, x=x: z - rate(x + 0.5 * z), -2.0, 2.0, xtol=1e-15, rtol=1e-14)
-        assert values(np.array([x]), NONE)[0] == pytest.approx(x + root, rel=1e-10, abs=1e-14)
+        assert values(np.array([x]), NONE)[0] == pytest.approx(x + root, rel=share, abs=1e-14)
     fine = system(rate, 1, dt=1.0, method="radau", steps=4).f(np.array([0.3]))
     # It runs out within the step, and stays where the uptake is the supply.
     assert fine[0] == pytest.approx(1e-4 * 0.01 / 0.99, rel=1e-3)
