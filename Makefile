@@ -45,6 +45,7 @@ examples: $(VENV)/.test
 	$(BIN)/python -m examples.gallery.reactors --quick --out results/gallery
 	$(BIN)/python -m examples.gallery.weak_excitation --quick --out results/gallery
 	$(BIN)/python -m examples.gallery.lorenz96 --quick --out results/gallery
+	$(BIN)/python -m examples.gallery.stiff_and_algebraic --quick --out results/gallery
 	$(BIN)/python examples/benchmarks/compare_peers.py --quick --problem reactor --out results
 	$(BIN)/python examples/benchmarks/constrained.py --steps 60 --out results
 	$(BIN)/python examples/benchmarks/batch.py --members 200 --steps 40 --out results
@@ -59,6 +60,7 @@ gallery: $(VENV)/.test
 	$(BIN)/python -m examples.gallery.reactors --out results/gallery
 	$(BIN)/python -m examples.gallery.weak_excitation --out results/gallery
 	$(BIN)/python -m examples.gallery.lorenz96 --out results/gallery
+	$(BIN)/python -m examples.gallery.stiff_and_algebraic --out results/gallery
 	$(BIN)/python -m examples.gallery.indoor_uwb --data "$(DATA)/indoor_uwb" --out results/gallery
 	$(BIN)/python -m examples.gallery.outdoor_uwb --data "$(DATA)/uwb_outdoor" --out results/gallery
 	$(BIN)/python -m examples.gallery.smartloc --data "$(DATA)/smartloc_berlin" --out results/gallery

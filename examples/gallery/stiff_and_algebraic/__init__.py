@@ -1,0 +1,1 @@
+"""A stiff reactor, a fed-batch fermentation and a small grid: implicit steps, beside do-mpc."""

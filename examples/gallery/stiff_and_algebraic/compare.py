@@ -1,0 +1,123 @@
+"""The three models, estimated with filters, with moving horizon estimation and with do-mpc.
+
+Nothing is tuned: the covariances are those of the simulation, and all have the same horizon, which
+was fixed before the first run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+import qpmhe
+from qpmhe.plots import trajectories
+from qpmhe.plots.style import LIGHT
+from qpmhe.tuning import Weights
+
+from ..problem import Problem, Record, Result, Way
+from .plants import PLANTS, Plant, simulate
+
+#: Runs of the tables, and of a quick look.
+SEEDS, FEW = range(3), range(1)
+HORIZON = 10
+SHOWN = "MHE, 2 QPs", "do-mpc", "EKF"
+
+
+def model(plant: Plant) -> qpmhe.System:
+    """The plant by Radau's method, and X."""
+    n, k, m = plant.n, len(plant.algebraic), len(plant.inputs[0])
+    p, least = len(plant.noise), np.array(plant.least)
+
+    def part(index: int) -> Callable[..., Any]:
+        def function(*arguments: Any) -> Any:
+            parts = [[one[..., i] for i in range(one.shape[-1])] for one in arguments]
+            return np.stack(plant.equations(*parts, np)[index], axis=-1)  # type: ignore[call-arg]
+
+        return function
+
+    rate, algebraic, output = (part(i) for i in range(3))
+    bounded = qpmhe.Box(least[:n], np.full(n, np.inf)) if np.isfinite(least).any() else None
+    options: dict[str, Any] = {
+        "dt": plant.dt, "n": n, "p": p, "m": m, "states": bounded, "method": "radau",
+        "steps": plant.substeps,
+    }
+    if k:
+        return qpmhe.System.from_dae(
+            lambda x, z, u: rate(x, z, u, u[..., :0]),
+            lambda x, z, u: algebraic(x, z, u, u[..., :0]),
+            lambda x, z, u: output(x, z, u, u[..., :0]), k=k, algebraic_guess=plant.algebraic,
+            **options,
+        )
+    if plant.parameters:
+        return qpmhe.augment_parameters(
+            lambda x, u, theta: rate(x, x[..., :0], u, theta),
+            lambda x, u, theta: output(x, x[..., :0], u, theta),
+            nominal=plant.guess[n:], drifting=True,
+            parameter_bounds=qpmhe.Box(least[n:], np.full(plant.parameters, np.inf)), **options,
+        )
+    return qpmhe.System.from_ode(
+        lambda x, u: rate(x, x[..., :0], u, x[..., :0]),
+        lambda x, u: output(x, x[..., :0], u, x[..., :0]), **options,
+    )
+
+
+def problem(plant: Plant, seeds: Sequence[int], quick: bool = False) -> Problem:
+    """Records that differ in everything that is drawn; the first half of each lets them settle."""
+    steps = 20 if quick else plant.steps
+    guess = np.array(plant.guess)
+    records = []
+    for seed in seeds:
+        states, measured, inputs = simulate(plant, seed, steps)
+        records.append(Record("simulated", measured, inputs, states, [guess], steps // 2))
+    squared = (np.diag(np.square(one)) for one in (plant.prior, plant.disturbance, plant.noise))
+    which = list(plant.error)
+    return Problem(
+        f"stiff_and_algebraic_{plant.name}", plant.title, model(plant), records,
+        Weights(*squared, HORIZON),
+        lambda x, real: np.sqrt(np.mean((x - real)[:, which] ** 2, axis=1)), plant.error_unit,
+        plant.lost, own=lambda _, weights: own(plant, weights),
+        note=f"lost: an error above {plant.lost:g}. do-mpc: Radau collocation and Ipopt.",
+    )
+
+
+def problems(_: Path, quick: bool) -> list[Problem]:
+    """All of them."""
+    return [problem(plant, FEW if quick else SEEDS, quick) for plant in PLANTS]
+
+
+def own(plant: Plant, weights: Weights) -> dict[str, Way]:
+    """do-mpc, where it is installed."""
+    if find_spec("do_mpc") is None:
+        return {}
+    from .peer import DoMpc
+
+    return {"do-mpc": lambda start: DoMpc(plant, start, weights.horizon)}
+
+
+def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Figure:
+    """The runs at the median of the filter's error; a column a plant."""
+    with rc_context(LIGHT):
+        figure = Figure(figsize=(10.2, 5.0), layout="constrained")
+        grid = figure.subplots(2, len(PLANTS), squeeze=False)
+        for plant, problem, found, axes in zip(PLANTS, problems, results, grid.T, strict=True):
+            by_name = {one.estimator: one for one in found}
+            which = by_name["EKF"].which
+            truth, at = problem.records[which].truth, [i for i, _ in plant.shown]
+            drawn = {n: by_name[n].estimates[which][:, at] for n in SHOWN if n in by_name}
+            trajectories(
+                plant.dt * np.arange(float(len(truth))), truth[:, at], drawn,
+                [name for _, name in plant.shown], f"time t ({plant.unit})", axes=list(axes),
+            )
+            axes[0].set_title(plant.title)
+            for panel, line in zip(axes, truth[:, at].T, strict=True):
+                reach = max(0.5 * np.ptp(line), 0.1 * np.abs(line).max())
+                panel.set_ylim(line.min() - reach, line.max() + reach)
+            if plant is not PLANTS[0]:
+                axes[0].get_legend().remove()
+    return figure

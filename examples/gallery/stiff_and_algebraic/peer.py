@@ -1,0 +1,122 @@
+"""do-mpc's moving horizon estimation on the same model: collocation, solved by Ipopt."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from time import perf_counter
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..problem import Array
+from .plants import Plant
+
+
+class DoMpc:
+    """An estimator of do-mpc: Radau's collocation of the same order and substeps.
+
+    Its prior is around the second state of its last solution, with a constant weight; its
+    parameter is constant in each window. It has no missing measurements: a weight of zero, a
+    parameter that varies in time, takes their place.
+
+    Parameters
+    ----------
+    plant : Plant
+        The model and its covariances.
+    start : (n,) array
+        The first estimate, with the parameters behind it.
+    horizon : int
+        N.
+    """
+
+    engine = "Ipopt"
+
+    def __init__(self, plant: Plant, start: Array, horizon: int) -> None:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")  # it misses ONNX, which is of no use here
+            import do_mpc  # type: ignore[import-untyped,import-not-found,unused-ignore]
+
+            self._plant, self._horizon = plant, horizon
+            model = do_mpc.model.Model("continuous", "SX")
+            counts = {"_x": plant.n, "_z": len(plant.algebraic), "_u": len(plant.inputs[0]),
+                      "_p": plant.parameters}
+            parts = [
+                [model.set_variable(kind, f"{kind[1]}{i}") for i in range(size)]
+                for kind, size in counts.items()
+            ]
+            rates, rest, outputs = plant.equations(*parts, ca)
+            for i, one in enumerate(rates):
+                model.set_rhs(f"x{i}", one, process_noise=True)
+            for i, one in enumerate(rest):
+                model.set_alg(f"g{i}", one)
+            for i, one in enumerate(outputs):
+                model.set_meas(f"y{i}", one, meas_noise=True)
+            for i, one in enumerate(parts[2]):
+                model.set_meas(f"u{i}", one, meas_noise=False)
+            seen = model.set_variable("_tvp", "seen", shape=(len(outputs), 1))
+            model.setup()
+            names = [f"p{i}" for i in range(plant.parameters)]
+            self._mhe = mhe = do_mpc.estimator.MHE(model, names)
+            mhe.set_param(
+                n_horizon=horizon, t_step=plant.dt, meas_from_data=True,
+                store_full_solution=False, state_discretization="collocation",
+                collocation_type="radau", collocation_deg=3, collocation_ni=plant.substeps,
+                store_solver_stats=[],
+            )
+            mhe.settings.supress_ipopt_output()
+            n, prior = plant.n, 1.0 / np.array(plant.prior)
+            # Its disturbance is a rate.
+            rate = np.array(plant.disturbance)[:n] / plant.dt
+            mhe.set_default_objective(
+                P_x=np.diag(prior[:n] ** 2), P_w=np.diag(rate**-2),
+                P_v=ca.diag(seen / ca.DM(np.square(plant.noise))),
+                P_p=np.diag(prior[n:] ** 2) if names else None,
+            )
+            self._template = mhe.get_tvp_template()
+            self._seen, self._now = np.ones((1, len(outputs))), 0
+            mhe.set_tvp_fun(self._weights)
+            for kind, first, least in (
+                ("_x", "x", plant.least[:n]), ("_p_est", "p", plant.least[n:])
+            ):
+                for i, bound in enumerate(least):
+                    if np.isfinite(bound):
+                        mhe.bounds["lower", kind, f"{first}{i}"] = bound
+            mhe.setup()
+        self.reset(start)
+
+    def reset(self, start: Array) -> None:
+        """Begin again."""
+        plant, mhe, n = self._plant, self._mhe, self._plant.n
+        mhe.reset_history()
+        mhe.x0, mhe.u0 = start[:n], np.mean(plant.inputs, axis=0)
+        if plant.algebraic:
+            mhe.z0 = np.array(plant.algebraic)
+        if plant.parameters:
+            mhe.p_est0 = start[n:]
+        mhe.set_initial_guess()
+
+    def run(self, measurements: Array, inputs: Array) -> SimpleNamespace:
+        """What the gallery reads of a run."""
+        self._seen = ~np.isnan(measurements)
+        last, found, times = np.zeros(measurements.shape[1]), [], []
+        for t, y in enumerate(measurements):
+            last = np.where(self._seen[t], y, last)
+            self._now = t
+            # A sample has the input before it.
+            sample = np.concatenate((last, inputs[max(t - 1, 0)]))
+            began = perf_counter()
+            x = self._mhe.make_step(sample[:, None]).ravel()
+            times.append(perf_counter() - began)
+            found.append(np.concatenate((x, self._mhe.p_est0.cat.full().ravel())))
+        return SimpleNamespace(filtered=np.array(found), times=np.array(times))
+
+    def _weights(self, _: float) -> Any:
+        """Which outputs each sample of the window has; before the first one, its copies."""
+        for i in range(self._horizon):
+            t = max(self._now - self._horizon + 1 + i, 0)
+            self._template["_tvp", i, "seen"] = self._seen[t].astype(float)
+        return self._template
