@@ -37,7 +37,7 @@ def model(plant: Plant) -> qpmhe.System:
     def part(index: int) -> Callable[..., Any]:
         def function(*arguments: Any) -> Any:
             parts = [[one[..., i] for i in range(one.shape[-1])] for one in arguments]
-            return np.stack(plant.equations(*parts, np)[index], axis=-1)  # type: ignore[call-arg]
+            return np.stack(plant.equations(*parts, np)[index], axis=-1)
 
         return function
 
@@ -75,11 +75,13 @@ def problem(plant: Plant, seeds: Sequence[int], quick: bool = False) -> Problem:
     for seed in seeds:
         states, measured, inputs = simulate(plant, seed, steps)
         records.append(Record("simulated", measured, inputs, states, [guess], steps // 2))
-    squared = (np.diag(np.square(one)) for one in (plant.prior, plant.disturbance, plant.noise))
+    prior, disturbance, noise = (
+        np.diag(np.square(one)) for one in (plant.prior, plant.disturbance, plant.noise)
+    )
     which = list(plant.error)
     return Problem(
         f"stiff_and_algebraic_{plant.name}", plant.title, model(plant), records,
-        Weights(*squared, HORIZON),
+        Weights(prior, disturbance, noise, HORIZON),
         lambda x, real: np.sqrt(np.mean((x - real)[:, which] ** 2, axis=1)), plant.error_unit,
         plant.lost, own=lambda _, weights: own(plant, weights),
         note=f"lost: an error above {plant.lost:g}. do-mpc: Radau collocation and Ipopt.",

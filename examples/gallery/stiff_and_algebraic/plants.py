@@ -26,8 +26,9 @@ import numpy as np
 
 from ..problem import Array
 
-#: Rates, algebraic residuals and outputs, of the components of x, z, u and of the parameters.
-Equations = Callable[[list[Any], list[Any], list[Any], list[Any], ModuleType], tuple[Any, ...]]
+#: Rates, algebraic residuals and outputs, of lists of the components of x, z, u and of the
+#: parameters, and of the module whose functions they take.
+Equations = Callable[..., tuple[Any, ...]]
 
 
 class Plant(NamedTuple):
@@ -184,7 +185,7 @@ def _plant(plant: Plant) -> tuple[Any, Any]:
              "p": plant.parameters}
     parts = {name: ca.SX.sym(name, size) for name, size in kinds.items()}
     rates, rest, outputs = plant.equations(*map(ca.vertsplit, parts.values()), ca)
-    problem = {"x": parts["x"], "p": ca.vertcat(parts["u"], parts["p"]), "ode": ca.vertcat(*rates)}
+    problem: Any = {"x": parts["x"], "p": ca.vertcat(parts["u"], parts["p"]), "ode": ca.vertcat(*rates)}
     if rest:
         problem |= {"z": parts["z"], "alg": ca.vertcat(*rest)}
     kind = "idas" if rest else "cvodes"
@@ -225,5 +226,5 @@ def _consistent(plant: Plant) -> Any:
         "xzu", (plant.n, len(plant.algebraic), len(plant.inputs[0])), strict=True
     ))
     _, rest, _ = plant.equations(*map(ca.vertsplit, (x, z, u)), [], ca)
-    program = {"x": z, "p": ca.vertcat(x, u), "g": ca.vertcat(*rest)}
+    program: Any = {"x": z, "p": ca.vertcat(x, u), "g": ca.vertcat(*rest)}
     return ca.rootfinder("consistent", "newton", program)
