@@ -185,7 +185,8 @@ def _plant(plant: Plant) -> tuple[Any, Any]:
              "p": plant.parameters}
     parts = {name: ca.SX.sym(name, size) for name, size in kinds.items()}
     rates, rest, outputs = plant.equations(*map(ca.vertsplit, parts.values()), ca)
-    problem: Any = {"x": parts["x"], "p": ca.vertcat(parts["u"], parts["p"]), "ode": ca.vertcat(*rates)}
+    given = ca.vertcat(parts["u"], parts["p"])
+    problem: Any = {"x": parts["x"], "p": given, "ode": ca.vertcat(*rates)}
     if rest:
         problem |= {"z": parts["z"], "alg": ca.vertcat(*rest)}
     kind = "idas" if rest else "cvodes"
