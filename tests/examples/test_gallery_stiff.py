@@ -37,13 +37,31 @@ def test_do_mpc_weighs_what_is_measured(parts):
     peer = import_module("gallery.stiff_and_algebraic.peer")
     plant = parts["plants"].PLANTS[0]
     states, measured, inputs = parts["plants"].simulate(plant, 0, 9)
-    mhe, guess = peer.DoMpc(plant, np.array(plant.guess), 4), np.array(plant.guess)
+    guess, prior = np.array(plant.guess), np.diag(np.square(plant.prior))
+    mhe = peer.DoMpc(plant, guess, 4, prior, np.diag(np.square(plant.disturbance[:4])))
     found = mhe.run(measured, inputs).filtered
     assert found.shape == states.shape
     assert abs(found[-1, 3] - states[-1, 3]) < 0.1  # the volume, measured each hour
+    # Of a first sample there is one, not N: Kalman's update of the volume.
+    gain = prior[3, 3] / (prior[3, 3] + plant.noise[0] ** 2)
+    assert found[0, 3] == pytest.approx(guess[3] + gain * (measured[0, 0] - guess[3]), rel=1e-4)
     other = np.where(np.isnan(measured), np.nan, measured)
     other[8, 2:] = np.nan  # the only late sample of biomass and product
     mhe.reset(guess)
     without = mhe.run(other, inputs).filtered
-    np.testing.assert_allclose(without[:8], found[:8], rtol=1e-4, atol=1e-5)
+    small = 1e-3 * np.array(plant.prior)  # of a product that is at its bound
+    assert np.isclose(without[:8], found[:8], rtol=1e-4, atol=small).all()
     assert np.abs(without[8] - found[8]).max() > 1e-3
+
+
+def test_a_rate_adds_what_the_fast_state_keeps(parts):
+    plants = parts["plants"]
+    for plant, fast in ((plants.PLANTS[0], 2), (plants.PLANTS[1], 2), (plants.PLANTS[2], None)):
+        states, _, inputs = plants.simulate(plant, 0, 60)
+        effect = plants.effect_of_rates(plant, states[40:], inputs[40:]) / plant.dt
+        assert (effect > 0.0).all()
+        assert (effect < 1.2).all()
+        assert fast is None or effect[fast] == min(effect) < 0.1
+    feed = plants.PLANTS[0]
+    states, _, inputs = plants.simulate(feed, 0, 3)
+    assert plants.effect_of_rates(feed, states, inputs)[3] == pytest.approx(feed.dt)  # the volume

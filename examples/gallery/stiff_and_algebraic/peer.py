@@ -20,8 +20,9 @@ class DoMpc:
     """An estimator of do-mpc: Radau's collocation of the same order and substeps.
 
     Its prior is around the second state of its last solution, with a constant weight; its
-    parameter is constant in each window. It has no missing measurements: a weight of zero, a
-    parameter that varies in time, takes their place.
+    parameter is constant in each window; its disturbance is a rate. It has neither missing
+    measurements nor windows shorter than N, so that parameters that vary in time take their place:
+    a missing measurement has weight zero, and before the first sample the state stands still.
 
     Parameters
     ----------
@@ -31,11 +32,17 @@ class DoMpc:
         The first estimate, with the parameters behind it.
     horizon : int
         N.
+    prior : (n, n) array
+        Covariance of the first state of a window, with the parameters behind it.
+    rates : (n, n) array
+        Covariance of the disturbance.
     """
 
     engine = "Ipopt"
 
-    def __init__(self, plant: Plant, start: Array, horizon: int) -> None:
+    def __init__(
+        self, plant: Plant, start: Array, horizon: int, prior: Array, rates: Array
+    ) -> None:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")  # it misses ONNX, which is of no use here
             import do_mpc  # type: ignore[import-untyped,import-not-found,unused-ignore]
@@ -48,9 +55,10 @@ class DoMpc:
                 [model.set_variable(kind, f"{kind[1]}{i}") for i in range(size)]
                 for kind, size in counts.items()
             ]
-            rates, rest, outputs = plant.equations(*parts, ca)
-            for i, one in enumerate(rates):
-                model.set_rhs(f"x{i}", one, process_noise=True)
+            moving, rest, outputs = plant.equations(*parts, ca)
+            runs = model.set_variable("_tvp", "runs")
+            for i, one in enumerate(moving):
+                model.set_rhs(f"x{i}", runs * one, process_noise=True)
             for i, one in enumerate(rest):
                 model.set_alg(f"g{i}", one)
             for i, one in enumerate(outputs):
@@ -68,16 +76,15 @@ class DoMpc:
                 store_solver_stats=[],
             )
             mhe.settings.supress_ipopt_output()
-            n, prior = plant.n, 1.0 / np.array(plant.prior)
-            # Its disturbance is a rate.
-            rate = np.array(plant.disturbance)[:n] / plant.dt
+            n = plant.n
             mhe.set_default_objective(
-                P_x=np.diag(prior[:n] ** 2), P_w=np.diag(rate**-2),
+                P_x=np.linalg.inv(prior[:n, :n]),
+                P_w=ca.DM(np.linalg.inv(rates)) * (1 + 1e4 * (1 - runs)),
                 P_v=ca.diag(seen / ca.DM(np.square(plant.noise))),
-                P_p=np.diag(prior[n:] ** 2) if names else None,
+                P_p=np.linalg.inv(prior[n:, n:]) if names else None,
             )
             self._template = mhe.get_tvp_template()
-            self._seen, self._now = np.ones((1, len(outputs))), 0
+            self._seen, self._now = np.ones((1, len(outputs)), dtype=bool), 0
             mhe.set_tvp_fun(self._weights)
             for kind, first, least in (
                 ("_x", "x", plant.least[:n]), ("_p_est", "p", plant.least[n:])
@@ -115,8 +122,9 @@ class DoMpc:
         return SimpleNamespace(filtered=np.array(found), times=np.array(times))
 
     def _weights(self, _: float) -> Any:
-        """Which outputs each sample of the window has; before the first one, its copies."""
+        """Which outputs each sample of the window has, and whether time runs towards it."""
         for i in range(self._horizon):
-            t = max(self._now - self._horizon + 1 + i, 0)
-            self._template["_tvp", i, "seen"] = self._seen[t].astype(float)
+            t = self._now - self._horizon + 1 + i
+            self._template["_tvp", i, "seen"] = 1.0 * (self._seen[max(t, 0)] & (t >= 0))
+            self._template["_tvp", i, "runs"] = float(t > 0)
         return self._template
