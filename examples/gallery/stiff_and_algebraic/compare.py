@@ -1,7 +1,8 @@
 """The three models, estimated with filters, with moving horizon estimation and with do-mpc.
 
-All have the covariances of the simulation and the same horizon. Feed, substeps and disturbances of
-the plants were set after a look at records of the seeds 0 to 2; the tables have other seeds.
+All have the covariances of the simulation and the same horizon. The plants, the component that is
+judged and do-mpc's rates were set after a look at records of the seeds 0 to 2; the tables have
+other seeds.
 """
 
 from __future__ import annotations
