@@ -11,7 +11,17 @@ from numpy.typing import ArrayLike
 from .._checks import Array, positive
 from ..errors import InvalidInputError
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
-from .style import PROVED, REAL, STYLES, date_axis, line_styles, panels, run_times, time_words
+from .style import (
+    MEASURED,
+    PROVED,
+    REAL,
+    STYLES,
+    date_axis,
+    line_styles,
+    panels,
+    run_times,
+    time_words,
+)
 
 if TYPE_CHECKING:
     from ..estimation.estimate import Estimate
@@ -83,6 +93,9 @@ def states(
 ) -> list[Any]:
     """The estimates of a run, with bands of their covariances and of the proved set.
 
+    Measurements are dots on the states that they measure: those of an output that is equal to one
+    state, and to no other, at all estimates of the run.
+
     Parameters
     ----------
     run : Run
@@ -120,7 +133,9 @@ def states(
     names = run_labels(run) if labels is None else label_list(labels, n)
     drawn = trajectories(times, truth, lines, names, when, axes, residual=residual)
     date_axis(run, dt, drawn[-1])
-    add_bands(run, times, [panel.lines[-len(lines)] for panel in drawn], sigmas)
+    middle = [panel.lines[-len(lines)] for panel in drawn]
+    add_bands(run, times, middle, sigmas)
+    measured = add_measurements(run, times, middle)
     if band is not None:
         lower, upper = (
             curve(f"band[{side}]", values, count, n) for side, values in enumerate(_pair(band))
@@ -131,7 +146,7 @@ def states(
                 times, lower[:, j], upper[:, j], color=PROVED, linewidth=0.0, zorder=0.5,
                 label="holds the true state (proved)",
             )
-    if band is not None or (run.covariances is not None and len(run)):
+    if band is not None or measured or (run.covariances is not None and len(run)):
         _legend(drawn, axes)
     return drawn
 
@@ -151,6 +166,32 @@ def add_bands(run: Run, times: Array, lines: Sequence[Any], sigmas: float) -> No
             color=STYLES[0]["color"], alpha=0.35, linewidth=0.0,
             label=f"± {sigmas:g} standard deviations",
         )
+
+
+def add_measurements(run: Run, times: Array, lines: Sequence[Any]) -> bool:
+    """Dots of the measurements under the lines of the first states; whether there are any."""
+    if run.source is None or not len(run):
+        return False
+    system, y, x = run.source.system, run.source.measurements, run.states[:-1]
+    u = np.zeros((len(run), 0)) if run.source.inputs is None else run.source.inputs
+    try:
+        outputs = system.h.batch(x, u)
+        errors = y - outputs
+        if system.output_residual is not None:
+            system.output_residual.wrap(errors, y)
+    except Exception:  # a user's function
+        return False
+    same = (outputs[:, :, None] == x[:, None, :]).all(axis=0)
+    found = False
+    for i in np.flatnonzero(same.sum(axis=1) == 1):
+        j = int(same[i].argmax())
+        if j < len(lines) and np.isfinite(y[:, i]).any():
+            # An angle is drawn in the turn of its estimate.
+            values = y[:, i] if system.output_residual is None else (
+                lines[j].get_ydata()[:-1] + errors[:, i])
+            lines[j].axes.plot(times[:-1], values, zorder=0.9, **MEASURED)
+            found = True
+    return found
 
 
 def _pair(band: Any) -> tuple[ArrayLike, ArrayLike]:
@@ -223,13 +264,17 @@ def _names(labels: Sequence[str] | None, n: int) -> list[str]:
 
 def _legend(drawn: list[Any], axes: Any) -> None:
     """One legend: above all panels of a new figure, or within the first of given panels."""
-    handles, names = drawn[0].get_legend_handles_labels()
+    shown: dict[str, Any] = {}
+    for panel in drawn:
+        for handle, name in zip(*panel.get_legend_handles_labels(), strict=True):
+            shown.setdefault(name, handle)
     if axes is not None:
-        drawn[0].legend(frameon=False)
+        drawn[0].legend(shown.values(), shown.keys(), frameon=False)
         return
     figure = drawn[0].figure
     for old in list(figure.legends):
         old.remove()
     figure.legend(
-        handles, names, loc="outside upper center", ncols=min(len(names), 5), frameon=False
+        shown.values(), shown.keys(), loc="outside upper center", ncols=min(len(shown), 5),
+        frameon=False,
     )

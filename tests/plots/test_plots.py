@@ -77,6 +77,47 @@ def test_estimates_of_angles_are_drawn_on_the_turn_of_the_truth():
     assert low < drawn["estimate"][1:, 1].min() < drawn["estimate"][1:, 1].max() < high
 
 
+def test_measurements_are_dots_on_the_states_that_they_measure():
+    def h(x):
+        return np.array([x[2], 2.0 * x[0], x[1] + x[0], x[2]])
+
+    system = qpmhe.System(lambda x: 0.9 * x, h, n=3, p=4)
+    given = {"prior": np.eye(3), "disturbance": np.eye(3), "noise": np.eye(4)}
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.ExtendedKalman(**given), qpmhe.QuadraticCost.from_covariances(**given),
+        horizon=3, initial_state=[1.0, 2.0, 3.0])
+    y = np.random.default_rng(0).normal(size=(12, 4))
+    y[3, 0], y[:, 3] = np.nan, np.nan
+    run = mhe.run(y, covariances=True)
+    axes = plots.states(run, dt=0.5)
+    dots = [[line for line in panel.lines if line.get_label() == "measurement"] for panel in axes]
+    assert [len(each) for each in dots] == [0, 0, 1]
+    np.testing.assert_array_equal(dots[2][0].get_xdata(), 0.5 * np.arange(12))
+    np.testing.assert_array_equal(dots[2][0].get_ydata(), y[:, 0])
+    assert dots[2][0].get_zorder() < axes[2].collections[0].get_zorder()
+    (legend,) = axes[0].figure.legends
+    assert "measurement" in [each.get_text() for each in legend.get_texts()]
+    run.source = None
+    assert not any("measurement" in lines(panel) for panel in plots.states(run))
+
+
+def test_a_measured_angle_is_drawn_in_the_turn_of_its_estimate(case):
+    run = copy(case[1])
+    turns = 2.0 * np.pi * np.arange(len(run))
+    run.states = np.column_stack((np.append(turns, 0.0), np.ones(len(run) + 1)))
+
+    def wrap(errors, _):
+        errors[...] = (errors + np.pi) % (2.0 * np.pi) - np.pi
+
+    run.source = case[1].source._replace(
+        measurements=np.full((len(run), 1), 0.1),
+        system=SimpleNamespace(
+            h=SimpleNamespace(batch=lambda x, u: x[:, :1]), dt=None, signals=None,
+            output_residual=SimpleNamespace(wrap=wrap)))
+    found = lines(plots.states(run)[0])["measurement"]
+    np.testing.assert_allclose(found[:, 1], turns + 0.1)
+
+
 def test_time_is_in_seconds_where_the_step_is_known(case, monkeypatch):
     _, run, estimate = case
     for panel in (plots.states(run)[-1], plots.costs(run), plots.outcomes(run)):
