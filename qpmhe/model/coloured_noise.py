@@ -141,6 +141,9 @@ def augment_noise(
     another length forgets more or less; the covariance of :math:`w_c` stays the one that you give.
     One step of ``"rk4"`` multiplies by 0.27 at least, with two substeps by 0.073.
 
+    The set W of the larger system does not bound :math:`w_c`. For a certificate, give it one with
+    bounds of all disturbances by `System.with_sets`, or sizes.
+
     Source: A. E. Bryson and D. E. Johansen, "Linear filtering for time-varying systems using
     measurements containing colored noise", IEEE Trans. Automatic Control 10, 1965.
 
