@@ -36,6 +36,7 @@ from .estimation.estimate import DroppedRow, Estimate, Status
 from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
 from .estimation.settings import Settings
+from .model.coloured_noise import ColouredNoise, augment_noise
 from .model.constraints import Constraint
 from .model.noisy_inputs import noisy_inputs
 from .model.parameters import augment_parameters
@@ -113,6 +114,7 @@ __all__ = [
     "BatchEstimator",
     "Box",
     "Cauchy",
+    "ColouredNoise",
     "Compiled",
     "Constraint",
     "ConvexSet",
@@ -152,6 +154,7 @@ __all__ = [
     "UnscentedKalman",
     "__version__",
     "angles",
+    "augment_noise",
     "augment_parameters",
     "baselines",
     "batch",

@@ -97,12 +97,21 @@ def from_sympy(
         )
     def augmented(change: Augmentation, others: SystemOptions) -> System:
         moved = [sympy.Dummy(f"m{i}", real=True) for i in range(change.n - n)]
-        entries = change.inputs(given, moved)
-        replaced = dict(zip(given, map(sympy.sympify, entries), strict=True))
+        own = given[: change.m]
+
+        def of(column: Any) -> Any:
+            def evaluate(_: Any, v: Any) -> Any:
+                return column.xreplace(dict(zip(given, map(sympy.sympify, v), strict=True)))
+
+            return evaluate
+
+        def join(*parts: Any) -> Any:
+            return list(_flat(parts))
+
+        step = change.of_one_state(of(rates), join, 1.0 if dt is None else 0.0)
+        output, joint = change.of_one_state(of(outputs), join), [*state, *moved]
         return from_sympy(
-            [*rates.xreplace(replaced), *(moved if dt is None else [0] * len(moved))],
-            outputs.xreplace(replaced), [*state, *moved], given[: change.m], dt=dt, method=method,
-            **others,
+            step(joint, own), output(joint, own), joint, own, dt=dt, method=method, **others
         )
 
     return system.with_origin(make_augmented=augmented, recipe=(from_sympy, {

@@ -30,7 +30,7 @@ from .proposals import (
     units,
 )
 from .rows import doubled, dropped
-from .sensor_memory import with_coloured_noise, with_lag
+from .sensor_memory import coloured_variances, with_coloured_noise, with_lag
 from .signatures import additive
 
 # A finding lists at most so many rows.
@@ -172,7 +172,8 @@ CAUSES: dict[str, Cause] = {
         (with_coloured_noise,), "plain", 0.0, 3,
         "noise of {sensors} that is correlated over {samples}",
         "The noise of {sensors} is correlated in time, over about {samples}.",
-        "Estimate it as a further state (a first-order Markov process); leave Q and R as they are.",
+        "Estimate it as a further state: {augment}, with {white} for the variance{s_white} of the "
+        "white noise that remains in R{of}; leave the rest of Q and R as they are.",
     ),
     "change": Cause(
         (changing,), "log", np.log(2.0), 2,
@@ -263,7 +264,21 @@ def _words(fault: Fault, names: Names, deviations: Array, outlying: Array) -> di
         "ahead": "ahead of" if value > 0.0 else "behind",
         "rows": f"{count} row{'s' * (count > 1)}", "is_row": "are" if count > 1 else "is",
         "places": _places(fault.rows, names),
+        **(_augmented(fault, len(names.outputs)) if kind == "coloured" else {}),
         "shares": listed([f"{outlying[j]:.1%} of {names.outputs[j]}" for j in worst]),
+    }
+
+
+def _augmented(fault: Fault, p: int) -> dict[str, str]:
+    """The call that makes states of coloured noise, and what remains white."""
+    sensors, kept = list(fault.subject) or list(range(p)), float(np.exp(-1.0 / fault.value))
+    sizes = np.sqrt(coloured_variances(fault.hypothesis, kept))
+    white = fault.hypothesis.usual_noise.diagonal()[sensors]
+    deviations = [float(f"{one:.3g}") for one in sizes]
+    return {
+        "augment": f"qpmhe.augment_noise(system, {sensors}, correlation={kept:.4g}, "
+                   f"deviation={deviations})",
+        "white": listed([f"{one:.3g}" for one in white]), "s_white": "s" * (len(white) > 1),
     }
 
 

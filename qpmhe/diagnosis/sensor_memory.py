@@ -176,6 +176,13 @@ def coloured(
     return made(-1.0 / float(np.log(kept)))
 
 
+def coloured_variances(changed: Hypothesis, kept: float) -> Array:
+    """Stationary variances of the coloured noise of such a hypothesis, sensor by sensor."""
+    assert changed.bank is not None
+    added = changed.disturbance.diagonal()[changed.bank.system.n :]
+    return np.asarray(added[added > 0.0] / (1.0 - kept**2))
+
+
 def with_lag(evidence: Evidence) -> Iterator[Fault]:
     """Sensors that follow what they measure with a lag of the first order."""
     def lagging(part: tuple[int, ...], constant: float) -> Fault:

@@ -1,4 +1,4 @@
-"""Inputs of a model that become states, for unknown parameters and noisy inputs."""
+"""States behind those of a model: unknown parameters, errors of inputs, noise with memory."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.values import shown
 
 from ..errors import InvalidInputError, SetError, ShapeError
+from .derivatives import Jacobian
 from .functions import BatchedFunction, Trusted
 from .sets import Box, ConvexSet, SoftSet
 from .system import System
@@ -25,10 +26,11 @@ class Augmentation:
     r"""A change of a model of state x and inputs v into one of state z = (x, s) and inputs u.
 
     .. math::
-        v = \begin{pmatrix} u \\ c \end{pmatrix} + S s
+        v = \begin{pmatrix} u \\ c \end{pmatrix} + S s, \qquad y = h(x, v) + T s
 
-    where each column of S picks the input to which an entry of s is added. Every adapter applies
-    it to functions in its own language before they are differentiated and compiled.
+    where each column of S picks the input, or of T the output, to which an entry of s is added.
+    Every adapter applies it to functions in its own language before they are differentiated and
+    compiled.
 
     Parameters
     ----------
@@ -38,16 +40,58 @@ class Augmentation:
         c.
     moved : (k,) array of int
         The place in v of each entry of s.
+    outputs : (q, k) array, optional
+        T; none if left out.
+    memory : (k,) array, optional
+        With T: the factor of each entry of s that is its next value, or its rate. If left out, s
+        is constant.
     """
 
-    def __init__(self, n: int, m: int, constants: Array, moved: Index) -> None:
+    def __init__(
+        self, n: int, m: int, constants: Array, moved: Index, outputs: Array | None = None,
+        memory: Array | None = None,
+    ) -> None:
         self._n, self.m, self._constants, self._moved = n, m, constants, moved
+        self._outputs, self._memory = outputs, memory
         #: Number of states z.
-        self.n = n + moved.size
+        self.n = n + (moved.size if memory is None else memory.size)
 
     def beside(self, n: int) -> Augmentation:
         """The same change of a model of n states."""
-        return Augmentation(n, self.m, self._constants, self._moved)
+        return Augmentation(
+            n, self.m, self._constants, self._moved, self._outputs, self._memory
+        )
+
+    def memory(self, factor: float) -> Array:
+        """The factors (k,) of s, which are this one where s is constant."""
+        return np.full(self.n - self._n, factor) if self._memory is None else self._memory
+
+    def slopes(self, factor: float, **given: Jacobian | None) -> dict[str, Trusted]:
+        """Jacobians that the user gave, by name, as those by z; none where s acts on f."""
+        if self._outputs is None:
+            return {}
+        n, nothing = self._n, np.zeros(0)
+        nothings = np.zeros((n, self.n - n))
+        below = np.hstack((np.zeros((self.n - n, n)), np.diag(self.memory(factor))))
+
+        def extended(function: Jacobian, beside: Array | None) -> Trusted:
+            def evaluate(z: Array, u: Array = nothing) -> Array:
+                slope = function.batch(z[:, :n], u) if z.ndim > 1 else function(z[:n], u)
+                lead, right = z.shape[:-1], nothings if beside is None else beside
+                right = np.broadcast_to(right, (*lead, *right.shape))
+                wide = np.concatenate((slope, right), axis=-1)
+                if beside is not None:
+                    return wide
+                rows = np.broadcast_to(below, (*lead, *below.shape))
+                return np.concatenate((wide, rows), axis=-2)
+
+            return Trusted(evaluate)
+
+        return {
+            name: extended(one, self._outputs if name == "h_jacobian" else None)
+            for name, one in given.items()
+            if one is not None and one.method != "finite differences"
+        }
 
     def inputs(self, u: Any, s: Any) -> list[Any]:
         """The entries of v, of anything that has entries and can be added."""
@@ -61,14 +105,25 @@ class Augmentation:
     ) -> Function:
         """A function of (x, v) as one of (z, u), in a language of columns of one state.
 
-        ``join`` makes one column of several and of single entries. With a ``factor``, this
-        multiple of s stands behind the value.
+        ``join`` makes one column of several and of single entries. With a ``factor``, it is f, and
+        this multiple of s stands behind the value, or that of the memory; without, it is h.
         """
-        n = self._n
+        n, outputs = self._n, self._outputs
+        memory = self.memory(factor or 0.0).tolist()
 
         def evaluate(z: Any, u: Any = ()) -> Any:
-            value = function(z[:n], join(*self.inputs(u, z[n:])))
-            return value if factor is None else join(value, factor * z[n:])
+            s = [z[n + j] for j in range(len(memory))]
+            moved = self._moved.size + self._constants.size
+            value = function(z[:n], join(*self.inputs(u, s)) if moved else u)
+            if factor is not None:
+                return join(value, *(one * s[j] for j, one in enumerate(memory)))
+            if outputs is None:
+                return value
+            value = join(value)
+            entries = [value[i] for i in range(len(outputs))]
+            for i, j in np.argwhere(outputs).tolist():
+                entries[i] = entries[i] + s[j]
+            return join(*entries)
 
         return evaluate
 
@@ -76,18 +131,23 @@ class Augmentation:
         """The same of a NumPy function, over leading dimensions."""
         n, m, constants, moved = self._n, self.m, self._constants, self._moved
         size, inputs = function.shape[0], self.m + self._constants.size
+        added = self._outputs.T if self._outputs is not None and function.name == "h" else None
+        memory = self.memory(factor or 0.0)
         nothing: Array = np.zeros(0)
 
         def evaluate(z: Array, u: Array = nothing) -> Array:
             v = np.empty((*z.shape[:-1], inputs), np.result_type(z, u))
             v[..., :m], v[..., m:] = u, constants
-            v[..., moved] += z[..., n:]
+            if moved.size:
+                v[..., moved] += z[..., n:]
             x = z[..., :n]
             if z.ndim == 1:
                 value = np.asarray(function(x, v)).reshape(size)
             else:
                 value = function.batch(x, v)
-            return value if factor is None else np.concatenate((value, factor * z[..., n:]), -1)
+            if added is not None:
+                value = value + z[..., n:] @ added
+            return value if factor is None else np.concatenate((value, memory * z[..., n:]), -1)
 
         return Trusted(evaluate)
 
@@ -115,9 +175,11 @@ def augmented(system: System, change: Augmentation, **options: Unpack[SystemOpti
     if system.origin.make_augmented is not None:
         found = system.origin.make_augmented(change, options)
     else:
+        own = system.evaluation.functions
+        given = change.slopes(1.0, f_jacobian=own.f_jacobian, h_jacobian=own.h_jacobian)
         found = System(
             change.over_leading(system.f, 1.0), change.over_leading(system.h),
-            n=change.n, p=system.p, m=change.m, **options,
+            n=change.n, p=system.p, m=change.m, **given, **options,
         )
     return found.with_origin(held=system.held)
 

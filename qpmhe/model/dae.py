@@ -172,7 +172,7 @@ def made_from_dae(
                 found: Array = evaluate(np.concatenate((x, z, s), axis=-1), u)
                 if function.name != "rate":
                     return found
-                return np.concatenate((found, 0.0 * s), axis=-1)
+                return np.concatenate((found, change.memory(0.0) * s), axis=-1)
 
             return Trusted(of_joint_state)
 

@@ -95,9 +95,13 @@ def made_from_ode(
         )
 
     def augmented(change: Augmentation, others: SystemOptions) -> System:
-        return cls.from_ode(
-            change.over_leading(batched, 0.0), change.over_leading(system.h),
-            dt=dt, method=how.method, steps=how.steps, n=change.n, p=p, m=change.m, **others,
+        own = system.evaluation.functions
+        slopes = change.slopes(0.0, rate_jacobian=own.rate_jacobian, h_jacobian=own.h_jacobian)
+        return made_from_ode(
+            cls, change.over_leading(batched, 0.0), change.over_leading(system.h), dt=dt,
+            n=change.n, p=p, m=change.m, how=how, rate_jacobian=slopes.get("rate_jacobian"),
+            h_jacobian=slopes.get("h_jacobian"), options=others,
+            jacobians=jacobians if slopes else "given",
         )
 
     system = cls.made(

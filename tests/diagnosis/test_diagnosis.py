@@ -1,5 +1,6 @@
 """A diagnosis names the fault that was planted, and none in a healthy run."""
 
+import re
 import sys
 from html import escape
 from pathlib import Path
@@ -264,6 +265,38 @@ def test_what_factors_of_covariances_do_not_explain_is_not_blamed_on_them(a, spo
     first = found.findings[0]
     cause = "lag" if spoilt == "lag" else "coloured"
     assert cause in (first.kind, *first.equals), str(found)
+
+
+@pytest.mark.parametrize(
+    ("a", "seed", "sensors"), [(SPRING, 1, [0]), (TANKS, 0, [0, 1]), (TANKS, 1, [0])]
+)
+def test_the_remedy_for_coloured_noise_makes_the_innovations_white(a, seed, sensors):
+    def spoil(x, v):
+        y = x + v
+        y[:, sensors] = coloured(0.8)(x, v)[:, sensors]
+        return y
+
+    run = pair(a, seed, spoil=spoil)
+    before = qpmhe.diagnose(run)
+    (one,) = before.findings
+    assert one.kind == "coloured"
+    call = re.search(r"qpmhe\.augment_noise\(.*?\]\)", one.remedy)[0]
+    noisy = eval(call, {"qpmhe": qpmhe, "system": run.source.system})
+    assert noisy.system.n == 2 + len(sensors)
+    np.testing.assert_allclose(noisy.correlation, 0.8, atol=0.06)
+    np.testing.assert_allclose(np.sqrt(noisy.prior.diagonal()), 0.1, rtol=0.35)
+    white = re.search(r"with (.*) for the variance", one.remedy)[1].split(" and ")
+    r = 0.1**2 * np.eye(2)
+    r[sensors, sensors] = [float(text) for text in white]
+    given = noisy.covariances(prior=np.eye(2), disturbance=0.02**2 * np.eye(2), noise=r)
+    after = qpmhe.diagnose(qpmhe.MovingHorizonEstimator(
+        noisy.system, qpmhe.ExtendedKalman(**given), qpmhe.QuadraticCost.from_covariances(**given),
+        horizon=10, initial_state=noisy.initial_state(np.zeros(2)), engine="python", max_qps=0,
+    ).run(run.source.measurements, run.source.inputs))
+    assert after.is_healthy, str(after)
+    largest = [np.abs(found.correlations.own[1:6, sensors]).max() for found in (before, after)]
+    assert largest[0] > 0.3
+    assert largest[1] < 0.18  # 3.1 standard errors
 
 
 @pytest.mark.parametrize("a", [TANKS, SPRING], ids=["tanks", "spring"])
