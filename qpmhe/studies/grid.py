@@ -383,9 +383,14 @@ def _observers(value: Any) -> tuple[str, ...]:
 
 
 def _estimators(value: Any) -> dict[str, str]:
-    items = value if isinstance(value, Mapping) else {
-        one: one for one in ([value] if isinstance(value, str) else value)
-    }
+    if isinstance(value, Mapping):
+        items = dict(value)
+    else:
+        names = _several("estimators", value, f"expected some of {', '.join(KNOWN['estimators'])}, "
+                                              "functions, or a dictionary of these")
+        items = {one: one for one in names} if all(isinstance(one, str) for one in names) else {
+            str(k): one for k, one in enumerate(names)
+        }
     for name, text in items.items():
         if not (isinstance(name, str) and isinstance(text, str)):
             raise StudyError(
@@ -397,7 +402,7 @@ def _estimators(value: Any) -> dict[str, str]:
                 f"estimators has the name {name!r}, which is taken by "
                 f"{'the observer' if name == OBSERVER else 'a QP backend'}; give it another."
             )
-    return dict(items)
+    return items
 
 
 def _numbers(name: str, least: int, nothing: str) -> Callable[[Any], tuple[int | None, ...]]:
