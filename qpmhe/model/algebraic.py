@@ -121,8 +121,9 @@ class AlgebraicStates:
                 values, slopes = self._joint(trial, u[at]), self._jacobian(trial, u[at])
                 again = eliminated(values, J, n).step
                 curved = share(again - (1.0 - factor[:, None]) * step, scale)
+                # Beyond a fold, how far off the equations are says nothing.
+                curved[np.linalg.slogdet(slopes[:, n:, n:])[0] != found.side] = np.nan
                 good = straight(curved, factor, before, length)
-                good &= np.linalg.slogdet(slopes[:, n:, n:])[0] == found.side
                 outside = ~(good | done | lost)
                 if not outside.any():
                     break
