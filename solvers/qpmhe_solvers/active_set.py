@@ -30,6 +30,7 @@ _PATIENCE = 2
 # Exchanges without a cap. Most QPs take less than ten.
 _MOST_EXCHANGES = 1000
 _STOPPED = "the cap on exchanges, or on time, is reached"
+_DEPENDS = "active constraints depend on each other"
 _INFEASIBLE = "the QP is infeasible: a limit depends on active ones"
 
 
@@ -203,7 +204,7 @@ class _Search:
             columns = self._met(active)
             change = self._multipliers(active, columns @ column)
             if change is None:
-                return "active constraints depend on each other"
+                return _DEPENDS
             along = column - change @ columns
             slope, full, partial, leaves = float(along.dot(along)), math.inf, math.inf, -1
             if slope > _DEPENDENT * float(column.dot(column)):
@@ -220,7 +221,7 @@ class _Search:
                 if full == math.inf:
                     return _INFEASIBLE
                 self._minimise(np.array([new]), side)
-                return ""
+                return "" if self.sides[new] else _DEPENDS
             if full < math.inf:
                 self.step = self.step - partial * self._up(along)
             self.duals[active] -= partial * change

@@ -47,10 +47,9 @@ class AutoSolver(Solver):
     def _solve(self, qp: QP, start: Array | None) -> Solution:
         limit = self.time_limit
         until = None if limit is None else perf_counter() + limit
-        small, exact = qp.size <= _SMALL, self._exact
-        if small:
-            exact = None
-        elif exact is not None and self._active:  # which the factorisation alone would not see
+        small = qp.size <= _SMALL
+        exact = None if small else self._exact
+        if exact is not None and self._active:  # the factorisation alone will not do
             answer = self._exactly(exact, qp, limit)
             if answer is not None:
                 return answer

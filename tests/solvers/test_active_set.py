@@ -78,6 +78,33 @@ def test_limits_twice_and_limits_without_a_feasible_point(unit):
     assert "infeasible" in found.message
 
 
+def test_rows_of_zeros_and_equalities_that_repeat_others():
+    """A constraint without a slope, at a point where its gradient vanishes."""
+
+    def unconstrained():
+        qp = QP(4, 2, 2)
+        qp.band[:, :, 0] = 1.0
+        qp.gradient = -2.0
+        return qp
+
+    for limit, word in ((1.0, ""), (-1e-13, ""), (-1.0, "infeasible")):
+        qp = unconstrained()
+        qp.row_upper[1, 0] = limit
+        qp.upper = 0.5
+        found = create("active_set").solve(qp)
+        assert (found.status is SOLVED) == (not word)
+        assert word in found.message
+        if not word:
+            np.testing.assert_allclose(found.d, np.full((4, 2), 0.5))
+    qp = unconstrained()
+    qp.lower[0] = qp.upper[0] = 1.0
+    qp.row_own[0, 0] = 1.0
+    qp.row_lower[0, 0] = qp.row_upper[0, 0] = 2.0  # what both bounds say already
+    found = create("active_set").solve(qp)
+    assert found.status is SOLVED
+    np.testing.assert_allclose(found.d, [[1, 1], [2, 2], [2, 2], [2, 2]])
+
+
 @pytest.mark.parametrize("vague", [1e4, 1e8, 1e10])
 def test_a_vague_first_stage_changes_no_digit_of_the_rest(vague):
     qp, _ = make(9, 3, 2, bounds="all", sides="two", seed=5)
