@@ -5,6 +5,7 @@ of their rows is active at the estimates: boxes on the disturbances, on disturba
 and on the velocities. In one run, on one thread, all take the same windows:
 
 - the compiled step, converged and with one QP;
+- the Python step, converged, by the default backend and by PIQP;
 - CasADi's ``sqpmethod`` with HPIPM, converged, with the Gauss-Newton Hessian, from its previous
   solution, and the time of one of its QPs;
 - PIQP's own update and solve of the Python step's QPs, whose structure it knows already.
@@ -197,6 +198,9 @@ def measured(name: str, sets: dict[str, Any], steps: int) -> Case:
         return [mhe.update(y) for y in record][HORIZON:]
 
     converged, single = run(engine="compiled", max_qps=None), run(engine="compiled")
+    plain, by_piqp = (
+        run(engine="python", max_qps=None, backend=backend) for backend in ("auto", "piqp")
+    )
     Multistage.seconds = []
     run(engine="python", backend="multistage", max_qps=None)
     peer, theirs = Hpipm(example, sets), []
@@ -219,6 +223,8 @@ def measured(name: str, sets: dict[str, Any], steps: int) -> Case:
         len(solved) / len(theirs),
         {
             "compiled, converged": middle(e.step_time for e in converged),
+            "Python, converged": middle(e.step_time for e in plain),
+            "Python by PIQP, converged": middle(e.step_time for e in by_piqp),
             "HPIPM, converged": middle(theirs[k][1] for k in solved),
             "compiled, one QP": middle(e.step_time for e in single),
             "HPIPM, one QP": middle(theirs[k][2] for k in solved),
@@ -266,6 +272,11 @@ def main() -> None:
     for row in ("converged", "one QP"):
         table.add_row(f"compiled / HPIPM, {row}", *(
             f"{one.seconds[f'compiled, {row}'] / one.seconds[f'HPIPM, {row}']:.2f}"
+            for one in cases
+        ))
+    for other in ("Python by PIQP", "HPIPM"):
+        table.add_row(f"Python / {other}, converged", *(
+            f"{one.seconds['Python, converged'] / one.seconds[f'{other}, converged']:.2f}"
             for one in cases
         ))
     console.print(table)

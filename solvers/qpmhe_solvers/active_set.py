@@ -79,6 +79,7 @@ class ActiveSetSolver(Solver):
         self._most = options.max_iterations or most_exchanges
         self._sizes = (0, 0, 0)
         self._last: Sides = np.zeros(0, np.int8)
+        self._columns: _Columns | None = None
 
     def __reduce__(self) -> tuple[type[ActiveSetSolver], tuple[SolverOptions]]:
         return type(self), (self.options,)
@@ -93,22 +94,101 @@ class ActiveSetSolver(Solver):
     def forget(self) -> None:
         """Forget the last active set; see `Solver.forget`."""
         super().forget()
-        self._sizes, self._last = (0, 0, 0), np.zeros(0, np.int8)
+        self._sizes, self._last, self._columns = (0, 0, 0), np.zeros(0, np.int8), None
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         until = None if self.time_limit is None else perf_counter() + self.time_limit
-        factor, info = self._lapack.pbtrf(qp.lapack_band, lower=1)
-        if info != 0:
+        columns = self._columns
+        if columns is None or not columns.are_of(qp):  # else only the limits or g have changed
+            columns = self._columns = _Columns(self._lapack, qp)
+        if not columns.regular:
             return RawSolution(None, False, 0, message="H is not positive definite")
         if self._sizes != qp.sizes or not self.options.warm_start:
             self._sizes, self._last = qp.sizes, np.zeros(qp.all_lower.size, np.int8)
-        search = _Search(self._lapack, qp, factor, self._most, until)
+        search = _Search(qp, columns, self._most, until)
         message, duals = search.go(self._last), search.duals
         if not message:
             self._last = search.sides
         return RawSolution(
             search.step, not message, search.exchanges, duals[: qp.size], duals[qp.size :], message
         )
+
+
+class _Columns:
+    """The factor L of one H, columns L^-1 c of the constraints met so far, and their products.
+
+    ``regular`` says whether H is positive definite.
+    """
+
+    def __init__(self, lapack: _Lapack, qp: QP) -> None:
+        self._lapack, self._qp = lapack, qp.copy()
+        self._factor, info = lapack.pbtrf(qp.lapack_band, lower=1)
+        self.regular = info == 0
+        self._place = np.full(qp.all_lower.size, -1, np.intp)  # where a constraint's column stands
+        self._columns, self._gram = np.empty((0, qp.size)), np.empty((0, 0))
+
+    def are_of(self, qp: QP) -> bool:
+        """Whether H and the rows of a QP are the same."""
+        own = self._qp
+        return own.sizes == qp.sizes and all(
+            np.array_equal(getattr(own, name), getattr(qp, name))
+            for name in ("band", "row_own", "row_next")
+        )
+
+    def root(self, active: Index) -> tuple[Array, Array, int]:
+        """The root of C H^-1 C' with a diagonal of 1, its units, and how many are independent."""
+        places = self._place[active]
+        gram = self._gram[places[:, None], places]
+        unit = 1.0 / np.sqrt(gram.diagonal())
+        gram *= unit
+        gram *= unit[:, None]
+        root, info = self._lapack.potrf(gram.T, lower=1, overwrite_a=1)
+        independent = info - 1 if info > 0 else active.size
+        small = (root.diagonal()[:independent] < _DEPENDENT_ROOT).nonzero()[0]
+        return root, unit, int(small[0]) if small.size else independent
+
+    def met(self, constraints: Index) -> Array:
+        """The columns L^-1 c of constraints, as rows."""
+        places = self._place[constraints]
+        new = constraints[places < 0]
+        if new.size:
+            qp, normals = self._qp, np.zeros((new.size, self._qp.size))
+            bounds = (new < qp.size).nonzero()[0]
+            normals[bounds, new[bounds]] = 1.0
+            if bounds.size < new.size:
+                others = (new >= qp.size).nonzero()[0]
+                stage, row = np.divmod(new[others] - qp.size, qp.rows)
+                at = stage[:, None] * qp.n + np.arange(qp.n)
+                normals[others[:, None], at] = qp.row_own[stage, row]
+                inner = stage + 1 < qp.stages
+                normals[others[inner, None], at[inner] + qp.n] = (
+                    qp.row_next[stage[inner], row[inner]]
+                )
+            old, columns = len(self._columns), self.down(normals.T).T
+            self._place[new] = old + np.arange(new.size)
+            # The rows in C order are columns in Fortran order: LAPACK copies nothing.
+            self._columns = np.concatenate((self._columns, columns))
+            gram = np.empty((old + new.size, old + new.size))
+            gram[:old, :old] = self._gram
+            gram[old:] = columns @ self._columns.T
+            gram[:old, old:] = gram[old:, :old].T
+            self._gram, places = gram, self._place[constraints]
+        return self._columns[places]
+
+    def down(self, side: Array) -> Array:
+        """The solution x of L x = side."""
+        found: Array = self._lapack.tbtrs(self._factor, side, uplo="L")[0]
+        return found
+
+    def up(self, side: Array) -> Array:
+        """The solution x of L' x = side."""
+        found: Array = self._lapack.tbtrs(self._factor, side, uplo="L", trans="T")[0]
+        return found
+
+    def solve(self, root: Array, side: Array) -> Array:
+        """The solution x of R R' x = side."""
+        found: Array = self._lapack.potrs(root, side, lower=1)[0]
+        return found
 
 
 class _Search:
@@ -119,16 +199,11 @@ class _Search:
     multipliers, positive on the upper side.
     """
 
-    def __init__(
-        self, lapack: _Lapack, qp: QP, factor: Array, most: int, until: float | None
-    ) -> None:
-        self._lapack, self._qp, self._factor = lapack, qp, factor
-        self._most, self._until = most, until
-        self._free = -self._up(self._down(qp.gradient.reshape(-1)))
+    def __init__(self, qp: QP, columns: _Columns, most: int, until: float | None) -> None:
+        self._qp, self._columns, self._most, self._until = qp, columns, most, until
+        self._free = -columns.up(columns.down(qp.gradient.reshape(-1)))
         self._equal: Flags = (qp.all_lower == qp.all_upper) & np.isfinite(qp.all_lower)
         count = qp.all_lower.size
-        self._place = np.full(count, -1, np.intp)  # where a constraint's column stands
-        self._columns, self._gram = np.empty((0, qp.size)), np.empty((0, 0))
         self.sides, self.step, self.duals = np.zeros(count, np.int8), self._free, np.zeros(count)
         self.exchanges = 0
 
@@ -198,10 +273,10 @@ class _Search:
         """Make one constraint active; others leave before their multipliers change signs."""
         qp, sign = self._qp, float(side[new])
         limit = float((qp.all_upper if sign > 0.0 else qp.all_lower)[new])
-        column = sign * self._met(np.array([new]))[0]
+        column = sign * self._columns.met(np.array([new]))[0]
         while not self._stopped():
             active = self.sides.nonzero()[0]
-            columns = self._met(active)
+            columns = self._columns.met(active)
             change = self._multipliers(active, columns @ column)
             if change is None:
                 return _DEPENDS
@@ -223,7 +298,7 @@ class _Search:
                 self._minimise(np.array([new]), side)
                 return "" if self.sides[new] else _DEPENDS
             if full < math.inf:
-                self.step = self.step - partial * self._up(along)
+                self.step = self.step - partial * self._columns.up(along)
             self.duals[active] -= partial * change
             self.sides[leaves], self.duals[leaves] = 0, 0.0
         return _STOPPED
@@ -238,8 +313,8 @@ class _Search:
         self.step, self.duals = self._free, np.zeros(self.sides.size)
         if not active.size:
             return
-        columns = self._met(active)
-        root, unit, independent = self._root(active)
+        columns = self._columns.met(active)
+        root, unit, independent = self._columns.root(active)
         if independent < active.size:
             active, columns, unit = active[:independent], columns[:independent], unit[:independent]
             root = root[:independent, :independent]
@@ -249,59 +324,19 @@ class _Search:
         level = np.where(self.sides[active] > 0, qp.all_upper[active], qp.all_lower[active])
         for _ in range(2):  # the second time for the rounding of the first
             missed = self._values(self.step)[active] - level
-            force = unit * self._lapack.potrs(root, unit * missed, lower=1)[0]
+            force = unit * self._columns.solve(root, unit * missed)
             self.duals[active] += force
-            self.step = self.step - self._up(force @ columns)
+            self.step = self.step - self._columns.up(force @ columns)
 
     def _multipliers(self, active: Index, missed: Array) -> Array | None:
         """The solution y of C H^-1 C' y = missed on constraints; None where they are dependent."""
         if not active.size:
             return missed
-        root, unit, independent = self._root(active)
+        root, unit, independent = self._columns.root(active)
         if independent < active.size:
             return None
-        found: Array = unit * self._lapack.potrs(root, unit * missed, lower=1)[0]
+        found: Array = unit * self._columns.solve(root, unit * missed)
         return found
-
-    def _root(self, active: Index) -> tuple[Array, Array, int]:
-        """The root of C H^-1 C' with a diagonal of 1, its units, and how many are independent."""
-        places = self._place[active]
-        gram = self._gram[places[:, None], places]
-        unit = 1.0 / np.sqrt(gram.diagonal())
-        gram *= unit
-        gram *= unit[:, None]
-        root, info = self._lapack.potrf(gram.T, lower=1, overwrite_a=1)
-        independent = info - 1 if info > 0 else active.size
-        small = (root.diagonal()[:independent] < _DEPENDENT_ROOT).nonzero()[0]
-        return root, unit, int(small[0]) if small.size else independent
-
-    def _met(self, constraints: Index) -> Array:
-        """The columns L^-1 c of constraints, as rows."""
-        places = self._place[constraints]
-        new = constraints[places < 0]
-        if new.size:
-            qp, normals = self._qp, np.zeros((new.size, self._qp.size))
-            bounds = (new < qp.size).nonzero()[0]
-            normals[bounds, new[bounds]] = 1.0
-            if bounds.size < new.size:
-                others = (new >= qp.size).nonzero()[0]
-                stage, row = np.divmod(new[others] - qp.size, qp.rows)
-                at = stage[:, None] * qp.n + np.arange(qp.n)
-                normals[others[:, None], at] = qp.row_own[stage, row]
-                inner = stage + 1 < qp.stages
-                normals[others[inner, None], at[inner] + qp.n] = (
-                    qp.row_next[stage[inner], row[inner]]
-                )
-            old, columns = len(self._columns), self._down(normals.T).T
-            self._place[new] = old + np.arange(new.size)
-            # The rows in C order are columns in Fortran order: LAPACK copies nothing.
-            self._columns = np.concatenate((self._columns, columns))
-            gram = np.empty((old + new.size, old + new.size))
-            gram[:old, :old] = self._gram
-            gram[old:] = columns @ self._columns.T
-            gram[:old, old:] = gram[old:, :old].T
-            self._gram, places = gram, self._place[constraints]
-        return self._columns[places]
 
     def _values(self, step: Array) -> Array:
         qp = self._qp
@@ -309,13 +344,3 @@ class _Search:
             return step
         rows = qp.rows_times(step.reshape(qp.stages, qp.n))
         return np.concatenate((step, rows), axis=None)
-
-    def _down(self, side: Array) -> Array:
-        """The solution x of L x = side."""
-        found: Array = self._lapack.tbtrs(self._factor, side, uplo="L")[0]
-        return found
-
-    def _up(self, side: Array) -> Array:
-        """The solution x of L' x = side."""
-        found: Array = self._lapack.tbtrs(self._factor, side, uplo="L", trans="T")[0]
-        return found

@@ -59,6 +59,20 @@ def test_a_shift_moves_the_set_that_it_begins_with():
     assert [cold_again.solve(qp).iterations for _ in range(2)] == [cold, cold]
 
 
+def test_new_limits_and_gradients_of_the_same_matrices_and_new_matrices():
+    """One factorisation serves while H and the rows stay; a new solver gives the same answers."""
+    solver, (qp, _) = create("active_set"), make(9, 3, 2, bounds="all", sides="two", seed=1)
+    for name in ("gradient", "upper", "row_upper", "band", "row_own", "row_next"):
+        qp = qp.copy()
+        getattr(qp, name)[...] *= 1.1
+        if name.endswith("upper"):
+            low = getattr(qp, name.replace("upper", "lower"))
+            getattr(qp, name)[...] = np.maximum(getattr(qp, name), low)
+        found, fresh = solver.solve(qp), create("active_set").solve(qp)
+        assert found.status is fresh.status is SOLVED
+        np.testing.assert_allclose(found.d, fresh.d, atol=1e-11 * np.abs(fresh.d).max())
+
+
 @pytest.mark.parametrize("unit", [1.0, 1e6, 1e-6])
 def test_limits_twice_and_limits_without_a_feasible_point(unit):
     qp = QP(3, 2, 2)
