@@ -13,6 +13,7 @@ from qpmhe_solvers.values import shown
 from ..errors import InvalidInputError, SetError, ShapeError
 from .derivatives import Jacobian
 from .functions import BatchedFunction, Trusted
+from .residuals import extended
 from .sets import Box, ConvexSet, SoftSet
 from .system import System
 from .system_arguments import SystemOptions
@@ -242,7 +243,24 @@ def product(
     )
 
 
-def extended_matrix(system: System, k: int) -> Array | None:
+def inherited(
+    system: System, k: int, bounds: ConvexSet | None = None, still: ConvexSet | None = None
+) -> SystemOptions:
+    """The options of a system with k states behind it, all but ``scales``.
+
+    The k states stay in the set ``bounds``, their disturbances in ``still``; None is everything.
+    """
+    n = system.n
+    return {
+        "states": product(system.states, n, bounds, k),
+        "disturbances": product(system.disturbances, system.r, still, k),
+        "noises": system.noises, "disturbance_matrix": _extended_matrix(system, k),
+        "output_residual": system.output_residual,
+        "state_residual": extended(system.state_residual, n, n + k),
+    }
+
+
+def _extended_matrix(system: System, k: int) -> Array | None:
     """The system's ``disturbance_matrix`` with k states behind that have a disturbance each."""
     matrix = system.disturbance_matrix
     if matrix is None:

@@ -15,12 +15,10 @@ from qpmhe_solvers.values import shown
 
 from .._checks import numbers, positive_definite, positive_semidefinite, vector
 from ..errors import InvalidInputError, OptionError, ShapeError
-from .augmentation import Augmentation, Index, augmented, chosen, extended_matrix, product
+from .augmentation import Augmentation, Index, augmented, chosen, inherited
 from .discretize import Discretization, discretize
-from .residuals import extended
 from .signals import Signal
 from .system import System, checked_system
-from .system_arguments import SystemOptions
 
 Array = NDArray[np.float64]
 
@@ -160,10 +158,12 @@ def augment_noise(
     places = _places(system, outputs)
     k = places.size
     deviations = _each("deviation", deviation, k)
-    if (deviations <= 0.0).any():
+    with np.errstate(over="ignore"):
+        variances = deviations**2
+    if not ((deviations > 0.0) & (variances > 0.0) & np.isfinite(variances)).all():
         raise InvalidInputError(
-            f"deviation is {shown(deviation)}; expected numbers above 0, the standard deviations "
-            "of the noise. Leave out an output without coloured noise."
+            f"deviation is {shown(deviation)}; expected numbers above 0 with finite squares, the "
+            "standard deviations of the noise. Leave out an output without coloured noise."
         )
     kept = _correlations(system, correlation, time_constant, k)
     factors, how = kept, system.origin.how
@@ -171,13 +171,7 @@ def augment_noise(
         factors = np.array([-_decay(float(rho), how) / system.dt for rho in kept])
     added = np.eye(p)[:, places]
     change = Augmentation(n, system.m, np.zeros(0), np.arange(0), added, factors)
-    options: SystemOptions = {
-        "states": product(system.states, n, None, k),
-        "disturbances": product(system.disturbances, system.r, None, k),
-        "noises": system.noises, "disturbance_matrix": extended_matrix(system, k),
-        "output_residual": system.output_residual,
-        "state_residual": extended(system.state_residual, n, n + k),
-    }
+    options = inherited(system, k)
     if system.has_scales and system.scales is not None:
         options["scales"] = np.append(system.scales, deviations)
     signals = system.signals
@@ -189,7 +183,6 @@ def augment_noise(
     made = augmented(system, change, **options).with_origin(
         recipe=(_system, recipe), signals=signals
     )
-    variances = deviations**2
     return ColouredNoise(
         made, kept, np.diag(variances), np.diag(variances * (1.0 - kept) * (1.0 + kept))
     )

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InvalidInputError
-from .augmentation import Augmentation, augmented, chosen, extended_matrix, product
+from .augmentation import Augmentation, augmented, chosen, inherited
 from .functions import Trusted
 from .model import Origin
-from .residuals import extended
 from .system import System, checked_system
 from .system_arguments import SystemOptions
 
@@ -72,13 +71,7 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
     noisy = chosen("inputs", inputs, m, "input")
     if noisy.size == 0:
         raise InvalidInputError("inputs is empty; expected at least one input, or leave it out.")
-    options: SystemOptions = {
-        "states": product(system.states, n, None, noisy.size),
-        "disturbances": product(system.disturbances, system.r, None, noisy.size),
-        "noises": system.noises, "disturbance_matrix": extended_matrix(system, noisy.size),
-        "output_residual": system.output_residual,
-        "state_residual": extended(system.state_residual, n, n + noisy.size),
-    }
+    options = inherited(system, noisy.size)
     held = augmented(system, Augmentation(n, m, np.zeros(0), noisy), **options)
     recipe = noisy_inputs, {"system": system, "inputs": noisy}
     return _without_memory(held, slice(n, n + noisy.size), options).with_origin(recipe=recipe)

@@ -13,13 +13,12 @@ from qpmhe_solvers.values import finite, shown
 
 from .._checks import dimension, flag, numbers
 from ..errors import InvalidInputError, ModelError, OptionError, SetError, ShapeError
-from .augmentation import Augmentation, augmented, chosen, extended_matrix, product
+from .augmentation import Augmentation, augmented, chosen, inherited, product
 from .functions import BatchedFunction
 from .points import FEW, Points, points
-from .residuals import extended
-from .sets import Box, ConvexSet, SoftSet
+from .sets import Box, ConvexSet
 from .system import System
-from .system_arguments import SystemOptions, checked_set
+from .system_arguments import checked_set
 
 Array = NDArray[Any]
 Index = NDArray[np.intp]
@@ -193,28 +192,11 @@ class _Parameters(NamedTuple):
         constants[self.moved] = 0.0
         return Augmentation(n, m, constants, m + self.moved)
 
-    def sets(
-        self, states: ConvexSet | SoftSet | None, n: int,
-        disturbances: ConvexSet | SoftSet | None, r: int,
-    ) -> SystemOptions:
-        """X and W of the augmented system, of those of x alone."""
-        k = self.moved.size
-        return {
-            "states": product(states, n, self.bounds, k),
-            "disturbances": product(disturbances, r, self.still, k),
-        }
-
 
 def _of_system(f: System, m: int, parameters: _Parameters) -> System:
     """The augmented system of one whose last inputs, behind ``m`` others, are the parameters."""
-    change, k = parameters.change(f.n, m), parameters.moved.size
-    options: SystemOptions = {
-        "noises": f.noises, "disturbance_matrix": extended_matrix(f, k),
-        "output_residual": f.output_residual,
-        "state_residual": extended(f.state_residual, f.n, change.n),
-    }
-    options.update(parameters.sets(f.states, f.n, f.disturbances, f.r))
-    return augmented(f, change, **options)
+    options = inherited(f, parameters.moved.size, parameters.bounds, parameters.still)
+    return augmented(f, parameters.change(f.n, m), **options)
 
 
 def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
@@ -225,8 +207,12 @@ def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:
     states, disturbances = given["states"], given["disturbances"]
     hard = checked_set("states", states, n, alone)
     checked_set("disturbances", disturbances, n, alone)
-    sets = parameters.sets(states, n, disturbances, n)  # raises for soft ones
-    nominal, moved, bounds, _ = parameters
+    nominal, moved, bounds, still = parameters
+    k = moved.size
+    sets = {  # raises for soft ones
+        "states": product(states, n, bounds, k),
+        "disturbances": product(disturbances, n, still, k),
+    }
     probes = _probes(points(FEW, n, m, hard), nominal, moved, bounds)
     f, h = _function("f", given["f"], n, m, probes), _function("h", given["h"], p, m, probes)
     change, dt, method = parameters.change(n, m), given["dt"], given["method"]

@@ -271,6 +271,8 @@ def noisy(system=None, outputs=(0,), **options):
         (lambda: noisy(correlation=-0.1), "InvalidInputError", r"-0.1; expected numbers in"),
         (lambda: noisy(correlation=np.nan), "InvalidInputError", "correlation"),
         (lambda: noisy(deviation=0.0), "InvalidInputError", "deviation is 0.0; expected numbers"),
+        (lambda: noisy(deviation=1e200), "InvalidInputError", "with finite squares"),
+        (lambda: noisy(deviation=1e-200), "InvalidInputError", "numbers above 0 with finite"),
         (lambda: noisy(deviation=[1.0, 2.0]), "ShapeError", r"shape \(2,\).*each of the 1"),
         (lambda: noisy(correlation=None), "OptionError", "exactly one"),
         (lambda: noisy(of_ode(), correlation=0.5, time_constant=1.0), "OptionError", "exactly"),
