@@ -7,6 +7,7 @@ import hashlib
 import threading
 import weakref
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -129,7 +130,7 @@ def _made(
     chosen = _Chosen(file, outputs, inputs, parameters)
     instance = _instance(file, chosen)
     n, m, p = len(file.states), len(chosen.inputs), len(chosen.outputs)
-    at_rest = np.array([_number(one) for one in chosen.inputs])
+    at_rest = np.array([_start(file, one) for one in chosen.inputs])
     _check_no_time(file, instance, at_rest, positive("dt", dt))
     model = _Functions(instance, chosen)
     slopes = model.slopes(file, derivatives, at_rest)
@@ -177,7 +178,10 @@ class _File:
             with zipfile.ZipFile(self.path) as archive:
                 members = archive.namelist()
                 root = ElementTree.fromstring(archive.read("modelDescription.xml"))
-        except (OSError, KeyError, zipfile.BadZipFile, ElementTree.ParseError) as error:
+        except (
+            OSError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error,
+            ElementTree.ParseError,
+        ) as error:
             raise InvalidInputError(
                 f"path is {str(path)!r}, which is no FMU that can be read ({error}); expected a "
                 "zip archive with modelDescription.xml."
@@ -209,6 +213,12 @@ class _File:
             element.get(f"providesDirectionalDerivative{plural}") in ("true", "1")
         )
         self.variables = {one.name: one for one in self.description.modelVariables}
+        for one in self.variables.values():
+            if not 0 <= one.valueReference < 2**32:  # C would read some other place
+                raise self.error(
+                    f"the reference of {one.name} is {one.valueReference}",
+                    "one from 0 to 4294967295. Export it again"
+                )
         self._check_platform(fmpy, members)
         self._check_no_events()
         self.rates = [one.variable for one in self.description.derivatives]
@@ -217,6 +227,15 @@ class _File:
 
     def error(self, found: str, expected: str) -> ModelError:
         return ModelError(f"{self.path.name}: {found}; expected {expected}.")
+
+    def value(self, name: str, text: Any, reader: type = float) -> Any:
+        """A value in the description, which FMPy leaves a text."""
+        try:
+            return reader(text)
+        except ValueError as error:
+            raise self.error(
+                f"{name} is {text!r}", f"a value of type {reader.__name__}. Export it again"
+            ) from error
 
     def _check_kind(self, root: Element) -> None:
         if root.find("ModelExchange") is None:
@@ -376,17 +395,24 @@ def _values(
         kind, reader = _TYPES.get(one.type, (one.type, int))
         if file.fmi == 3 and one.type == "Enumeration":
             kind = "Int64"
-        number = finite(value)
-        is_right = isinstance(value, reader) if reader in (str, bool) else number is not None and (
-            reader is float or float(number).is_integer()
-        ) and not isinstance(value, bool)
-        if not is_right:
+        if not _is_of(value, kind, reader):
             raise InvalidInputError(
                 f"parameters[{name!r}] is {shown(value)}; expected a value of type {one.type}."
             )
-        value = reader(value)
-        found[name] = (kind, one.valueReference, value)
+        found[name] = (kind, one.valueReference, reader(value))
     return found
+
+
+def _is_of(value: Any, kind: str, reader: type) -> bool:
+    """Whether a value is one of a type; C would cut an integer that has too many bits."""
+    if reader in (str, bool):
+        return isinstance(value, reader)
+    number = None if isinstance(value, bool) else finite(value)
+    if number is None or reader is float:
+        return number is not None
+    bits = int(kind.rpartition("Int")[2]) if kind[-1].isdigit() else 32
+    least = 0 if kind.startswith("U") else -(2 ** (bits - 1))
+    return float(number).is_integer() and least <= int(value) < least + 2**bits
 
 
 # What sets a variable of a type, and the type in Python; all others are integers.
@@ -413,12 +439,12 @@ _MAKING = threading.RLock()
 def _instance(file: _File, chosen: _Chosen) -> Instance:
     """The instance with this wiring, shared with all systems that have it."""
     experiment = file.description.defaultExperiment
-    start = getattr(experiment, "startTime", None)
+    start = file.value("the start time", getattr(experiment, "startTime", None) or 0.0)
     wiring = Wiring(
         file.digest, file.fmi, file.exchange.modelIdentifier, file.description.guid,
         _references(file.states), _references(chosen.inputs), tuple(chosen.computed),
         _references(file.rates), tuple(chosen.values.values()),
-        float(start or 0.0), file.exchange.canBeInstantiatedOnlyOncePerProcess,
+        start, file.exchange.canBeInstantiatedOnlyOncePerProcess,
     )
     with _MAKING:
         found = _INSTANCES.get(wiring)
@@ -545,8 +571,12 @@ def _check_no_time(file: _File, instance: Instance, u: Array, dt: float) -> None
         ) from error
 
 
-def _number(variable: Any) -> float:
-    return float(variable.start or 0.0)
+def _start(file: _File, variable: Any) -> Any:
+    """A variable's start value, which FMPy leaves a text; 0 or blank if it has none."""
+    reader, start = _TYPES.get(variable.type, ("", int))[1], variable.start
+    if reader is bool:
+        return start in ("true", "1")
+    return file.value(f"the start value of {variable.name}", start or reader(), reader)
 
 
 def _signals(file: _File, chosen: _Chosen, instance: Instance) -> Signals:
@@ -554,23 +584,22 @@ def _signals(file: _File, chosen: _Chosen, instance: Instance) -> Signals:
         declared = variable.declaredType
         unit = variable.unit or getattr(declared, "unit", None) or ""
         size = nominal or variable.nominal or getattr(declared, "nominal", None) or 1.0
-        return Signal(variable.name, unit, value, float(size), variable.description or "")
+        size = file.value(f"the nominal value of {variable.name}", size)
+        return Signal(variable.name, unit, value, size, variable.description or "")
 
     def at_start(variable: Any) -> Any:
         if variable.name in chosen.values:
             return chosen.values[variable.name][2]
-        reader = _TYPES.get(variable.type, ("", int))[1]
-        start = variable.start
-        return start in ("true", "1") if reader is bool else reader(start or 0)
+        return _start(file, variable)
 
     states = zip(
         file.states, instance.initial_state.tolist(), instance.nominal.tolist(), strict=True
     )
-    x, u = instance.initial_state, np.array([_number(one) for one in chosen.inputs])
+    x, u = instance.initial_state, np.array([_start(file, one) for one in chosen.inputs])
     measured = _Functions(instance, chosen).output(x, u).tolist()
     return Signals(
         tuple(of(*one) for one in states),
-        tuple(of(one, _number(one)) for one in chosen.inputs),
+        tuple(of(one, _start(file, one)) for one in chosen.inputs),
         tuple(of(*one) for one in zip(chosen.outputs, measured, strict=True)),
         tuple(
             of(one, at_start(one)) for one in file.description.modelVariables

@@ -228,6 +228,11 @@ CHANGED = {
               "no continuous states"),
     "state": ([(' derivative="1"', "")], r"der\(upper\) are not those of a Real state"),
     "garbage": ([('index="3"', 'index="300"')], "FMPy cannot read its description"),
+    "start": ([('<Real start="1"', '<Real start="full"')], "start value of pump is 'full'; expec"),
+    "integer": ([('<Integer start="1"', '<Integer start="1.5"')], "start value of pipes is '1.5'"),
+    "nominal": ([('start="0" unit', 'nominal="big" start="0" unit')], "nominal value of leak is"),
+    "time": ([("<UnitD", '<DefaultExperiment startTime="noon"/><UnitD')], "start time is 'noon'"),
+    "reference": ([('valueReference="4"', 'valueReference="-4"')], "reference of pump is -4"),
 }
 
 
@@ -273,6 +278,7 @@ def test_more_fmus_that_are_refused(fmi):
         ({"parameters": {"area": True}}, "expected a value of type (Real|Float64)"),
         ({"parameters": {"area": np.nan}}, "expected a value of type (Real|Float64)"),
         ({"parameters": {"pipes": 1.5}}, "expected a value of type Int"),
+        ({"parameters": {"pipes": 2**31}}, "expected a value of type Int"),
         ({"parameters": {"schedules": 1}}, "expected a value of type Boolean"),
     ):
         with pytest.raises(InvalidInputError, match=text):
@@ -288,7 +294,7 @@ def test_more_fmus_that_are_refused(fmi):
 
 
 def test_files_that_are_none_and_no_fmpy(tmp_path, monkeypatch):
-    for path in (tmp_path / "none.fmu", tmp_path, 3):
+    for path in (tmp_path / "none.fmu", tmp_path, 3, "a\0b"):
         with pytest.raises(InvalidInputError, match="path is"):
             qpmhe.from_fmu(path, dt=0.1)
     bad = fmus.fmu()
