@@ -14,6 +14,7 @@ from .._checks import Array, flag
 from ..errors import InvalidInputError, ShapeError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
+from ..model.model import Model
 from ..terms.hold import Hold
 from ..terms.sum import further_terms
 from .certificate import Certificate
@@ -201,6 +202,7 @@ class Monitor:
     def _begin(self, certificate: Certificate, estimator: MovingHorizonEstimator) -> None:
         """What the theorem needs of the estimator."""
         self._certificate, cost = certificate, certificate.cost
+        self._evaluated = certificate.system.model()  # once: it compares traces at each call
         self.barred = _barred(estimator) or next((text for bars, text in (
             (not certificate.constants, "; ".join(certificate.failures)),
             (estimator.horizon not in certificate.constants,
@@ -365,7 +367,9 @@ class Monitor:
         if not self.bound.region.contains(estimate.trajectory[:-1]).all():
             return "the estimate left the region"
         with np.errstate(all="ignore"):
-            costs = _costs(self._certificate, estimate, np.array(self._inputs))
+            costs = _costs(
+                self._certificate, self._evaluated, estimate, np.array(self._inputs)
+            )
         # Comparisons with NaN are false.
         most = math.inf if Status.RESTORED in estimate.status else costs[1]
         if not costs[0] <= estimate.cost <= most:
@@ -447,15 +451,16 @@ def _barred(estimator: MovingHorizonEstimator) -> str:
     ) if bars), "")
 
 
-def _costs(certificate: Certificate, estimate: Estimate, u: Array) -> tuple[float, float]:
+def _costs(
+    certificate: Certificate, model: Model, estimate: Estimate, u: Array
+) -> tuple[float, float]:
     """J of the estimate and of the candidate, computed again: rounded down, and up.
 
     Where the prior's weight varies, J of the estimate is the least that it may be.
     """
-    system, cost = certificate.system, certificate.cost
+    cost = certificate.cost
     x, z = estimate.trajectory, estimate.candidate
     try:
-        model = system.model()
         outputs = (model.output(each[:-1], u) for each in (x, z))
         ahead = (model.step(each[:-1], u) for each in (x, z))
         (h_x, h_z), (f_x, f_z) = outputs, ahead

@@ -304,3 +304,12 @@ def test_a_monitor_is_for_one_estimator(certificate):
     ):
         with pytest.raises(error, match=words):
             asked()
+
+
+def test_a_model_is_looked_up_once(certificate, monkeypatch):
+    """To look a model up is to compare its traces with the functions again."""
+    mhe = estimator(certificate)
+    watch = Monitor(certificate, mhe, initial_error=START)
+    monkeypatch.setattr(qpmhe.System, "model", lambda *_: pytest.fail("looked up in a sample"))
+    readings = [watch.check(mhe.update(y)) for y in record(steps=8)[1]]
+    assert readings[-1].reason == ""
