@@ -7,7 +7,7 @@ operations each, and a graph of matrices (casadi.MX) calls these in turn.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 #: A matrix of at least so many nonzeros is kept as one. From 20 by 20 on, loops are faster than as
@@ -112,10 +112,15 @@ def _multiplies(function: Any) -> bool:
     """Whether there is a product with a large constant matrix in a graph."""
     mtimes = _casadi().OP_MTIMES
     return any(
-        function.instruction_id(k) == mtimes
-        and any(function.instruction_MX(k).dep(i).numel() >= LEAST for i in (1, 2))
-        for k in range(function.n_instructions())
+        code == mtimes and any(node.dep(i).numel() >= LEAST for i in (1, 2))
+        for code, node in _instructions(function)
     )
+
+
+def _instructions(function: Any) -> Iterator[tuple[int, Any]]:
+    """The code and the node of each instruction of a graph, in their order."""
+    for k in range(function.n_instructions()):
+        yield function.instruction_id(k), function.instruction_MX(k)
 
 
 def _evaluated(function: Any, arguments: list[Any], products: Products) -> list[Any]:
@@ -123,30 +128,39 @@ def _evaluated(function: Any, arguments: list[Any], products: Products) -> list[
     ca = _casadi()
     if not function.is_a("MXFunction"):
         return list(function.call([ca.SX(one) for one in arguments]))
+
+    def evaluate(code: int, node: Any, given: list[Any]) -> list[Any]:
+        if code == ca.OP_CONST:
+            return [ca.sparsify(node.to_DM())]
+        if code == ca.OP_RESHAPE:
+            return [ca.reshape(given[0], *node.shape)]
+        if code == ca.OP_MTIMES:
+            into, left, right = given
+            return [into + products.of(left, right)]
+        if code == ca.OP_CALL:
+            return _evaluated(node.which_function(), given, products)
+        operands = [node.dep(i) for i in range(node.n_dep())]
+        symbols = [ca.MX.sym("a", one.sparsity()) for one in operands]
+        operation = ca.Function("one", symbols, [ca.graph_substitute(node, operands, symbols)])
+        return list(operation.call([ca.SX(one) for one in given]))
+
+    return _walked(function, arguments, evaluate)
+
+
+def _walked(function: Any, arguments: list[Any], evaluate: Callable[..., list[Any]]) -> list[Any]:
+    """The results of a graph, by a function of each instruction's code, node and operands."""
+    ca = _casadi()
     work: dict[int, Any] = {}
     results: list[Any] = [None] * function.n_out()
-    for k in range(function.n_instructions()):
-        code, node = function.instruction_id(k), function.instruction_MX(k)
-        places, given = function.instruction_output(k), function.instruction_input(k)
+    for k, (code, node) in enumerate(_instructions(function)):
+        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
         if code == ca.OP_INPUT:
-            work[places[0]] = arguments[given[0]]
+            work[outputs[0]] = arguments[inputs[0]]
         elif code == ca.OP_OUTPUT:
-            results[places[0]] = work[given[0]]
-        elif code == ca.OP_CONST:
-            work[places[0]] = ca.sparsify(node.to_DM())
-        elif code == ca.OP_RESHAPE:
-            work[places[0]] = ca.reshape(work[given[0]], *node.shape)
-        elif code == ca.OP_MTIMES:
-            into, left, right = (work[one] for one in given)
-            work[places[0]] = into + products.of(left, right)
-        elif code == ca.OP_CALL:
-            inner, values = node.which_function(), [work[one] for one in given]
-            work.update(zip(places, _evaluated(inner, values, products), strict=True))
+            results[outputs[0]] = work[inputs[0]]
         else:
-            operands = [node.dep(i) for i in range(node.n_dep())]
-            symbols = [ca.MX.sym("a", one.sparsity()) for one in operands]
-            operation = ca.Function("one", symbols, [ca.graph_substitute(node, operands, symbols)])
-            work[places[0]], = operation.call([ca.SX(work[one]) for one in given])
+            found = evaluate(code, node, [work[one] for one in inputs])
+            work.update(zip(outputs, found, strict=True))
     return results
 
 
@@ -167,8 +181,8 @@ def operations(function: Any) -> int:
         return int(function.n_instructions())
     ca = _casadi()
     return sum(
-        operations(function.instruction_MX(k).which_function())
-        if function.instruction_id(k) == ca.OP_CALL else 1 for k in range(function.n_instructions())
+        operations(node.which_function()) if code == ca.OP_CALL else 1
+        for code, node in _instructions(function)
     )
 
 
@@ -178,21 +192,17 @@ def has_products(function: Any) -> bool:
         return False
     ca, products = _casadi(), False
     known = (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_RESHAPE)
-    for k in range(function.n_instructions()):
-        code = function.instruction_id(k)
+    for code, node in _instructions(function):
         if code == ca.OP_CALL:
-            inner = function.instruction_MX(k).which_function()
+            inner = node.which_function()
             products |= has_products(inner)
             if not (inner.is_a("SXFunction") or has_products(inner)):
                 return False
         elif code == ca.OP_MTIMES:
-            into, matrix, _ = (function.instruction_MX(k).dep(i) for i in range(3))
-            if not (into.is_zero() and matrix.is_constant()):
+            if not (node.dep(0).is_zero() and node.dep(1).is_constant()):
                 return False
             products = True
-        elif code not in known and not (
-            code == ca.OP_PROJECT and function.instruction_MX(k).is_dense()
-        ):
+        elif code not in known and not (code == ca.OP_PROJECT and node.is_dense()):
             return False
     return products
 
@@ -222,29 +232,22 @@ def with_slope(function: Any, x: Any, u: Any) -> tuple[Any, Any]:
 def _differentiated(function: Any, arguments: list[_Known]) -> list[_Known]:
     """The values of a function that has products, and their derivatives."""
     ca = _casadi()
-    work: dict[int, _Known] = {}
-    results: list[_Known] = [(None, None)] * function.n_out()
-    for k in range(function.n_instructions()):
-        code, node = function.instruction_id(k), function.instruction_MX(k)
-        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
-        if code == ca.OP_INPUT:
-            work[outputs[0]] = arguments[inputs[0]]
-        elif code == ca.OP_OUTPUT:
-            results[outputs[0]] = work[inputs[0]]
-        elif code == ca.OP_CONST:
-            work[outputs[0]] = node, None
-        elif code in (ca.OP_RESHAPE, ca.OP_PROJECT):
-            value, slope = work[inputs[0]]
-            value = ca.reshape(value, *node.shape) if code == ca.OP_RESHAPE else ca.densify(value)
-            work[outputs[0]] = value, slope
-        elif code == ca.OP_MTIMES:
-            (matrix, _), (value, slope) = (work[one] for one in inputs[1:])
-            work[outputs[0]] = ca.mtimes(matrix, value), _moved(matrix, slope)
-        else:
-            inner, given = node.which_function(), [work[one] for one in inputs]
+
+    def evaluate(code: int, node: Any, given: list[_Known]) -> list[_Known]:
+        if code == ca.OP_CONST:
+            return [(node, None)]
+        if code == ca.OP_CALL:
+            inner = node.which_function()
             of = _of_scalars if inner.is_a("SXFunction") else _differentiated
-            work.update(zip(outputs, of(inner, given), strict=True))
-    return results
+            return of(inner, given)
+        if code == ca.OP_MTIMES:
+            (matrix, _), (value, slope) = given[1:]
+            return [(ca.mtimes(matrix, value), _moved(matrix, slope))]
+        (value, slope), = given
+        is_reshape = code == ca.OP_RESHAPE
+        return [(ca.reshape(value, *node.shape) if is_reshape else ca.densify(value), slope)]
+
+    return _walked(function, arguments, evaluate)
 
 
 def _moved(matrix: Any, slope: Any) -> Any:
