@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .._checks import numbers
+from qpmhe_solvers.values import shown
+
+from .._checks import flag, numbers
 from ..errors import ModelError, ShapeError
 from ..model.symbols import Symbol, SymbolArray
 
@@ -83,6 +85,7 @@ class _Scaled:
     inverse: bool = False
 
     def __call__(self, x: Any) -> Any:
+        _check_size(self.name, self.scale.size, x)
         return x * self.scale + self.shift if self.inverse else (x - self.shift) / self.scale
 
 
@@ -96,11 +99,15 @@ class _Normalized:
     offset: Array
 
     def __call__(self, x: Any) -> Any:
-        if np.shape(x)[-1] != self.weight.size:  # NumPy would repeat a single one
-            raise ShapeError(f"{self.name} of {self.weight.size} has {np.shape(x)[-1]} inputs.")
+        _check_size(self.name, self.weight.size, x)
         gap = x - np.mean(x, axis=-1, keepdims=True)
         variance = np.mean(gap * gap, axis=-1, keepdims=True)
         return gap / np.sqrt(variance + self.eps) * self.weight + self.offset
+
+
+def _check_size(name: str, size: int, x: Any) -> None:
+    if np.shape(x)[-1] != size:  # NumPy would repeat a single one
+        raise ShapeError(f"{name} of {size} has {np.shape(x)[-1]} inputs.")
 
 
 @dataclass(frozen=True)
@@ -226,7 +233,7 @@ def from_torch(module: Any, *, traced: bool = True) -> LearntFunction | TorchFun
                 f"the weights {name} have the type {kind}; expected float32 or float64. Weights "
                 "in half precision become single precision by module.float()."
             )
-    if not traced:
+    if not flag("traced", traced):
         return TorchFunction(module)
     return LearntFunction(type(module).__name__, list(_torch_layers(module, "module")))
 
@@ -357,8 +364,8 @@ def _sklearn_layers(model: Any) -> Iterator[Layer]:
                     yield _Activation(kind, _OF_SKLEARN[kind])
             return
     raise ModelError(
-        f"there is a {name}, which has no form in NumPy here; expected an MLPRegressor, or a "
-        "Pipeline of StandardScaler and MLPRegressor."
+        f"{shown(model)} has no form in NumPy here; expected a fitted MLPRegressor, or a Pipeline "
+        "of StandardScaler and MLPRegressor."
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.adapters.learnt import LearntFunction, _Activation, _Affine, _Normalized
+from qpmhe.adapters.learnt import LearntFunction, _Activation, _Affine, _Normalized, _Scaled
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import ModelError, ShapeError
 
@@ -73,15 +73,19 @@ def test_what_sklearn_has_besides_is_refused_by_name(sklearn):
         (sklearn.kind(), "MLPRegressor is not fitted"),
         (sklearn.compose.TransformedTargetRegressor(), "TransformedTargetRegressor is not fitted"),
         (transformed, "no StandardScaler as its transformer"),
-        (sklearn.preprocessing.MinMaxScaler().fit(X), "there is a MinMaxScaler"),
+        (sklearn.preprocessing.MinMaxScaler().fit(X), r"MinMaxScaler\(\) has no form"),
         (sklearn.preprocessing.StandardScaler().fit(X), "has no linear layer"),
-        (type("Own", (sklearn.kind,), {})(), "there is a Own"),
-        (3, "there is a int"),
+        (type("Own", (sklearn.kind,), {})(), "Own.* has no form"),
+        (sklearn.kind, "MLPRegressor'> has no form in NumPy here; expected a fitted"),
+        (3, "3 has no form"),
     ):
         with pytest.raises(ModelError, match=message):
             qpmhe.from_sklearn(wrong)
     with pytest.raises(ShapeError, match=r"shape \(2,\); expected \(\.\.\., 3\)"):
         qpmhe.from_sklearn(model)([1.0, 2.0])
+    scaler = _Scaled("scaler", np.zeros(1), np.ones(1))  # NumPy would repeat it
+    with pytest.raises(ModelError, match="do not fit together: scaler of 1 has 3 inputs"):
+        LearntFunction("both", [scaler, _Affine("layer", np.ones((1, 3)), np.zeros(1))])
     model.coefs_[0][0, 0] = np.nan
     with pytest.raises(qpmhe.errors.InvalidInputError, match=r"coefs_\[0\]"):
         qpmhe.from_sklearn(model)
