@@ -29,7 +29,7 @@ SMALL = 1e-7
 ROUNDING = 4e-16
 #: How far the equations may be from linear along a step, as a share of it.
 CURVED = 0.5
-#: By how much a step that is not becomes shorter: at least, and at most.
+#: Factors that shorten a step along which they are less linear: the least and the largest.
 LESS = 0.1, 0.5
 
 
@@ -201,8 +201,9 @@ def solved(matrix: Array, right: Array, inverses: Array) -> Array:
 def straight(curved: Array, factor: Array, before: Array, length: Array) -> Mask:
     """Whether the equations are nearly linear along steps of these factors (K,).
 
-    ``curved`` is how far the correction behind is from that of linear equations, a share as
-    ``before`` is of the whole step. Of the last steps only a finite value is asked for.
+    ``curved`` says how far the correction after the step is from the one that linear equations
+    would give; like ``before``, the length of the whole step, it is a share of the variables'
+    sizes. Where ``length`` says that the step is one of the last, any finite ``curved`` will do.
     """
     found: Mask = (curved <= CURVED * factor * before) | ((length <= SMALL) & np.isfinite(curved))
     return found

@@ -44,8 +44,8 @@ class Augmentation:
     outputs : (q, k) array, optional
         T; none if left out.
     memory : (k,) array, optional
-        With T: the factor of each entry of s that is its next value, or its rate. If left out, s
-        is constant.
+        With T: each entry of s times its factor is its next value, or its rate. If left out, s is
+        constant.
     """
 
     def __init__(
@@ -64,11 +64,11 @@ class Augmentation:
         )
 
     def memory(self, factor: float) -> Array:
-        """The factors (k,) of s, which are this one where s is constant."""
+        """The factors (k,) of the entries of s; this one for each where s is constant."""
         return np.full(self.n - self._n, factor) if self._memory is None else self._memory
 
     def slopes(self, factor: float, **given: Jacobian | None) -> dict[str, Trusted]:
-        """Jacobians that the user gave, by name, as those by z; none where s acts on f."""
+        """Jacobians by z, by name, from those by x that are exact; none where s acts on inputs."""
         if self._outputs is None:
             return {}
         n, nothing = self._n, np.zeros(0)
@@ -106,8 +106,9 @@ class Augmentation:
     ) -> Function:
         """A function of (x, v) as one of (z, u), in a language of columns of one state.
 
-        ``join`` makes one column of several and of single entries. With a ``factor``, it is f, and
-        this multiple of s stands behind the value, or that of the memory; without, it is h.
+        ``join`` makes one column of several columns and single entries. With a ``factor``, the
+        function is f, and the next s, or its rate, stands behind the value: s times its memory, or
+        times this factor where s is constant. Without a factor, the function is h.
         """
         n, outputs = self._n, self._outputs
         memory = self.memory(factor or 0.0).tolist()

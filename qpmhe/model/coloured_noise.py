@@ -134,9 +134,9 @@ def augment_noise(
 
     Notes
     -----
-    In a system with a rate, c has the rate :math:`-\kappa c`, discretised as x, with the
-    :math:`\kappa` whose step of the usual length multiplies c by rho exactly. So a step of
-    another length forgets more or less; the covariance of :math:`w_c` stays the one that you give.
+    In a system with a rate, c has the rate :math:`-\kappa c`, which is discretised as the rate of
+    x is; :math:`\kappa` is chosen so that a step of the usual length multiplies c by rho exactly.
+    Longer steps forget more and shorter ones less, but the covariance of :math:`w_c` is the same.
     One step of ``"rk4"`` multiplies by 0.27 at least, with two substeps by 0.073.
 
     The set W of the larger system does not bound :math:`w_c`. For a certificate, give it one with

@@ -1,8 +1,8 @@
 """Products with large constant matrices as one operation each, in functions and their Jacobians.
 
-A trace is of scalar operations (casadi.SX), of which a dense matrix would take one for each entry.
-A product stands for new symbols there; what is between products becomes one function of scalar
-operations each, and a graph of matrices (casadi.MX) calls these in turn.
+A trace consists of scalar operations (casadi.SX), and a product with a dense matrix would take one
+for each of its entries. New symbols stand for the product instead. The scalar operations between
+products become functions, which a graph of matrices (casadi.MX) calls in turn.
 """
 
 from __future__ import annotations
@@ -82,10 +82,10 @@ class Products:
 
 
 def with_products(function: Any) -> Any:
-    """A graph of matrices (MX) whose products with large constant matrices are one operation each.
+    """A graph of matrices (MX) in another form: between products, it has scalar operations.
 
-    Between these it is of scalar operations. None where there is no such product, or an operation
-    that has no scalar form.
+    Each product with a large constant matrix is one operation. None where there is no such product,
+    or where an operation has no scalar form.
     """
     if not any(_multiplies(one) for one in _graphs(function)):
         return None
@@ -208,7 +208,7 @@ def has_products(function: Any) -> bool:
 
 
 def in_scalars(function: Any) -> Any:
-    """The same of scalar operations alone, where these are not too many."""
+    """The same function in scalar operations alone, where these are not too many."""
     if not has_products(function):
         return function
     found = function.expand()
@@ -251,7 +251,7 @@ def _differentiated(function: Any, arguments: list[_Known]) -> list[_Known]:
 
 
 def _moved(matrix: Any, slope: Any) -> Any:
-    """The derivative of C V, by that of the entries of V, column by column."""
+    """The derivative of C V, column by column, from the derivative of the entries of V."""
     if slope is None:
         return None
     ca, (rows, inner), count = _casadi(), matrix.shape, slope.shape[0] // matrix.shape[1]

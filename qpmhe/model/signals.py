@@ -22,7 +22,7 @@ class Signal(NamedTuple):
     nominal : float
         Its typical magnitude, 1 if none is given.
     description : str
-        What it is; blank if nothing is given.
+        A text about it; blank if none is given.
     """
 
     name: str

@@ -225,7 +225,7 @@ class Symbol:
         """Return the symbol itself: a state is real."""
         return self
 
-    @property  # type: ignore[misc]  # NumPy asks for this attribute
+    @property  # type: ignore[misc]  # NumPy asks for it, but never sets it, as one can of an object
     def __class__(self) -> Any:
         """The type of an array's entry, for who asks by ``isinstance``."""
         return np.bool_ if self.logical else np.float64

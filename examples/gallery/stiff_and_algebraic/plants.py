@@ -211,7 +211,7 @@ def simulate(plant: Plant, seed: int, steps: int) -> tuple[Array, Array, Array]:
     x, parameters = drawn[:n], drawn[n:]
     for t, u in enumerate(inputs):
         states[t] = np.concatenate((x, parameters))
-        if z.size:  # the z of this x and u: that of a sample without length
+        if z.size:  # z solves the algebraic equations at this x and u
             z = _consistent(plant)(z, np.concatenate((x, u))).full().ravel()
         y = np.array(outputs(x, z, u, parameters)).ravel()
         y += plant.noise * rng.standard_normal(y.size)
