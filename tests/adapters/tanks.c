@@ -10,6 +10,8 @@
 #define FATAL fmi3Fatal
 typedef fmi3Status status;
 typedef fmi3ValueReference reference;
+typedef fmi3Instance instance;
+#define IN(name) fmi3##name
 #else
 #include "fmi2Functions.h"
 #define OK fmi2OK
@@ -18,6 +20,8 @@ typedef fmi3ValueReference reference;
 #define FATAL fmi2Fatal
 typedef fmi2Status status;
 typedef fmi2ValueReference reference;
+typedef fmi2Component instance;
+#define IN(name) fmi2##name
 #endif
 
 /* References: 0, 1 the levels; 2, 3 their rates; 4 pump; 5 leak, an input; 6 flow; 7 total; 8 area, 9 outlet, 10 drift:
@@ -100,8 +104,18 @@ static tanks *started(const char *name)
     return t;
 }
 
-#if FMI == 3
 #define C(x) ((tanks *)(x))
+void IN(FreeInstance)(instance c) { free(c); }
+status IN(Terminate)(instance c) { return OK; }
+status IN(ExitInitializationMode)(instance c) { return OK; }
+status IN(EnterContinuousTimeMode)(instance c) { C(c)->initialised = 1; return OK; }
+status IN(SetTime)(instance c, double time) { C(c)->time = time; return OK; }
+status IN(SetContinuousStates)(instance c, const double *x, size_t n) { memcpy(C(c)->reals, x, n * sizeof *x); return OK; }
+status IN(GetContinuousStates)(instance c, double *x, size_t n) { memcpy(x, C(c)->reals, n * sizeof *x); return OK; }
+status IN(GetNominalsOfContinuousStates)(instance c, double *x, size_t n) { x[0] = NOMINAL; x[1] = 1.0; return OK; }
+static status rates(instance c, double *d, size_t n) { status s = evaluate(C(c)); memcpy(d, C(c)->reals + 2, n * sizeof *d); return s; }
+
+#if FMI == 3
 fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String path, fmi3Boolean v, fmi3Boolean l,
     fmi3InstanceEnvironment e, fmi3LogMessageCallback log)
 {
@@ -111,20 +125,11 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
     t->log = log;
     return t;
 }
-void fmi3FreeInstance(fmi3Instance c) { free(c); }
-fmi3Status fmi3Terminate(fmi3Instance c) { return OK; }
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean d, fmi3Float64 tol, fmi3Float64 start, fmi3Boolean e, fmi3Float64 stop)
 { C(c)->time = start; return OK; }
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { return OK; }
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { C(c)->initialised = 1; return OK; }
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *more, fmi3Boolean *ends, fmi3Boolean *n, fmi3Boolean *v, fmi3Boolean *has, fmi3Float64 *when)
 { *more = *ends = *n = *v = 0; *has = C(c)->schedules; *when = 3.0; return OK; }
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) { C(c)->time = time; return OK; }
-fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 *x, size_t n) { memcpy(C(c)->reals, x, n * sizeof *x); return OK; }
-fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 *x, size_t n) { memcpy(x, C(c)->reals, n * sizeof *x); return OK; }
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 *x, size_t n) { x[0] = NOMINAL; x[1] = 1.0; return OK; }
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 *d, size_t n)
-{ status s = evaluate(C(c)); memcpy(d, C(c)->reals + 2, n * sizeof *d); return s; }
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 *d, size_t n) { return rates(c, d, n); }
 fmi3Status fmi3GetFloat64(fmi3Instance c, const fmi3ValueReference *r, size_t n, fmi3Float64 *v, size_t nv) { return get(C(c), r, n, v); }
 fmi3Status fmi3SetFloat64(fmi3Instance c, const fmi3ValueReference *r, size_t n, const fmi3Float64 *v, size_t nv) { return put(C(c), r, n, v); }
 fmi3Status fmi3SetBoolean(fmi3Instance c, const fmi3ValueReference *r, size_t n, const fmi3Boolean *v, size_t nv) { C(c)->schedules = v[0]; return OK; }
@@ -134,7 +139,6 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference
     const fmi3Float64 *seed, size_t ns, fmi3Float64 *out, size_t no)
 { return nu == no && nk == ns ? slope(C(c), u, nu, k[0], seed[0], out) : ERROR; }
 #else
-#define C(x) ((tanks *)(x))
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String path, const fmi2CallbackFunctions *f, fmi2Boolean v, fmi2Boolean l)
 {
     tanks *t;
@@ -143,20 +147,11 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     t->log = f->logger;
     return t;
 }
-void fmi2FreeInstance(fmi2Component c) { free(c); }
-fmi2Status fmi2Terminate(fmi2Component c) { return OK; }
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean d, fmi2Real tol, fmi2Real start, fmi2Boolean e, fmi2Real stop) { C(c)->time = start; return OK; }
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return OK; }
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return OK; }
-fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { C(c)->initialised = 1; return OK; }
 fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *e)
 { memset(e, 0, sizeof *e); e->nextEventTimeDefined = C(c)->schedules; e->nextEventTime = 3.0; return OK; }
-fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) { C(c)->time = time; return OK; }
-fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real *x, size_t n) { memcpy(C(c)->reals, x, n * sizeof *x); return OK; }
-fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real *x, size_t n) { memcpy(x, C(c)->reals, n * sizeof *x); return OK; }
-fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real *x, size_t n) { x[0] = NOMINAL; x[1] = 1.0; return OK; }
-fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real *d, size_t n)
-{ status s = evaluate(C(c)); memcpy(d, C(c)->reals + 2, n * sizeof *d); return s; }
+fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real *d, size_t n) { return rates(c, d, n); }
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference *r, size_t n, fmi2Real *v) { return get(C(c), r, n, v); }
 fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference *r, size_t n, const fmi2Real *v) { return put(C(c), r, n, v); }
 fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference *r, size_t n, const fmi2Boolean *v) { C(c)->schedules = v[0]; return OK; }
