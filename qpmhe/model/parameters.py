@@ -58,7 +58,8 @@ def augment_parameters(
 
     The model is a pair of NumPy functions, or a `System` whose last inputs are the parameters, made
     by `System`, `from_casadi`, `from_jax`, `from_sympy`, `from_control` or `from_fmu`: the result
-    has the same kind of derivatives, and a CasADi model stays one.
+    has the same kind of derivatives and the same names, and a CasADi model stays one. Jacobians
+    that you gave, and those of an FMU, lack the parameters' columns: differences take their place.
 
     Parameters
     ----------
@@ -196,7 +197,11 @@ class _Parameters(NamedTuple):
 def _of_system(f: System, m: int, parameters: _Parameters) -> System:
     """The augmented system of one whose last inputs, behind ``m`` others, are the parameters."""
     options = inherited(f, parameters.moved.size, parameters.bounds, parameters.still)
-    return augmented(f, parameters.change(f.n, m), **options)
+    made, signals = augmented(f, parameters.change(f.n, m), **options), f.signals
+    if signals is None:
+        return made
+    states = (*signals.states, *(signals.inputs[m + j] for j in parameters.moved))
+    return made.with_origin(signals=signals._replace(states=states, inputs=signals.inputs[:m]))
 
 
 def _of_functions(given: dict[str, Any], parameters: _Parameters) -> System:

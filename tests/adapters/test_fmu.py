@@ -150,6 +150,15 @@ def test_an_unknown_input_among_the_states():
         np.testing.assert_allclose(found.batch(zs, us), expected.batch(zs, us), rtol=1e-12)
 
 
+def test_an_unknown_input_among_the_parameters_keeps_its_name():
+    system = qpmhe.augment_parameters(qpmhe.from_fmu(fmus.fmu(), dt=0.1), nominal=[0.0])
+    assert system.derivatives == {"f": "finite differences", "h": "finite differences"}
+    for one in (system, pickle.loads(pickle.dumps(system))):
+        states, inputs, _, _ = one.signals
+        assert [signal.name for signal in states] == ["upper", "lower", "leak"]
+        assert [str(signal) for signal in inputs] == ["pump [m3/s]"]
+
+
 def values(system):
     xs, us = fmus.points(40)
     return [system.f.batch(xs, us), system.f_jacobian.batch(xs, us), system.h.batch(xs, us)]
