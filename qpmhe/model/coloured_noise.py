@@ -274,7 +274,8 @@ def _decay(rho: float, how: Discretization) -> float:
         raise OptionError(
             f"the correlation is {rho:.3g}, but a step of {how.method!r} with steps = {steps} "
             f"multiplies the noise by {tried.min() ** steps:.3g} at least, at rates of up to "
-            f"{_GRID[-1]:g} per substep; make the system with more steps, or leave this noise in the covariance of v: it is nearly white."
+            f"{_GRID[-1]:g} per substep; make the system with more steps, or leave this noise in "
+            "the covariance of v: it is nearly white."
         )
     i = int(passed[0])
     return steps * float(brentq(
