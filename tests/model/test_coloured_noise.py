@@ -294,3 +294,19 @@ def test_wrong_arguments_are_named(call, error, words):
 def test_methods_that_forget_all_take_noise_without_memory(method):
     larger = noisy(of_ode(method), correlation=0.0).system
     assert abs(larger.f(np.array([0.1, 0.2, 1.0]), np.zeros(1))[2]) < 1e-12
+
+
+def test_tune_finds_its_disturbance_in_a_record():
+    rng, rho, c = np.random.default_rng(0), 0.9, 0.0
+    y = np.empty((300, 1))
+    for t in range(300):
+        y[t] = c + 0.1 * rng.standard_normal()
+        c = rho * c + 0.5 * np.sqrt(1.0 - rho**2) * rng.standard_normal()
+    still = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1)
+    noisy = qpmhe.augment_noise(still, [0], correlation=rho, deviation=5.0)
+    given = noisy.covariances(prior=[[1.0]], disturbance=[[1e-8]], noise=[[1.0]])
+    found = qpmhe.tune(
+        noisy.system, [(y,)], **given, initial_state=[0.0, 0.0], horizon=2, objective="likelihood",
+        structure={"disturbance": {"memory": [1]}, "noise": "diagonal"},
+    )
+    assert np.sqrt(found.disturbance[1, 1]) == pytest.approx(0.5 * np.sqrt(1.0 - rho**2), rel=0.2)
