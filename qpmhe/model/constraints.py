@@ -609,13 +609,11 @@ def checked_constraints(value: Any) -> tuple[Constraint, ...]:
         return ()
     if isinstance(value, Constraint):
         return (value,)
-    listed = tuple(value) if isinstance(value, (list, tuple)) else None
-    wrong = value if listed is None else next(
-        (one for one in listed if not isinstance(one, Constraint)), None
-    )
-    if wrong is not None or listed is None:
-        raise SetError(
-            f"constraints holds {shown(wrong)}; expected a list of qpmhe.Constraint, such as "
-            "[qpmhe.Constraint(lambda x: x[0] - 1.0)]."
-        )
-    return listed
+    listed = value if isinstance(value, (list, tuple)) else [value]
+    for one in listed:
+        if not isinstance(one, Constraint):
+            raise SetError(
+                f"constraints holds {shown(one)}; expected a list of qpmhe.Constraint, such as "
+                "[qpmhe.Constraint(lambda x: x[0] - 1.0)]."
+            )
+    return tuple(listed)
