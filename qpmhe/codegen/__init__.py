@@ -46,10 +46,13 @@ class Written(tuple[Path, ...]):
     needs: Needs
 
     def __new__(cls, paths: Iterable[Path], needs: Needs) -> Written:
-        """The paths, with what they need."""
+        """The paths of an estimator's files, and its needs."""
         made = super().__new__(cls, paths)
         made.needs = needs
         return made
+
+    def __getnewargs__(self) -> tuple[tuple[Path, ...], Needs]:
+        return tuple(self), self.needs
 
 
 def write(
@@ -86,9 +89,9 @@ def write(
         parameter initial_state. Its communication step is the sampling time, 1 for a model in
         discrete time. It holds the C sources, and a library for this kind of machine.
     compiler : str, optional
-        The command of a C compiler on this machine, of the target or not, with options: memory,
-        code and stack are measured in the header and in ``needs`` as it compiles the source. GCC
-        states the stack, from version 10 on.
+        The command of a C compiler on this machine, with options; a cross-compiler for the target,
+        or any other. With it, header and ``needs`` also state memory, code and stack of the source
+        as this command compiles it. Only GCC tells the stack, from version 10 on.
 
     Returns
     -------
@@ -114,6 +117,37 @@ def write(
         raise InvalidInputError(
             f"estimator is {estimator!r}; expected a qpmhe.MovingHorizonEstimator."
         )
+    _check_name(name)
+    if real not in ("double", "float"):
+        raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
+    flag("fmu", fmu)
+    files, needs = generated(
+        system_of(estimator), estimator.observer, estimator.cost, estimator.settings, name, real,
+        estimator.usual,
+    )
+    files = dict(zip(files, stripped(*files.values()), strict=True))
+    if compiler is not None:
+        needs = replace(needs, **measured(files, name, compiler))
+    header, types = f"{name}.h", f"typedef {real} {name}_real;\n"
+    files[header] = files[header].replace(types, f"{types}\n{needs.header(name)}", 1)
+    suffixes = ("h", "c", "fmu") if fmu else ("h", "c")
+    try:
+        folder = Path(directory)
+        folder.mkdir(parents=True, exist_ok=True)
+        for file, text in files.items():
+            (folder / file).write_text(text, encoding="ascii")
+        if fmu:
+            initial = estimator.initial_state
+            write_fmu(folder / f"{name}.fmu", name, files, estimator.system, initial)
+    except (OSError, TypeError, ValueError) as error:
+        raise InvalidInputError(
+            f"directory is {directory!r}, which cannot be written ({error})."
+        ) from error
+    return Written((folder / f"{name}.{suffix}" for suffix in suffixes), needs)
+
+
+def _check_name(name: str) -> None:
+    """Raise where this is no name of C files."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise OptionError(
             f"name is {name!r}; expected a C identifier: letters, digits and underscores."
@@ -128,29 +162,3 @@ def write(
             f"name is {name!r}, but <{name.lower()}.h> is a header of the system, which "
             f"{name}.h would hide; take another, such as 'mhe_{name}'."
         )
-    if real not in ("double", "float"):
-        raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
-    flag("fmu", fmu)
-    files, needs = generated(
-        system_of(estimator), estimator.observer, estimator.cost, estimator.settings, name, real,
-        estimator.usual,
-    )
-    files = dict(zip(files, stripped(*files.values()), strict=True))
-    if compiler is not None:
-        needs = replace(needs, **measured(files, name, compiler))
-    header, types = f"{name}.h", f"typedef {real} {name}_real;\n"
-    files[header] = files[header].replace(types, f"{types}\n{needs.header(name)}", 1)
-    try:
-        folder = Path(directory)
-        folder.mkdir(parents=True, exist_ok=True)
-        for file, text in files.items():
-            (folder / file).write_text(text, encoding="ascii")
-        if fmu:
-            initial = estimator.initial_state
-            write_fmu(folder / f"{name}.fmu", name, files, estimator.system, initial)
-    except (OSError, TypeError, ValueError) as error:
-        raise InvalidInputError(
-            f"directory is {directory!r}, which cannot be written ({error})."
-        ) from error
-    suffixes = ("h", "c", "fmu") if fmu else ("h", "c")
-    return Written((folder / f"{name}.{suffix}" for suffix in suffixes), needs)

@@ -43,10 +43,12 @@ class CompiledMembers:
         threads: int | None,
     ) -> None:
         # The units of nonlinear constraints depend on where a member starts.
+        system = with_scaled_constraints(system, observer, cost, states[0])
         each = [system]
         if system.constraints is not None:
-            each = [with_scaled_constraints(system, observer, cost, state) for state in states]
-        system = each[0]
+            each += [
+                with_scaled_constraints(system, observer, cost, state) for state in states[1:]
+            ]
         self._library = library = checked_library(system, observer, cost, settings)
         usual = usual_conditions(settings)
         self._records = [library.settings, *(

@@ -101,7 +101,7 @@ class Needs:
             found.append(f"{self.code} of code and constants")
         if self.stack is not None:
             found.append(f"{self.stack} of stack, {self.frame} of them in one function")
-        command = self.compiler.replace("*/", "* /")
+        command = self.compiler.encode("ascii", "backslashreplace").decode().replace("*/", "* /")
         return f" As `{command}` compiles it: {'; '.join(found)}; without libm."
 
 
@@ -179,6 +179,11 @@ def _run(words: list[str], folder: Path, file: str) -> None:
         raise CompilationError(f"{words[0]} cannot be run ({error}).") from error
     if done.returncode:
         raise CompilationError(f"{words[0]} does not compile {file}: {done.stderr.strip()[:2000]}")
+    if not (folder / file).with_suffix(".o").is_file():
+        raise CompilationError(
+            f"{words[0]} does not compile {file} to an object file of its name; leave options out "
+            "that end before or name its output, such as -E, -S and -o."
+        )
 
 
 def _sizes(content: bytes) -> tuple[int, ...]:

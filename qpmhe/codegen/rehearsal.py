@@ -259,11 +259,30 @@ class _Nudged:
             spread = np.outer(nudge_x, nudge_x) * observer.initial_covariance()
             observer = observer.with_prior(spread)
         self._step = _Follower(nudge_x, system, observer, cost, settings, start * nudge_x)
+        self._generator = generator
 
     def after(self, sample: _Sample, found: Estimate) -> Estimate:
         """The estimate after one more sample, for which C has found this."""
         self._step.guide.found = found
-        return self._step.step(sample.y * self._nudge_y, *sample[1:], 0.0)
+        estimate = self._step.step(sample.y * self._nudge_y, *sample[1:], 0.0)
+        self._round_covariance()
+        return estimate
+
+    def _round_covariance(self) -> None:
+        """Change the observer's newest covariance, or the root of it, as rounding does.
+
+        Where states are nearly dependent, a covariance has few digits of what distinguishes them.
+        """
+        window = self._step.memory.window
+        k, P, roots = window.end, window.covariance, window.root
+        if P is None:
+            return
+        change = 1 + _EPSILONS * np.triu(self._generator.uniform(-1.0, 1.0, P[k].shape))
+        if roots is not None and window.is_vague[k]:
+            roots[k] *= change
+            P[k] = roots[k].T @ roots[k]
+        else:
+            P[k] *= np.sqrt(change * change.T)
 
 
 class _Rehearsal:
@@ -278,7 +297,7 @@ class _Rehearsal:
         attempt: int,
     ) -> None:
         n, p = system.n, system.p
-        self.compared = 0
+        self.compared, self._rounding = 0, ROUNDING
         self._library, self._generator = library, np.random.default_rng(int(is_wild))
         batches = points(interpreter, system.states, int(is_wild))
         first = next(islice(batches, attempt, None))[0][0]
@@ -347,6 +366,7 @@ class _Rehearsal:
             self._python.guide.found = found
             expected = self._python.step(*sample, 0.0)
             nudged = self._nudged.after(sample, found)
+            self._note_roots()
             if self._is_lost(expected, nudged):
                 estimates.pop()
                 break
@@ -367,14 +387,8 @@ class _Rehearsal:
     def _is_rounding(self, estimates: list[Estimate], expected: Estimate) -> bool:
         """Whether the last estimate is as far off as others that rounding may have led to.
 
-        One nudge may miss the direction in which an ill-conditioned step is sensitive, and none
-        shows the rounding inside of an observer's covariance.
+        One nudge may miss the direction in which an ill-conditioned step is sensitive.
         """
-        window = self._python.memory.window
-        if window.covariance is not None and _loses_digits(
-            window.covariance[window.start : window.end + 1]
-        ):
-            return True
         for _ in range(_NUDGES):
             other, nudged = _Nudged(self._generator, *self._arguments, self._start), expected
             for sample, found in zip(self._record, estimates, strict=False):
@@ -384,6 +398,23 @@ class _Rehearsal:
             ):
                 return True
         return False
+
+    def _note_roots(self) -> None:
+        """Allow for the rounding of an observer's update by roots, which no nudge shows.
+
+        A root, in units of its deviations, is rounded to shares of its least singular value.
+        """
+        window = self._python.memory.window
+        if window.root is None:
+            return
+        here = slice(window.start, window.end + 1)
+        roots = window.root[here][window.is_vague[here]]
+        deviations = np.linalg.norm(roots, axis=-2, keepdims=True)
+        if not (np.isfinite(deviations) & (deviations > 0.0)).all():
+            self._rounding = _LOST
+        elif len(roots):
+            least = max(np.linalg.svd(roots / deviations, compute_uv=False).min(), _EPSILONS)
+            self._rounding = max(self._rounding, min(_WEIGHT * _EPSILONS / least, _LOST))
 
     def _is_lost(self, expected: Estimate, nudged: Estimate) -> bool:
         """Whether the record is chaotic by now: two that nearly agreed have separate ways.
@@ -418,7 +449,7 @@ class _Rehearsal:
                     return f"J of {what} is {got:.6g}, but CasADi's interpreter has no number"
                 return ""
             size = abs(true) + self._python.guide.magnitudes[name]
-            if not abs(got - true) <= _WEIGHT * abs(other - true) + ROUNDING * size:
+            if not abs(got - true) <= _WEIGHT * abs(other - true) + self._rounding * size:
                 return f"J of {what} is {got:.6g}, by CasADi's interpreter {true:.6g}"
         limit, whose = found.candidate_cost, "the candidate"
         if Status.RESTORED in found.status:
@@ -430,7 +461,7 @@ class _Rehearsal:
         if window.projects and window.covariance is not None:
             # A projection moves by deviations of the observer, and rounds to a share of these.
             variances = window.covariance[window.start : window.end + 1].diagonal(0, 1, 2)
-            states += _EPSILONS / ROUNDING * np.sqrt(variances.max(axis=0))
+            states += _EPSILONS / self._rounding * np.sqrt(variances.max(axis=0))
         width = expected.disturbances.shape[1]
         outputs = np.nan_to_num(abs(expected.noises)).max(axis=0) + np.nan_to_num(abs(y))
         for name, sizes in (
@@ -440,7 +471,7 @@ class _Rehearsal:
             ("noises", outputs),
         ):
             got, true, other = (getattr(one, name) for one in (found, expected, nudged))
-            allowed = _WEIGHT * np.nan_to_num(abs(other - true)) + ROUNDING * sizes
+            allowed = _WEIGHT * np.nan_to_num(abs(other - true)) + self._rounding * sizes
             if _differs(got, true, allowed):
                 return f"an estimate has other numbers in {name!r} than by CasADi's interpreter"
         return ""
@@ -502,19 +533,3 @@ def _differs(got: Array, true: Array, allowed: Array | float) -> bool:
     if (np.isfinite(got) != finite).any():
         return True
     return bool((abs(got - true) > allowed)[finite].any())
-
-
-def _loses_digits(covariances: Array) -> bool:
-    """Whether rounding of covariances (..., n, n) changes a variance in the digits compared.
-
-    In units of the deviations, rounding is as large as the precision, a share of the least
-    variance of a combination of states.
-    """
-    variances = covariances.diagonal(0, -2, -1)
-    if not (variances > 0.0).all():
-        return True
-    deviations = np.sqrt(variances)
-    correlations = covariances / deviations[..., :, None] / deviations[..., None, :]
-    if not np.isfinite(correlations).all():
-        return True
-    return bool(np.linalg.eigvalsh(correlations).min() < _EPSILONS / ROUNDING)

@@ -42,7 +42,7 @@ class Field(NamedTuple):
 
     @property
     def of_window(self) -> bool:
-        """Whether its first dimension is that of the window's states, of which some are used."""
+        """Whether it has a row for each state of a window; a short window uses the first ones."""
         return self.shape.startswith("states")
 
     @property
@@ -178,7 +178,7 @@ class MemorySizes(NamedTuple):
         return tuple(self.dimensions[name] for name in field.shape.split())
 
     def first_value(self, field: Field) -> Any:
-        """The single value of a field before the first sample; None for one that is not there."""
+        """A single value before the first sample; None where there is none yet, or never."""
         if field.kind in ("count", "time"):
             return (0,) * self.shape(field)[0] if field.shape else 0
         if not field.shape:

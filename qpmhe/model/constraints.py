@@ -175,6 +175,7 @@ class _Bound:
         except ModelError as error:
             raise ModelError(f"{error} A constraint's size is the number of its rows.") from error
         self.jacobian = Jacobian(self.function, None, m, probes, self._box)
+        self._deviations: Array = np.empty(0)  # none yet
         self._user = self.function, self.jacobian
         #: The expression of g that is evaluated in its place; None where it is called as written,
         #: and why.
@@ -209,6 +210,8 @@ class _Bound:
 
     def use_scales(self, deviations: Array) -> None:
         """Take the typical magnitudes of s."""
+        if np.array_equal(deviations, self._deviations):
+            return
         self._deviations = deviations
         function, jacobian = self._user
         jacobian = jacobian.copy(function)
@@ -609,13 +612,11 @@ def checked_constraints(value: Any) -> tuple[Constraint, ...]:
         return ()
     if isinstance(value, Constraint):
         return (value,)
-    listed = tuple(value) if isinstance(value, (list, tuple)) else None
-    wrong = value if listed is None else next(
-        (one for one in listed if not isinstance(one, Constraint)), None
-    )
-    if wrong is not None or listed is None:
-        raise SetError(
-            f"constraints holds {shown(wrong)}; expected a list of qpmhe.Constraint, such as "
-            "[qpmhe.Constraint(lambda x: x[0] - 1.0)]."
-        )
-    return listed
+    listed = value if isinstance(value, (list, tuple)) else [value]
+    for one in listed:
+        if not isinstance(one, Constraint):
+            raise SetError(
+                f"constraints holds {shown(one)}; expected a list of qpmhe.Constraint, such as "
+                "[qpmhe.Constraint(lambda x: x[0] - 1.0)]."
+            )
+    return tuple(listed)

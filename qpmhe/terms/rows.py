@@ -152,4 +152,7 @@ class Rows:
 def function_rows(chosen: Mask, scale: Array) -> Rows:
     """The rows g <= 0 of the chosen ones among all rows of g; a point is all of their values."""
     upper = np.where(chosen, 0.0, np.inf)
-    return Rows("constraints", Box(np.full(upper.size, -np.inf), upper), np.diag(scale**2))
+    rows = Rows("constraints", Box(np.full(upper.size, -np.inf), upper), np.eye(upper.size))
+    # Of numbers in any unit, whose squares may not be finite.
+    rows.deviation = rows.scale = scale[rows.components]
+    return rows

@@ -56,6 +56,8 @@ CASES = {
     # Fewer members would share a thread.
     "threads": (40, {}, {"max_qps": None, "warm_start": True, "threads": 2}),
     "sets": (3, {"disturbances": qpmhe.Box([-0.1] * 2, [0.1] * 2)}, {"max_qps": 2}),
+    # Each member's rows have the units that they have where it starts.
+    "constraints": (3, {"constraints": [qpmhe.Constraint(lambda x: x @ x - 0.2)]}, {"max_qps": 2}),
     "gates": (5, {"h": turn, "p": 2, "observer": KALMAN}, {"candidate": "reinitialized"}),
     "inputs": (3, {"f": driven, "h": lambda x, u: x[..., :1] + u[..., :1], "m": 3}, {}),
     "shared": (3, {"f": driven, "m": 3}, {"max_qps": 2}),

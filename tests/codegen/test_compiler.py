@@ -658,6 +658,32 @@ def test_rounding_in_a_covariance_is_not_taken_for_wrong_code(seed):
     assert Case(seed, "compiled").estimator().engine == "compiled"
 
 
+@pytest.mark.parametrize(("prior", "lie"), [
+    (1e10, "s/mhe_gained(&seen, gain, out);/{ & out[1] *= 1.01; }/"),
+    (1e20, "s/mhe_gained(&seen, gain, out);/{ & out[1] *= 1.01; }/"),
+    (1e14, "s/mhe_add_disturbance(s, stage, following);//"),
+])
+def test_a_vague_prior_hides_no_wrong_code(prior, lie, script, monkeypatch):
+    """Position and velocity are correlated to 1 - 1e-12 and more, but a root has their digits."""
+
+    def f(x):
+        a, b = x[..., 0], x[..., 1]
+        return np.stack([a + 0.1 * b, 0.99 * b - 0.1 * np.sin(a)], axis=-1)
+
+    weights = {"prior": prior * np.eye(2), "disturbance": 0.01 * np.eye(2), "noise": [[0.01]]}
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(f, lambda x: x[..., :1], n=2, p=1, m=0), qpmhe.ExtendedKalman(**weights),
+        qpmhe.QuadraticCost.from_covariances(**weights), horizon=6, initial_state=[0.5, 0.1],
+        engine="python",
+    )
+    monkeypatch.setattr(compiler, "_LEVELS", compiler._LEVELS[-1:])
+    script.lies(lie, [PLAIN])
+    with pytest.raises(compiler.WrongCodeError, match="pass its check"):
+        qpmhe.compile(mhe)
+    script.does(RIGHT, "-DTRUE")
+    assert qpmhe.compile(mhe).is_new
+
+
 def test_sigma_points_far_apart_are_not_taken_for_wrong_code(script):
     """Of a state of size 1 with a prior deviation of 1e9, differences of f lose nine digits."""
 

@@ -1,5 +1,6 @@
 """What the written C says that it needs: bounds that no step exceeds, and measured sizes."""
 
+import pickle
 import shutil
 import subprocess
 
@@ -69,6 +70,10 @@ def test_sizes_are_those_of_the_compiler(tmp_path):
     assert needs.memory / 2 < single.memory < 0.7 * needs.memory
     assert needs.code > 1000
     assert codegen.write(mhe, tmp_path).needs.memory is None
+    copied = pickle.loads(pickle.dumps(written))
+    assert (copied, copied.needs) == (written, needs)
+    accents = codegen.write(mhe, tmp_path, compiler="cc -DNAME=é").needs
+    assert accents.memory == needs.memory
     if needs.stack is not None:  # by GCC
         assert 100 < needs.frame < needs.stack < 100_000
 
@@ -81,7 +86,9 @@ def test_compilers_that_are_none(compiler, tmp_path):
 
 
 def test_compilers_that_fail(tmp_path):
-    for compiler in ("cc -no-such-option-at-all", "cc -O1 -ffast-math", "false"):
+    for compiler in (
+        "cc -no-such-option-at-all", "cc -O1 -ffast-math", "false", "true", "cc -S", "cc -o one.o",
+    ):
         with pytest.raises(CompilationError, match="does not compile"):
             codegen.write(linear(), tmp_path, compiler=compiler)
 

@@ -193,12 +193,26 @@ def test_the_observer_is_not_projected_onto_a_soft_set():
     assert not any(mhe.update(y).status & outside for y in record())
 
 
+@pytest.mark.parametrize("unit", [1e160, 1e-140])
+def test_units_of_a_constraint_decide_nothing(unit):
+    """Nor do those in which squares of its values are not finite."""
+    made = [
+        make({"constraints": [Constraint(lambda x, k=k: k * (ball(x) + 0.5))]})
+        for k in (1.0, unit)
+    ]
+    for y in record():
+        one, other = (mhe.update(y) for mhe in made)
+        assert one.status == other.status
+        np.testing.assert_allclose(one.trajectory, other.trajectory, rtol=1e-6, atol=1e-6)
+
+
 WRONG = [
     (lambda: UNIT.soften(), SetError, "row 0 of the soft set has no penalty"),
     (lambda: UNIT & UNIT.soften(linear=1.0), SetError, "intersect sets first and soften"),
     (lambda: Constraint(ball, linear=0.0), SetError, "leave the constraint hard"),
     (lambda: Constraint(lambda z: z), ModelError, "has the parameter z; expected only x"),
     (lambda: make({"constraints": [ball]}), SetError, "expected a list of qpmhe.Constraint"),
+    (lambda: make({"constraints": [None]}), SetError, "constraints holds None; expected a list"),
     (lambda: make({"constraints": [Constraint(lambda x, u: x[0])]}), ModelError,
      "constraints[0] takes u, but the system has no inputs"),
     (lambda: make({"constraints": [Constraint(lambda x: np.log(x[0] - 3.0))]}), ModelError,
