@@ -101,11 +101,11 @@ class Experiment:
 
     @cached_property
     def problem(self) -> Problem:
-        """What other estimators and observers are made for; a `WeightError` if there is none."""
+        """The problem of other estimators and observers; a `WeightError` without a prior."""
         system, observer, cost = self.parts
         return Problem.of(
             system, observer, cost, self.options["initial_state"],
-            parameters=self.options.get("parameters") or (),
+            parameters=self.options.get("parameters", ()),
         )
 
     def times(self, steps: int) -> Array:
