@@ -112,7 +112,7 @@ def test_another_estimator_is_a_cell_with_times_errors_and_nees(folder):
 
 @pytest.mark.parametrize(("name", "words"), [
     ("Raises", r"my.py, line \d+: ZeroDivisionError: division by zero"),
-    ("Diverges", r"the estimates diverge: after 3 steps, one is \[3e\+180"),
+    ("Diverges", r"the estimates diverge: after 3 steps, one is \["),
     ("Lost", r"the estimates diverge: after 1 steps, one is \[nan"),
     ("Word", "InvalidInputError: the estimate of Word is 'word', which is not an array"),
 ])
