@@ -16,19 +16,17 @@ from typing import Any
 import numpy as np
 
 from qpmhe_solvers import Backend, BackendError, Recording, backend, register
-from qpmhe_solvers.values import shown
 
 from .._checks import Array
 from ..baselines import follow
-from ..errors import InvalidInputError, ModelError, PriorWarning, QpmheError
+from ..errors import InvalidInputError, PriorWarning, QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..models import Record
-from ..models.loading import ModelSource, build, code_place
-from ..observers import Observer
+from ..models.loading import ModelSource, code_place
 from . import metrics
 from .environment import environment
-from .experiment import Source, experiment
+from .experiment import Source, experiment, made
 from .row import OBSERVER, Cell, StudyRow
 
 #: Engine of all cells: only the Python step calls the backends that a study compares.
@@ -81,9 +79,9 @@ def compute(task: Task) -> StudyRow:
         except CellTimeoutError as error:
             return failure(task, f"out of time: {error}")
         except BaseException as error:  # a solver may even try to leave the process
-            made = task.estimator or task.observer
-            place = "" if made is None or isinstance(error, QpmheError) else code_place(
-                error, made.file)
+            maker = task.estimator or task.observer
+            place = "" if maker is None or isinstance(error, QpmheError) else code_place(
+                error, maker.file)
             return failure(task, f"{place}{type(error).__name__}: {error}")
 
 
@@ -180,15 +178,10 @@ def _register(entry: Backend) -> None:
 def _estimator(task: Task, backend_name: str = "") -> Any:
     cell, found = task.cell, experiment(task.source)
     if task.estimator is not None:
-        return build(task.estimator, replace(found.problem, seed=cell.seed))
+        return made(task.estimator, replace(found.problem, seed=cell.seed))
     system, observer, cost = found.parts
     if task.observer is not None:
-        observer = build(task.observer, found.problem)
-        if not isinstance(observer, Observer):
-            raise ModelError(
-                f"observer {task.observer.name!r} returned {shown(observer)}; expected a "
-                "qpmhe.Observer."
-            )
+        observer = made(task.observer, found.problem)
     with warnings.catch_warnings():
         if task.observer is not None:  # the prior's weight is what observers are compared with
             warnings.simplefilter("ignore", PriorWarning)
@@ -209,10 +202,10 @@ def _run(
         if perf_counter() > limit:
             raise CellTimeoutError(f"{done} of {total} steps were done.")
 
-    made = _estimator(task, backend_name)
-    start = found.options["initial_state"] if task.estimator is not None else made.state
+    estimator = _estimator(task, backend_name)
+    start = found.options["initial_state"] if task.estimator is not None else estimator.state
     return follow(
-        made, np.array(start, float), record.measurements, record.inputs,
+        estimator, np.array(start, float), record.measurements, record.inputs,
         None if found.lengths is None else found.lengths[:total], covariances=covariances,
         each=watch,
     )

@@ -28,7 +28,7 @@ from ..errors import BackendError, InvalidInputError, ModelError, OptionError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..models.loading import ModelSource, check_named_in_file, find
 from ..observers import Observer
-from .experiment import Source, experiment
+from .experiment import Source, experiment, made
 from .row import OBSERVER, USUAL_OBSERVER, Cell
 
 if TYPE_CHECKING:
@@ -201,15 +201,14 @@ class Study:
             "observers": {one: one for one in self.observers if one != USUAL_OBSERVER},
             "estimators": self.estimators,
         }
-        made = {
+        makers = {
             group: {
                 name: find(text, folder, group[:-1], KNOWN[group]) for name, text in chosen.items()
             } for group, chosen in named.items()
         }
-        object.__setattr__(self, "makers", made)
-        if any(made.values()):
-            for source in sources:
-                _ = experiment(source).problem
+        object.__setattr__(self, "makers", makers)
+        for maker in (one for group in makers.values() for one in group.values()):
+            _check_maker(maker, sources)
         object.__setattr__(self, "models", tuple(model.name for model in models))
 
     @classmethod
@@ -339,6 +338,18 @@ def _translated(key: str, value: Any) -> Any:
     return [None if item == word else item for item in (
         value if isinstance(value, list) else [value]
     )]
+
+
+def _check_maker(maker: ModelSource, sources: Sequence[Source]) -> None:
+    """Raise a `ModelError` if an observer or estimator can be made for none of the models."""
+    for source in sources:
+        problem = experiment(source).problem
+        try:
+            made(maker, problem)
+            return
+        except ModelError as error:
+            failed = error
+    raise failed
 
 
 def _distinct(values: Iterable[Any]) -> tuple[Any, ...]:

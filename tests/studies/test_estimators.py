@@ -41,6 +41,11 @@ def gated(problem):
 def wrong(problem):
     return 3
 
+def far(problem):
+    if problem.system.n != 12:
+        raise ValueError("for 12 states")
+    return Kept(problem)
+
 class Raises(Kept):
     def update(self, y):
         return 1 / 0
@@ -82,7 +87,7 @@ def computed(study):
 def test_another_estimator_is_a_cell_with_times_errors_and_nees(folder):
     study = Study(
         qps=[0], estimators={"EKF": "my.py:filter", "kept": "my.py:Kept", "MHE": "my.py:gated",
-                             "wrong": "my.py:wrong", "few": "enkf(members=5)"},
+                             "few": "enkf(members=5)"},
         folder=folder, **SMALL,
     )
     assert [cell.backend for cell in study.cells()][:3] == ["observer", "EKF", "kept"]
@@ -106,8 +111,6 @@ def test_another_estimator_is_a_cell_with_times_errors_and_nees(folder):
         mhe = rows["MHE", seed]
         assert (mhe.improved, mhe.reasons is None) == (pytest.approx(1.0, abs=0.5), False)
         assert rows["few", seed].nees != rows["few", 1 - seed].nees  # random numbers of the seed
-    assert rows["wrong", 0].outcome == "failed"
-    assert "estimator is 3; expected an object with update(y, u)" in rows["wrong", 0].reason
 
 
 @pytest.mark.parametrize(("name", "words"), [
@@ -241,16 +244,22 @@ def test_what_does_not_fit_is_refused(folder):
         (ModelError, "cannot read", {"estimators": ["none.py:make"]}),
         (ModelError, "names no function; expected my.py", {"observers": ["my.py"]}),
         (OptionError, "Did you mean", {"estimator": ["ekf"]}),
+        (ModelError, "observer 'my.py:wrong' returned 3; expected a qpmhe.Observer",
+         {"observers": "my.py:wrong"}),
+        (ModelError, "'my.py:wrong' returned 3; expected an object with update(y, u)",
+         {"estimators": "my.py:wrong"}),
+        (ModelError, "my.py has no function missing", {"estimators": "my.py:missing"}),
+        (ModelError, "'ekf(iterations=0)' cannot be made: iterations is 0",
+         {"estimators": "ekf(iterations=0)"}),
+        (ModelError, "'my.py:far' cannot be made: ValueError: for 12 states",
+         {"estimators": "my.py:far"}),
     ):
         with pytest.raises(error, match=re.escape(words)):
             Study(**SMALL | options, folder=folder)
     assert Study(**SMALL, estimators=[]).estimators == {}
-    study = Study(qps=[1], observers=["my.py:wrong"], folder=folder, **SMALL | {"seeds": 1})
-    (row,) = computed(study)
-    assert "observer 'my.py:wrong' returned 3; expected a qpmhe.Observer" in row.reason
-    study = Study(qps=[0], estimators=["ekf(iterations=0)"], **SMALL | {"seeds": 1})
-    row = computed(study)[-1]
-    assert "estimator 'ekf(iterations=0)' cannot be made: iterations is 0" in row.reason
+    # It can be made for one of the models.
+    both = {"models": ["batch_reactor", "chain_of_masses(masses=2)"]}
+    assert Study(**SMALL, **both, estimators=["my.py:far"], folder=folder).estimators
 
 
 def test_a_models_file_registers_a_backend(folder):
