@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...plots import COLORS
-from ...plots.style import LIGHT, svg
+from ...plots.style import LIGHT, legend_columns, svg
 from .words import percent, time_tick
 
 if TYPE_CHECKING:
@@ -306,7 +306,6 @@ def _legends(figure: Any, drawing: Drawing, drawn: Mapping[str, Style]) -> None:
     if kinds & {"points", "line"}:
         present = {mark.backend for mark in marks} - {""}
         names = [name for name in drawn if name in present]
-        room = 0.55 + 0.07 * max(map(len, names), default=0)  # inches of a column
         plain = present - {mark.backend for mark in marks if mark.kind != "level"}
         figure.legend(
             handles=[
@@ -317,5 +316,5 @@ def _legends(figure: Any, drawing: Drawing, drawn: Mapping[str, Style]) -> None:
                 for name in names
             ],
             loc="outside lower center", fontsize=8,
-            ncols=max(1, min(6, len(names), int(figure.get_figwidth() / room))),
+            ncols=legend_columns(names, figure.get_figwidth(), 6),
         )
