@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from qpmhe_solvers.values import shown
+
 from .._checks import (
     Array,
     count,
+    numbers,
     positive,
     positive_definite,
     positive_semidefinite,
@@ -23,7 +26,7 @@ from .._checks import (
 )
 from .._linalg import inverse
 from ..costs import Cost, ObserverPrior
-from ..errors import ModelError, WeightError
+from ..errors import InvalidInputError, ModelError, ShapeError, WeightError
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -103,7 +106,13 @@ class Problem:
         ------
         WeightError
             If neither cost nor observer have a covariance of the initial error.
+        InvalidInputError, ShapeError, OptionError
+            If something does not fit.
         """
+        if not isinstance(observer, Observer):
+            raise InvalidInputError(f"observer is {shown(observer)}; expected a qpmhe.Observer.")
+        if not isinstance(cost, Cost):
+            raise InvalidInputError(f"cost is {shown(cost)}; expected a qpmhe.Cost.")
         factor, disturbance = cost.disturbance_factor, inverse(cost.disturbance)
         prior = (
             observer.initial_covariance() if isinstance(cost.prior, ObserverPrior)
@@ -120,7 +129,6 @@ class Problem:
             noise=inverse(cost.noise), **options,
         )
 
-
     @property
     def covariances(self) -> dict[str, Any]:
         """``prior``, ``disturbance`` and ``noise``, as Kalman-type observers take them."""
@@ -128,10 +136,10 @@ class Problem:
 
 
 class Baseline(ABC):
-    """An estimator that takes a measurement at a time: a filter, which knows no sets.
+    """A filter: an estimator that takes one measurement at a time and ignores sets.
 
-    A derived class has ``_begin``, ``_correct`` and ``_predict``. Missing components of y, which
-    are not finite, correct nothing.
+    A derived class has ``_correct`` and ``_predict``, and ``_begin`` where it remembers more than
+    state and covariance. Components of y that are not finite are missing: they correct nothing.
 
     Parameters
     ----------
@@ -151,6 +159,10 @@ class Baseline(ABC):
     filtered: Array
 
     def __init__(self, problem: Problem) -> None:
+        if not isinstance(problem, Problem):
+            raise InvalidInputError(
+                f"problem is {shown(problem)}; expected a qpmhe.baselines.Problem."
+            )
         self.problem, system = problem, problem.system
         variances = problem.prior.diagonal()
         # Traced once, where an estimator would trace it; a system alone asks at each call.
@@ -216,9 +228,8 @@ class Baseline(ABC):
         )
         return follow(self, self.state, y, u, covariances=True)
 
-    @abstractmethod
     def _begin(self) -> None:
-        """Set up what it remembers beside state and covariance, from these."""
+        """Set up further memory from the state and the covariance, where a filter has any."""
 
     @abstractmethod
     def _correct(self, system: System, y: Array, u: Array, there: Mask) -> None:
@@ -230,12 +241,12 @@ class Baseline(ABC):
 
 
 def innovation(system: System, y: Array, outputs: Array) -> Array:
-    """What y is above outputs h, (p,) or (B, p), angles within half a turn."""
+    """The innovation y - h, (p,) or (B, p), with angles within half a turn."""
     return difference(system.output_residual, np.broadcast_to(y, outputs.shape), outputs)
 
 
 def deviations(system: System, states: Array, weights: Array) -> tuple[Array, Array]:
-    """The mean (n,) of states (B, n), and what each is from it; angles within half a turn."""
+    """The mean (n,) of states (B, n), and their differences from it; angles within half a turn."""
     first = states[0]
     apart = difference(system.state_residual, states, np.broadcast_to(first, states.shape))
     mean = weights @ apart
@@ -243,8 +254,8 @@ def deviations(system: System, states: Array, weights: Array) -> tuple[Array, Ar
 
 
 def follow(
-    estimator: Any, start: Array, measurements: Array, inputs: Array | None = None,
-    steps: Array | None = None, *, covariances: bool = False,
+    estimator: Any, start: ArrayLike, measurements: ArrayLike, inputs: ArrayLike | None = None,
+    steps: ArrayLike | None = None, *, covariances: bool = False,
     each: Callable[[int], object] = lambda _done: None,
 ) -> Run:
     """Run an estimator on a record.
@@ -252,14 +263,15 @@ def follow(
     Parameters
     ----------
     estimator : object
-        With ``update(y, u)``, which returns the estimate (n,) of x(t+1), or an object with such a
-        ``state``. It may leave out u where there are no inputs, and it has a keyword ``dt`` where
-        steps have other lengths. Its ``covariance`` (n, n) is that of the estimate's error.
-    start : (n,) array
+        Its ``update(y, u)`` returns the estimate (n,) of x(t+1), or an object with such a
+        ``state``. Without inputs, ``update(y)`` will do; steps of several lengths need a keyword
+        ``dt``. It may have attributes ``covariance`` (n, n), the covariance of the estimate's
+        error, and ``filtered`` (n,), the estimate of x(t) that has used y(t).
+    start : (n,) array_like
         The estimate of x(0).
-    measurements, inputs : (T, p) and (T, m) array
+    measurements, inputs : (T, p) and (T, m) array_like
         The record.
-    steps : (T,) array, optional
+    steps : (T,) array_like, optional
         Lengths of the steps.
     covariances : bool
         Whether to collect covariances.
@@ -273,76 +285,85 @@ def follow(
 
     Raises
     ------
-    ModelError
-        If what it returns is no state, or it takes no ``dt`` where it needs one.
+    InvalidInputError, ModelError, ShapeError
+        If an argument does not fit, or an estimate; if ``update`` cannot be called as the record
+        needs it. Exceptions of ``update`` itself pass through.
     """
     name, update = type(estimator).__name__, getattr(estimator, "update", None)
-    if not callable(update):
-        raise ModelError(f"a {name} is no estimator; expected an object with update(y, u).")
-    needs_input, takes_dt = _arguments(update)
-    if steps is not None and not takes_dt:
+    if isinstance(estimator, type) or not callable(update):
         raise ModelError(
-            f"{name}.update takes no dt, but the record's steps have several lengths; expected "
-            "update(y, u, dt=...)."
+            f"the estimator is {shown(estimator)}; expected an object with update(y, u)."
         )
-    n, estimates, times, filtered, errors = start.size, [], [], [], []
-    states = [start.copy()]
-    is_mhe = isinstance(estimator, MovingHorizonEstimator)
-    for t, y in enumerate(measurements):
-        given = () if inputs is None and not needs_input else (
-            None if inputs is None else inputs[t],
+    first = vector("start", start, np.size(start))
+    y = _rows("measurements", measurements)
+    u = None if inputs is None else _rows("inputs", inputs, len(y))
+    lengths = None if steps is None else _rows("steps", steps, len(y))
+    options: dict[str, Any] = {} if lengths is None else {"dt": None}
+    alone = u is None and _takes(update, None, **options)
+    if not (alone or _takes(update, None, None, **options)):
+        raise ModelError(
+            f"{name}.update cannot be called as update(y, u{', dt=...' * bool(options)}), as this "
+            "record needs it; expected update(y, u), with a keyword dt for steps of several "
+            "lengths."
         )
-        options = {} if steps is None else {"dt": steps[t]}
+    n, is_mhe = first.size, isinstance(estimator, MovingHorizonEstimator)
+    unknown = np.full(n, np.nan)
+    states, estimates, times, filtered, errors = [first], [], [], [], []
+    for t in range(len(y)):
+        given = () if alone else (None if u is None else u[t],)
+        if lengths is not None:
+            options["dt"] = lengths[t]
         began = perf_counter()
-        found = update(y, *given, **options)
+        found = update(y[t], *given, **options)
         times.append(perf_counter() - began)
         estimates.append(found)
-        value = np.array(getattr(found, "state", found), np.float64)
-        if value.shape != (n,):
-            raise ModelError(
-                f"{name}.update returned an estimate of shape {value.shape}; expected ({n},), the "
-                "state x(t+1)."
-            )
-        states.append(value)
-        filtered.append(getattr(estimator, "filtered", np.full(n, np.nan)))
+        states.append(_read(f"the estimate of {name}", getattr(found, "state", found), n))
+        filtered.append(_read(f"{name}.filtered", getattr(estimator, "filtered", unknown), n))
         if covariances:
-            errors.append(
-                estimator.newest_covariance() if is_mhe else _covariance(estimator, found, n)
-            )
+            value = estimator.newest_covariance() if is_mhe else getattr(
+                found, "covariance", getattr(estimator, "covariance", None))
+            errors.append(_read(
+                f"the covariance of {name}", unknown * unknown[:, None] if value is None else value,
+                n, n,
+            ))
         each(t + 1)
-    matrices = np.array(errors) if errors and not all(one is None for one in errors) else None
+    matrices = None if np.isnan(errors).all() else np.array(errors)
     if estimates and all(isinstance(one, Estimate) for one in estimates):
-        return Run.of(start, estimates, matrices)
-    total, array = len(estimates), np.array(states)
-    none, unknown = np.zeros(total, np.intp), np.full(total, np.nan)
+        return Run.of(first, estimates, matrices)
+    array, none, costs = np.array(states), np.zeros(len(y), np.intp), np.full(len(y), np.nan)
     return Run(
-        states=array, filtered=np.array(filtered, np.float64).reshape(-1, n), costs=unknown,
-        candidate_costs=unknown.copy(), times=np.array(times), solve_times=unknown.copy(),
+        states=array, filtered=np.array(filtered).reshape(-1, n), costs=costs,
+        candidate_costs=costs.copy(), times=np.array(times), solve_times=costs.copy(),
         qps=none, solver_iterations=none - 1, flags=none.copy(), observer_states=array,
         covariances=matrices, engine=name,
     )
 
 
-def _arguments(update: Callable[..., Any]) -> tuple[bool, bool]:
-    """Whether a second argument must be given, and whether ``dt`` can be."""
+def _takes(update: Callable[..., Any], *arguments: Any, **options: Any) -> bool:
     try:
-        known = inspect.signature(update).parameters
-    except (TypeError, ValueError):  # of an extension module
-        return False, True
-    named = [one for one in known.values() if one.kind in (
-        one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
-    free = any(one.kind is one.VAR_KEYWORD for one in known.values())
-    return len(named) > 1 and named[1].default is inspect.Parameter.empty, free or "dt" in known
+        inspect.signature(update).bind(*arguments, **options)
+    except TypeError:
+        return False
+    except ValueError:  # an extension module does not say
+        return True
+    return True
 
 
-def _covariance(estimator: Any, found: Any, n: int) -> Array | None:
-    value = getattr(found, "covariance", getattr(estimator, "covariance", None))
-    if value is None:
-        return None
-    matrix = np.array(value, np.float64)
-    if matrix.shape != (n, n):
-        raise ModelError(
-            f"the covariance of {type(estimator).__name__} has shape {matrix.shape}; expected "
-            f"({n}, {n})."
+def _rows(name: str, values: ArrayLike, count: int | None = None) -> Array:
+    array = numbers(name, values, finite=False)
+    if array.ndim == 0 or count not in (None, len(array)):
+        raise ShapeError(
+            f"{name} has shape {array.shape}; expected {'T' if count is None else count} rows, one "
+            "a sample."
         )
-    return matrix
+    return array
+
+
+def _read(what: str, value: Any, *shape: int) -> Array:
+    """A copy of an array of the estimator."""
+    array = numbers(what, value, finite=False)
+    if array.shape != shape or value is None:
+        raise ShapeError(
+            f"{what} is {shown(value)}, of shape {array.shape}; expected an array of shape {shape}."
+        )
+    return array

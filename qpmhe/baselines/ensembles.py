@@ -15,10 +15,10 @@ class _Sampled(Baseline):
 
     def __init__(self, problem: Problem, size: int) -> None:
         self._size = size
-        self._root = cholesky(problem.system.state_covariance(problem.disturbance)).T
         super().__init__(problem)
 
     def _begin(self) -> None:
+        self._root = cholesky(self._disturbance).T
         self._random = np.random.default_rng(self.problem.seed)
         self._samples = self.state + self._drawn(cholesky(self.problem.prior).T)
         self._weights = np.full(self._size, 1.0 / self._size)

@@ -6,6 +6,7 @@ import numpy as np
 
 from .._checks import Array, dimension, positive
 from .._linalg import cholesky, solve
+from ..errors import OptionError
 from ..model.residuals import difference
 from ..model.system import System
 from .base import Baseline, Mask, Problem, deviations, innovation
@@ -49,9 +50,6 @@ class ExtendedKalmanFilter(Baseline):
         self._iterations = dimension("iterations", iterations, 1)
         super().__init__(problem)
 
-    def _begin(self) -> None:
-        pass
-
     def _correct(self, system: System, y: Array, u: Array, there: Mask) -> None:
         x, p, r = self.state, self.covariance, self.problem.noise[np.ix_(there, there)]
         at = x
@@ -91,7 +89,7 @@ class UnscentedKalmanFilter(Baseline):
     Raises
     ------
     OptionError
-        If the spread is not positive.
+        If the spread is not between 1e-6 and 1e6.
 
     References
     ----------
@@ -101,12 +99,14 @@ class UnscentedKalmanFilter(Baseline):
     def __init__(self, problem: Problem, *, spread: float | None = None) -> None:
         n = problem.system.n
         self._spread = float(np.sqrt(max(3, n))) if spread is None else positive("spread", spread)
+        if not 1e-6 <= self._spread <= 1e6:
+            raise OptionError(
+                f"spread is {self._spread:g}; expected standard deviations from 1e-6 to 1e6, "
+                "usually the square root of max(3, n)."
+            )
         share = 0.5 / self._spread**2
         self._weights = np.concatenate(([1.0 - 2.0 * n * share], np.full(2 * n, share)))
         super().__init__(problem)
-
-    def _begin(self) -> None:
-        pass
 
     def _points(self) -> Array:
         """Sigma points (2n + 1, n)."""

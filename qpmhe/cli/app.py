@@ -16,6 +16,7 @@ from qpmhe_solvers import backends
 
 from .._version import __version__
 from ..errors import QpmheError
+from . import options
 from .compare import compare, study
 from .compile import compile
 from .doctor import doctor
@@ -166,14 +167,8 @@ def certify(
         bool, typer.Option("--guard", help="Try a guard of estimates on the simulated record, or "
                                            "say why there is none.")
     ] = False,
-    max_disturbance: Annotated[
-        str | None,
-        typer.Option(help="Largest |w|, one length or a number for each component. Default: W, "
-                          "else three standard deviations."),
-    ] = None,
-    max_noise: Annotated[
-        str | None, typer.Option(help="Largest |v|, likewise for outputs.")
-    ] = None,
+    max_disturbance: options.MaxDisturbance = None,
+    max_noise: options.MaxNoise = None,
 ) -> None:
     """Prove how far the observer can be from the true state."""
     from .certify import certify as run

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -111,7 +112,7 @@ def compare(
         what = Study(
             models=model or ("batch_reactor",), records=record or (),
             reading=reading if record else {}, backends=backend or None,
-            observers=observer or ("model",), estimators=dict(map(_labelled, estimator or ())),
+            observers=observer or ("model",), estimators=_labelled(estimator or ()),
             qps=_numbers("qps", qps),
             solver_iterations=_numbers("solver_iterations", solver_iterations),
             horizons=_numbers("horizons", horizons),
@@ -195,10 +196,18 @@ def _show_kept(console: Console, folder: Path | None) -> None:
     )
 
 
-def _labelled(text: str) -> tuple[str, str]:
-    """The name of an estimator, and of the function that makes it."""
-    found = re.match(r"([^=:()]+)=(.*)", text, re.DOTALL)
-    return (found[1].strip(), found[2].strip()) if found else (text, text)
+def _labelled(texts: Sequence[str]) -> dict[str, str]:
+    """Names of estimators, and of the functions that make them."""
+    found: dict[str, str] = {}
+    for text in texts:
+        parts = re.fullmatch(r"([^=:()]+)=(.*)", text, re.DOTALL)
+        name, maker = (parts[1].strip(), parts[2].strip()) if parts else (text, text)
+        if found.setdefault(name, maker) != maker:
+            raise OptionError(
+                f"--estimator has the name {name!r} for {found[name]!r} and for {maker!r}; give "
+                "each a name of its own, as in NAME=ekf."
+            )
+    return found
 
 
 def _numbers(name: str, text: str) -> list[int | None]:

@@ -75,14 +75,8 @@ def estimate(
         typer.Option(help="For --bound: largest |x - z| at the start, one length or a number "
                           "for each state; default is the scenario's."),
     ] = None,
-    max_disturbance: Annotated[
-        str | None,
-        typer.Option(help="For --bound: largest |w|, one length or a number for each component; "
-                          "default is W, else three standard deviations."),
-    ] = None,
-    max_noise: Annotated[
-        str | None, typer.Option(help="For --bound: largest |v|, likewise for outputs.")
-    ] = None,
+    max_disturbance: options.MaxDisturbance = None,
+    max_noise: options.MaxNoise = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an estimation that was interrupted.")
     ] = False,

@@ -26,6 +26,12 @@ Width = Annotated[
     typer.Option(help="Also write the figures as PDF, this wide: single (84 mm), double "
                       "(174 mm) or a number of inches."),
 ]
+MaxDisturbance = Annotated[
+    str | None,
+    typer.Option(help="Largest |w| for proved bounds, one length or a number for each component; "
+                      "default is W, else three standard deviations."),
+]
+MaxNoise = Annotated[str | None, typer.Option(help="Largest |v| for proved bounds, likewise.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 
 #: What a record may be.

@@ -186,17 +186,24 @@ class Run:
     def __len__(self) -> int:
         return self.flags.size
 
+    @property
+    def has_costs(self) -> bool:
+        """Whether any cost is known: the estimators of `qpmhe.baselines` have none."""
+        return bool(np.isfinite(self.costs).any())
+
     def facts(self) -> dict[str, str]:
         """A summary in words: steps, outcomes, costs and times."""
         kept = int(((self.flags & Status.CANDIDATE.value) != 0).sum())
         improved = int(((self.flags & Status.IMPROVED.value) != 0).sum())
         found = {
             "steps": f"{len(self)}", "states": f"{self.states.shape[1]}", "engine": self.engine,
-            "improved": f"{improved}", "candidate kept": f"{kept}",
         }
-        if len(self):
+        if self.has_costs or not len(self):
+            found |= {"improved": f"{improved}", "candidate kept": f"{kept}"}
+        if self.has_costs:
             found["mean J"] = f"{self.costs.mean():.6g}"
             found["mean J of the candidate"] = f"{self.candidate_costs.mean():.6g}"
+        if len(self):
             found["median step"] = f"{1e6 * np.median(self.times):.3g} us"
         return found
 

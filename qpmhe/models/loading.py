@@ -109,7 +109,7 @@ def find(
         if written.endswith(".py"):
             raise ModelError(
                 f"the {kind} is {text!r}, which names no function; "
-                f"{_proposal((folder or Path()) / written, written)}."
+                f"{_proposal((folder or Path()) / written, written, kind)}."
             )
         if written not in names:
             raise ModelError(f"{kind} {written!r} is not known; {expected}.")
@@ -214,19 +214,21 @@ def _returns_model(function: Any) -> bool:
     )
 
 
-def _proposal(file: Path, written: str) -> str:
-    """What to write for the model of a file, by the functions that it defines."""
+def _proposal(file: Path, written: str, kind: str) -> str:
+    """What to write for a file, by the functions that it defines; models need no argument."""
     try:
         body = ast.parse(file.read_bytes()).body
     except (OSError, SyntaxError, ValueError):
         return f"expected {written}:function"
+    count = int(kind != "model")  # the problem
     names = [
         one.name for one in body
         if isinstance(one, ast.FunctionDef) and not one.name.startswith("_")
-        and len(one.args.posonlyargs + one.args.args) == len(one.args.defaults)
+        and len(one.args.posonlyargs + one.args.args) - len(one.args.defaults) == count
     ]
     if not names:
-        return f"expected {written}:function, and the file has no function without arguments"
+        return f"expected {written}:function" + (
+            ", and the file has no function without arguments" * (not count))
     return "expected " + " or ".join(f"{written}:{name}" for name in names[:5])
 
 

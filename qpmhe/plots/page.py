@@ -33,16 +33,21 @@ def run_page(run: Run) -> str:
         return table
     with rc_context(LIGHT):
         count = min(run.states.shape[1], _MOST)
-        figure = Figure(figsize=(5.6, 0.5 + 1.1 * (count + 1)), layout="constrained")
-        panels = list(figure.subplots(count + 1, 1, sharex=True))
-        times = run_times(run, None, None)[0]
+        total = count + run.has_costs
+        figure = Figure(figsize=(5.6, 0.5 + 1.1 * total), layout="constrained")
+        panels = list(figure.subplots(total, 1, sharex=True, squeeze=False)[:, 0])
+        times, when = run_times(run, None, None)
         trajectories(
             times, None, {"estimate": run.states[:, :count]},
-            run_labels(run)[:count], "", panels[:-1],
+            run_labels(run)[:count], "" if run.has_costs else when, panels[:count],
         )
-        add_bands(run, times, [panel.lines[0] for panel in panels[:-1]], 2.0)
-        costs(run, axes=panels[-1])
+        add_bands(run, times, [panel.lines[0] for panel in panels[:count]], 2.0)
+        if run.has_costs:
+            costs(run, axes=panels[-1])
         data = BytesIO()
         figure.savefig(data, format="png", dpi=110)
     image = base64.b64encode(data.getvalue()).decode()
-    return f"{table}<img alt='states and costs over time' src='data:image/png;base64,{image}'>"
+    return (
+        f"{table}<img alt='states over time' style='max-width:100%' "
+        f"src='data:image/png;base64,{image}'>"
+    )

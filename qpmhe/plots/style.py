@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from io import StringIO
@@ -93,9 +93,10 @@ def run_times(
     The days of Matplotlib where the run has dates, for `date_axis`.
     """
     source, count = run.source, len(run)
-    if _has_dates(run, dt):
+    index = _dates(run, dt)
+    if index is not None:
         dates: Any = import_module("matplotlib.dates")
-        return np.asarray(dates.date2num(run.index), np.float64), time_label or ""
+        return np.asarray(dates.date2num(index), np.float64), time_label or ""
     if dt is None and source is not None:
         dt = source.system.dt
         if source.steps is not None:
@@ -106,18 +107,20 @@ def run_times(
     )
 
 
-def _has_dates(run: Run, dt: float | None) -> bool:
-    return dt is None and hasattr(run.index, "tz")
+def _dates(run: Run, dt: float | None) -> Any:
+    """The dates of a run's states; None where it has none, or counts its steps."""
+    index: Any = run.index
+    return index if dt is None and hasattr(index, "tz") else None
 
 
 def date_axis(run: Run, dt: float | None, panel: Any) -> None:
     """Label the times of `run_times` as dates, where they are, in the zone of the run's index."""
-    if _has_dates(run, dt):
+    index = _dates(run, dt)
+    if index is not None:
         dates: Any = import_module("matplotlib.dates")
-        zone = run.index.tz  # type: ignore[union-attr]
-        locator = dates.AutoDateLocator(tz=zone, minticks=3)
+        locator = dates.AutoDateLocator(tz=index.tz, minticks=3)
         panel.xaxis.set_major_locator(locator)
-        panel.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator, tz=zone))
+        panel.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator, tz=index.tz))
 
 
 def time_words(dt: float | None) -> str:
@@ -135,6 +138,16 @@ def label_decades(axis: Any) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def legend_columns(names: Sequence[str], inches: float, most: int) -> int:
+    """The number of columns, at most ``most``, of a legend that has room in a figure this wide."""
+    for columns in range(min(most, len(names)), 1, -1):
+        groups = np.array_split([len(name) for name in names], columns)  # as Matplotlib does
+        widths = (0.65 + 0.072 * group.max() for group in groups)
+        if sum(widths) <= inches:
+            return columns
+    return 1
 
 
 def panels(count: int, axes: Any, height: float = 2.1) -> list[Any]:

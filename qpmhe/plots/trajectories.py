@@ -17,6 +17,7 @@ from .style import (
     REAL,
     STYLES,
     date_axis,
+    legend_columns,
     line_styles,
     panels,
     run_times,
@@ -275,6 +276,6 @@ def _legend(drawn: list[Any], axes: Any) -> None:
     for old in list(figure.legends):
         old.remove()
     figure.legend(
-        shown.values(), shown.keys(), loc="outside upper center", ncols=min(len(shown), 5),
-        frameon=False,
+        shown.values(), shown.keys(), loc="outside upper center", frameon=False,
+        ncols=legend_columns([*shown], figure.get_figwidth(), 5),
     )

@@ -19,15 +19,14 @@ from qpmhe_solvers import Backend, BackendError, Recording, backend, register
 
 from .._checks import Array
 from ..baselines import follow
-from ..errors import InvalidInputError, ModelError, PriorWarning
+from ..errors import InvalidInputError, PriorWarning, QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..models import Record
-from ..models.loading import ModelSource, build
-from ..observers import Observer
+from ..models.loading import ModelSource, code_place
 from . import metrics
 from .environment import environment
-from .experiment import Source, experiment
+from .experiment import Source, experiment, made
 from .row import OBSERVER, Cell, StudyRow
 
 #: Engine of all cells: only the Python step calls the backends that a study compares.
@@ -43,8 +42,8 @@ class Task:
     It gives up between two steps after ``timeout`` seconds. ``keep`` returns the trajectory,
     ``shared`` says that other cells run on the machine at the same time, ``registered`` is the
     backend for workers that do not know it, and ``isolated`` runs the solver in another process.
-    QPs on which the backend failed go to a folder in ``failing``. ``observer`` makes the observer,
-    if not the model, and ``estimator`` what runs in place of moving horizon estimation.
+    QPs on which the backend failed go to a folder in ``failing``. ``observer`` makes an observer
+    in place of the model's, ``estimator`` an estimator in place of moving horizon estimation.
     """
 
     cell: Cell
@@ -80,7 +79,10 @@ def compute(task: Task) -> StudyRow:
         except CellTimeoutError as error:
             return failure(task, f"out of time: {error}")
         except BaseException as error:  # a solver may even try to leave the process
-            return failure(task, f"{type(error).__name__}: {error}")
+            maker = task.estimator or task.observer
+            place = "" if maker is None or isinstance(error, QpmheError) else code_place(
+                error, maker.file)
+            return failure(task, f"{place}{type(error).__name__}: {error}")
 
 
 def failure(task: Task, reason: str) -> StudyRow:
@@ -114,11 +116,18 @@ def _measured(task: Task, limit: float) -> StudyRow:
     if "time" in task.parts:
         _warm_up(task, limit)
     run = _run(task, record, limit, covariances="covariance" in task.parts)
+    with np.errstate(over="ignore", invalid="ignore"):
+        has_square = np.isfinite(run.states**2).all(axis=1)
+    if not has_square.all():  # a mean over the other seeds would hide it
+        return failure(
+            task, f"the estimates diverge: after {has_square.argmin()} steps, one is "
+            f"{run.states[has_square.argmin()].tolist()}"
+        )
     residual = found.system.state_residual
     measured: dict[str, Any] = {
         **metrics.accuracy(run.states, record.states, found.settled, residual),
     }
-    if run.flags.any():  # a foreign estimator's steps have no status
+    if run.flags.any():  # steps of other estimators have no status
         measured |= metrics.outcomes(run)
     if "time" in task.parts:
         measured |= metrics.timing(run.times)
@@ -169,15 +178,10 @@ def _register(entry: Backend) -> None:
 def _estimator(task: Task, backend_name: str = "") -> Any:
     cell, found = task.cell, experiment(task.source)
     if task.estimator is not None:
-        return build(task.estimator, replace(found.problem, seed=cell.seed))
+        return made(task.estimator, replace(found.problem, seed=cell.seed))
     system, observer, cost = found.parts
     if task.observer is not None:
-        observer = build(task.observer, found.problem)
-        if not isinstance(observer, Observer):
-            raise ModelError(
-                f"observer {task.observer.name!r} returned a {type(observer).__name__}; expected "
-                "a qpmhe.Observer."
-            )
+        observer = made(task.observer, found.problem)
     with warnings.catch_warnings():
         if task.observer is not None:  # the prior's weight is what observers are compared with
             warnings.simplefilter("ignore", PriorWarning)
@@ -198,10 +202,10 @@ def _run(
         if perf_counter() > limit:
             raise CellTimeoutError(f"{done} of {total} steps were done.")
 
-    made = _estimator(task, backend_name)
-    start = found.options["initial_state"] if task.estimator is not None else made.state
+    estimator = _estimator(task, backend_name)
+    start = found.options["initial_state"] if task.estimator is not None else estimator.state
     return follow(
-        made, np.array(start, float), record.measurements, record.inputs,
+        estimator, np.array(start, float), record.measurements, record.inputs,
         None if found.lengths is None else found.lengths[:total], covariances=covariances,
         each=watch,
     )

@@ -11,12 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from qpmhe_solvers.values import shown
+
 from .._checks import Array
 from ..baselines import Problem
 from ..errors import InvalidInputError, ModelError
 from ..model.system import System
 from ..models import Record, Scenario
-from ..models.loading import ModelSource, load
+from ..models.loading import ModelSource, build, load
+from ..observers import Observer
 from ..records.arrays import read_record
 from ..records.record_model import load_record_model
 
@@ -101,17 +104,32 @@ class Experiment:
 
     @cached_property
     def problem(self) -> Problem:
-        """What other estimators and observers are made for; a `WeightError` if there is none."""
+        """The problem of other estimators and observers; a `WeightError` without a prior."""
         system, observer, cost = self.parts
         return Problem.of(
             system, observer, cost, self.options["initial_state"],
-            parameters=self.options.get("parameters") or (),
+            parameters=self.options.get("parameters", ()),
         )
 
     def times(self, steps: int) -> Array:
         """Times of the states x(0), ..., x(steps)."""
         spacing = np.full(steps, self.dt) if self.lengths is None else self.lengths[:steps]
         return np.concatenate(([0.0], np.cumsum(spacing)))
+
+
+def made(maker: ModelSource, problem: Problem) -> Any:
+    """The observer or estimator that a function of the user makes; a `ModelError` if it fails."""
+    found = build(maker, problem)
+    if maker.kind == "observer" and not isinstance(found, Observer):
+        raise ModelError(
+            f"observer {maker.name!r} returned {shown(found)}; expected a qpmhe.Observer."
+        )
+    if maker.kind == "estimator" and not callable(getattr(found, "update", None)):
+        raise ModelError(
+            f"estimator {maker.name!r} returned {shown(found)}; expected an object with "
+            "update(y, u)."
+        )
+    return found
 
 
 @lru_cache(maxsize=16)

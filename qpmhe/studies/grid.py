@@ -28,7 +28,7 @@ from ..errors import BackendError, InvalidInputError, ModelError, OptionError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..models.loading import ModelSource, check_named_in_file, find
 from ..observers import Observer
-from .experiment import Source, experiment
+from .experiment import Source, experiment, made
 from .row import OBSERVER, USUAL_OBSERVER, Cell
 
 if TYPE_CHECKING:
@@ -188,22 +188,27 @@ class Study:
         for source in sources:
             experiment(source)
         # A model's file may register backends of its own.
-        object.__setattr__(self, "backends", _backends(self.backends))
-        object.__setattr__(self, "sources", sources)
         assert isinstance(self.estimators, Mapping)
+        object.__setattr__(self, "backends", _backends(self.backends))
+        taken = self.estimators.keys() & {OBSERVER, *(one.name for one in backends())}
+        if taken:
+            raise StudyError(
+                f"estimators has the name {min(taken)!r}, which is taken by the observer or by a "
+                "QP backend; give it another."
+            )
+        object.__setattr__(self, "sources", sources)
         named = {
             "observers": {one: one for one in self.observers if one != USUAL_OBSERVER},
             "estimators": self.estimators,
         }
-        made = {
+        makers = {
             group: {
                 name: find(text, folder, group[:-1], KNOWN[group]) for name, text in chosen.items()
             } for group, chosen in named.items()
         }
-        object.__setattr__(self, "makers", made)
-        if any(made.values()):
-            for source in sources:
-                _ = experiment(source).problem
+        object.__setattr__(self, "makers", makers)
+        for maker in (one for group in makers.values() for one in group.values()):
+            _check_maker(maker, sources)
         object.__setattr__(self, "models", tuple(model.name for model in models))
 
     @classmethod
@@ -243,14 +248,12 @@ class Study:
         for key in sorted(options, key=lambda key: key not in _DATA):
             value = options[key]
             try:
-                for name in _models(value) if key == "models" else ():
-                    check_named_in_file(name, path.parent)
-                if key in _RETURNS:
+                if key == "models" or key in _RETURNS:
                     names = _CHECKS[key](value)
                     for name in names.values() if isinstance(names, dict) else names:
-                        check_named_in_file(name, path.parent, key[:-1], _RETURNS[key])
+                        check_named_in_file(name, path.parent, key[:-1], _RETURNS.get(key, ()))
                 alone = {} if key in _DATA else {key: value}
-                known = data if key in _DATA or key == "backends" else {}
+                known = data if key in _DATA or key in ("backends", "estimators") else {}
                 cls(**known, **alone, folder=path.parent)
             except InvalidInputError as error:
                 words = str(error)
@@ -337,26 +340,43 @@ def _translated(key: str, value: Any) -> Any:
     )]
 
 
+def _check_maker(maker: ModelSource, sources: Sequence[Source]) -> None:
+    """Raise a `ModelError` if an observer or estimator can be made for none of the models."""
+    for source in sources:
+        problem = experiment(source).problem
+        try:
+            made(maker, problem)
+            return
+        except ModelError as error:
+            failed = error
+    raise failed
+
+
 def _distinct(values: Iterable[Any]) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(values))
 
 
+def _listed(value: Any) -> list[Any]:
+    """The items of a value; one that has none, such as a number, is the only item."""
+    return [value] if isinstance(value, str) or not np.iterable(value) else list(value)
+
+
 def _several(name: str, value: Any, known: str) -> list[Any]:
-    try:
-        found = [value] if isinstance(value, str) else list(value)
-    except TypeError:  # no sequence: one item
-        found = [value]
+    found = _listed(value)
     if not found:
         raise StudyError(f"{name} is empty, and so is the grid; {known}.")
     return found
 
 
-def _models(value: Any) -> tuple[str, ...]:
-    names = _several("models", value, "name at least one model")
-    for name in names:
-        if not isinstance(name, str):
-            raise StudyError(f"models has {shown(name)}; expected the name of a model.")
-    return _distinct(names)
+def _names(option: str, known: str) -> Callable[[Any], tuple[str, ...]]:
+    def check(value: Any) -> tuple[str, ...]:
+        names = _several(option, value, known)
+        for name in names:
+            if not isinstance(name, str):
+                raise StudyError(f"{option} has {shown(name)}; {known}.")
+        return _distinct(names)
+
+    return check
 
 
 def _backends(value: Any) -> tuple[str, ...]:
@@ -373,36 +393,16 @@ def _backends(value: Any) -> tuple[str, ...]:
     return _distinct(names)
 
 
-def _observers(value: Any) -> tuple[str, ...]:
-    names = _several("observers", value, f"expected some of {USUAL_OBSERVER}, "
-                                         f"{', '.join(KNOWN['observers'])}, or functions")
-    for name in names:
-        if not isinstance(name, str):
-            raise StudyError(f"observers has {shown(name)}; expected the name of an observer.")
-    return _distinct(names)
-
-
 def _estimators(value: Any) -> dict[str, str]:
-    if isinstance(value, Mapping):
-        items = dict(value)
-    else:
-        names = _several("estimators", value, f"expected some of {', '.join(KNOWN['estimators'])}, "
-                                              "functions, or a dictionary of these")
-        items = {one: one for one in names} if all(isinstance(one, str) for one in names) else {
-            str(k): one for k, one in enumerate(names)
-        }
-    for name, text in items.items():
-        if not (isinstance(name, str) and isinstance(text, str)):
+    given = isinstance(value, Mapping)
+    items = list(value.items()) if given else [(one, one) for one in _listed(value)]
+    for name, text in items:
+        if not (isinstance(name, str) and isinstance(text, str) and name.strip()):
             raise StudyError(
-                f"estimators has {shown(name)}: {shown(text)}; expected a name, and the name of a "
-                "function that makes the estimator."
+                f"estimators has {f'{shown(name)}: ' * given}{shown(text)}; expected some of "
+                f"{', '.join(KNOWN['estimators'])}, functions, or a dictionary of these by name."
             )
-        if name == OBSERVER or name in {one.name for one in backends()}:
-            raise StudyError(
-                f"estimators has the name {name!r}, which is taken by "
-                f"{'the observer' if name == OBSERVER else 'a QP backend'}; give it another."
-            )
-    return items
+    return dict(items)
 
 
 def _numbers(name: str, least: int, nothing: str) -> Callable[[Any], tuple[int | None, ...]]:
@@ -457,11 +457,14 @@ def _seeds(value: Any) -> tuple[int, ...]:
 _DATA = ("models", "records", "reading")
 # The check of each option, in order; each returns the value in its standard form.
 _CHECKS: dict[str, Callable[[Any], Any]] = {
-    "models": _models,
+    "models": _names("models", "name at least one model"),
     "records": _records,
     "reading": _reading,
     "backends": _backends,
-    "observers": _observers,
+    "observers": _names(
+        "observers", f"expected some of {USUAL_OBSERVER}, {', '.join(KNOWN['observers'])}, or "
+                     "functions"
+    ),
     "estimators": _estimators,
     "qps": _numbers("qps", 0, " None iterates to convergence."),
     "solver_iterations": _numbers("solver_iterations", 1, " None leaves the solver's default."),

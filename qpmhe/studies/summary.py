@@ -13,7 +13,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import numbers
 from ..errors import InvalidInputError, ShapeError
-from .row import CONFIGURATION, HALVES, METRICS, OBSERVER
+from .row import CONFIGURATION, HALVES, METRICS
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -125,7 +125,7 @@ def summarise(frame: DataFrame) -> DataFrame:
 
 
 def with_observers(frame: DataFrame) -> DataFrame:
-    """Cells whose backends have the observer in their names, if there are several observers."""
+    """The cells, with the observer in the backend's name if there are several observers."""
     own = frame["observer"].ne("")
     if frame.loc[own, "observer"].nunique() < 2:
         return frame
@@ -134,12 +134,12 @@ def with_observers(frame: DataFrame) -> DataFrame:
 
 
 def alone(rows: DataFrame) -> Series:
-    """Which rows are an observer's that solves no QP; see `with_observers`."""
-    return rows["backend"].str.partition(" / ")[0] == OBSERVER
+    """Which rows are those of an observer alone."""
+    return ~sequential(rows) & rows["observer"].ne("")
 
 
 def sequential(rows: DataFrame) -> Series:
-    """Which rows solve QPs: neither an observer's nor those of other estimators."""
+    """Which rows solve QPs, and so are neither an observer's nor another estimator's."""
     return rows["qps"].ne(0).fillna(True).astype(bool)
 
 

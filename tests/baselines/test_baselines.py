@@ -16,12 +16,13 @@ from qpmhe.baselines import (
     UnscentedKalmanFilter,
     follow,
 )
-from qpmhe.errors import InvalidInputError, ModelError, OptionError, ShapeError, WeightError
+from qpmhe.errors import InvalidInputError, OptionError, ShapeError, WeightError
 
 A, B, C = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[0.0], [1.0]]), np.eye(2)
 G = np.array([[0.5], [1.0]])
 Q, R = np.array([[0.3]]), np.array([[0.2, 0.05], [0.05, 0.4]])
 P0, X0 = np.diag([4.0, 0.0]), np.array([1.0, -1.0])
+OBSERVER = qpmhe.ExtendedKalman(prior=P0, disturbance=Q, noise=R)
 KALMAN = (
     ExtendedKalmanFilter, partial(ExtendedKalmanFilter, iterations=5), UnscentedKalmanFilter,
     partial(UnscentedKalmanFilter, spread=0.1),
@@ -219,14 +220,49 @@ def test_any_object_with_an_update_is_followed():
     found = follow(mhe, mhe.state, measured, covariances=True)
     for name in ("states", "costs", "flags", "covariances", "filtered"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    for estimator, steps, words in (
-        (object(), None, "a object is no estimator; expected an object with update(y, u)"),
-        (Other([1.0]), None, "returned an estimate of shape (1,); expected (2,)"),
-        (Other([1.0, 2.0], covariance=np.eye(3)), None, "has shape (3, 3); expected (2, 2)"),
-        (Other([1.0, 2.0]), np.ones(3), "takes no dt, but the record's steps"),
+
+
+def test_estimators_and_records_that_do_not_fit_are_refused():
+    y = np.zeros((3, 1))
+    for estimator, options, words in (
+        (object(), {}, "; expected an object with update(y, u)"),
+        (Other, {}, "the estimator is <class"),
+        (Other([1.0]), {}, "the estimate of Other is [1.0], of shape (1,); expected an array of "),
+        (Other("word"), {}, "the estimate of Other is 'word', which is not an array of real"),
+        (Other(None), {}, "the estimate of Other is None"),
+        (Other([1.0, 2.0], covariance=np.eye(3)), {}, "of shape (3, 3); expected an array of"),
+        (Other([1.0, 2.0], covariance=len), {}, "the covariance of Other is <built-in function"),
+        (Other([1.0, 2.0], filtered="word"), {}, "Other.filtered is 'word'"),
+        (Other([1.0, 2.0]), {"steps": np.ones(3)}, "called as update(y, u, dt=...)"),
+        (Other([1.0, 2.0]), {"inputs": np.ones((3, 1))}, "Other.update cannot be called as"),
+        (Other([1.0, 2.0]), {"inputs": np.ones((2, 1))}, "inputs has shape (2, 1); expected 3 "),
+        (Other([1.0, 2.0]), {"steps": 0.1}, "steps has shape (); expected 3 rows"),
+        (Other([1.0, 2.0]), {"measurements": None}, "measurements has shape (); expected T rows"),
+        (Other([1.0, 2.0]), {"start": "word"}, "start is 'word', which is not"),
     ):
-        with pytest.raises(ModelError, match=re.escape(words)):
-            follow(estimator, np.zeros(2), y, steps=steps, covariances=True)
+        given = {"start": np.zeros(2), "measurements": y} | options
+        with pytest.raises(InvalidInputError, match=re.escape(words)):
+            follow(estimator, **given, covariances=True)
+
+
+class Remembering:
+    """It overwrites its arrays, and knows a covariance from its second update on."""
+
+    def __init__(self):
+        self.filtered, self.covariance = np.zeros(1), None
+
+    def update(self, y, u=None):
+        if self.filtered[0] > 0.0:
+            self.covariance = np.eye(1)
+        self.filtered += 1.0
+        return self.filtered
+
+
+def test_arrays_that_an_estimator_overwrites_are_copied():
+    run = follow(Remembering(), [0.0], np.zeros(3), np.zeros(3), covariances=True)
+    np.testing.assert_array_equal(run.states[:, 0], [0, 1, 2, 3])
+    np.testing.assert_array_equal(run.filtered[:, 0], [1, 2, 3])
+    np.testing.assert_array_equal(run.covariances[:, 0, 0], [np.nan, 1, 1])
 
 
 def test_what_does_not_fit_is_refused():
@@ -234,6 +270,11 @@ def test_what_does_not_fit_is_refused():
     for make, error, words in (
         (lambda: ExtendedKalmanFilter(problem, iterations=0), OptionError, "iterations is 0"),
         (lambda: UnscentedKalmanFilter(problem, spread=-1.0), OptionError, "spread is -1"),
+        (lambda: UnscentedKalmanFilter(problem, spread=1e300), OptionError, "from 1e-6 to 1e6"),
+        (lambda: ExtendedKalmanFilter(None), InvalidInputError, "problem is None; expected"),
+        (lambda: EnsembleKalmanFilter(problem.system), InvalidInputError, "problem is System"),
+        (lambda: Problem.of(problem.system, None, None, X0), InvalidInputError, "observer is None"),
+        (lambda: Problem.of(problem.system, OBSERVER, "", X0), InvalidInputError, "cost is ''; "),
         (lambda: EnsembleKalmanFilter(problem, members=1), OptionError, "members is 1"),
         (lambda: EnsembleKalmanFilter(problem, inflation=0.0), OptionError, "inflation is 0"),
         (lambda: BootstrapParticleFilter(problem, particles=1), OptionError, "particles is 1"),

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 import qpmhe
 from qpmhe import Status, plots
+from qpmhe.baselines import ExtendedKalmanFilter, Problem
 from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 from qpmhe.model.signals import Signal, Signals
 
@@ -278,3 +279,21 @@ def test_a_dot_belongs_to_the_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for stem, written in (("run_0.5", "run_0.5"), ("states.SVG", "states")):
         assert plots.save(Figure(), stem) == [Path(f"{written}.png"), Path(f"{written}.svg")]
+
+
+def test_a_run_without_costs_has_a_page_of_states_and_a_legend_that_fits(case):
+    states, run, _ = case
+    problem = Problem.of(SYSTEM, OBSERVER, COST, SCENARIO.initial_estimate)
+    other = ExtendedKalmanFilter(problem).run(states[1:, :1].sum(axis=1) + states[1:, 1])
+    assert {"mean J", "improved"} < run.facts().keys()
+    assert other.facts().keys() == {"steps", "states", "engine", "median step"}
+    assert "<img" in other._repr_html_()
+    axes = plots.states(
+        run, truth=states, guarded=run.states, band=(run.states - 1.0, run.states + 1.0)
+    )
+    figure = axes[0].figure
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    ends = legend.get_window_extent().extents
+    assert len(legend.get_texts()) == 5
+    assert 0.0 <= ends[0] < ends[2] <= figure.bbox.width

@@ -253,3 +253,14 @@ def test_figures_against_horizon_noise_and_qps_come_in_one_call(tmp_path):
     assert float(box[1]) == pytest.approx(84 / 25.4 * 72, rel=1e-3)
     with pytest.raises(OptionError, match="width is 'wide'; expected 'single'"):
         write_report(store, tmp_path / "out", width="wide")
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    (("A=ekf", "A=ukf"), "--estimator has the name 'A' for 'ekf' and for 'ukf'"),
+    (("missing.py:make",), "estimator 'missing.py:make': cannot read"),
+    (("=ekf",), "estimator '=ekf' is not known; expected one of ekf, ukf"),
+])
+def test_estimators_that_do_not_fit_are_named(given, words):
+    options = [one for name in given for one in ("--estimator", name)]
+    with pytest.raises(InvalidInputError, match=re.escape(words)):
+        command("compare", "--backend", "banded", *options)

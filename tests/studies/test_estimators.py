@@ -10,7 +10,7 @@ from qpmhe.baselines import ExtendedKalmanFilter, Problem
 from qpmhe.errors import ModelError, OptionError
 from qpmhe.studies import Store, StoreError, Study, StudyError, metrics, run, summarise
 from qpmhe.studies.cell import Task, compute
-from qpmhe.studies.summary import with_observers
+from qpmhe.studies.summary import alone, sequential, with_observers
 
 from .report_study import command
 
@@ -40,6 +40,28 @@ def gated(problem):
 
 def wrong(problem):
     return 3
+
+def far(problem):
+    if problem.system.n != 12:
+        raise ValueError("for 12 states")
+    return Kept(problem)
+
+class Raises(Kept):
+    def update(self, y):
+        return 1 / 0
+
+class Diverges(Kept):
+    def update(self, y):
+        self.state = self.state * 1e60
+        return self.state
+
+class Lost(Kept):
+    def update(self, y):
+        return self.state * np.nan
+
+class Word(Kept):
+    def update(self, y):
+        return "word"
 """
 SMALL = {"backends": ["banded"], "seeds": 2, "steps": 12}
 
@@ -65,7 +87,7 @@ def computed(study):
 def test_another_estimator_is_a_cell_with_times_errors_and_nees(folder):
     study = Study(
         qps=[0], estimators={"EKF": "my.py:filter", "kept": "my.py:Kept", "MHE": "my.py:gated",
-                             "wrong": "my.py:wrong", "few": "enkf(members=5)"},
+                             "few": "enkf(members=5)"},
         folder=folder, **SMALL,
     )
     assert [cell.backend for cell in study.cells()][:3] == ["observer", "EKF", "kept"]
@@ -89,8 +111,31 @@ def test_another_estimator_is_a_cell_with_times_errors_and_nees(folder):
         mhe = rows["MHE", seed]
         assert (mhe.improved, mhe.reasons is None) == (pytest.approx(1.0, abs=0.5), False)
         assert rows["few", seed].nees != rows["few", 1 - seed].nees  # random numbers of the seed
-    assert rows["wrong", 0].outcome == "failed"
-    assert "a int is no estimator; expected an object with update(y, u)" in rows["wrong", 0].reason
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("Raises", r"my.py, line \d+: ZeroDivisionError: division by zero"),
+    ("Diverges", r"the estimates diverge: after 3 steps, one is \["),
+    ("Lost", r"the estimates diverge: after 1 steps, one is \[nan"),
+    ("Word", "InvalidInputError: the estimate of Word is 'word', which is not an array"),
+])
+def test_an_estimator_that_fails_at_run_time_is_a_failed_cell(folder, name, words):
+    study = Study(qps=[0], estimators=[f"my.py:{name}"], folder=folder, **SMALL | {"seeds": 1})
+    row = computed(study)[-1]
+    assert row.outcome == "failed"
+    assert re.search(words, row.reason)
+
+
+def test_an_estimator_takes_no_name_of_the_observer(folder):
+    """Not even one that looks like an observer's in tables with several observers."""
+    study = Study(
+        qps=[0], observers=["model", "ekf"], estimators={"observer / own": "my.py:Kept"},
+        folder=folder, **SMALL,
+    )
+    store = run(study, folder / "store.sqlite", jobs=1, progress=False)
+    rows = summarise(with_observers(store.frame()))
+    assert set(rows.loc[alone(rows), "backend"]) == {"observer / model", "observer / ekf"}
+    assert not sequential(rows).any()
 
 
 def test_observers_are_an_axis(folder, tmp_path):
@@ -187,23 +232,34 @@ def test_a_file_has_the_same_and_names_no_other_function(folder, monkeypatch):
 
 def test_what_does_not_fit_is_refused(folder):
     for error, words, options in (
-        (StudyError, "taken by a QP backend", {"estimators": {"osqp": "ekf"}}),
-        (StudyError, "taken by the observer", {"estimators": {"observer": "ekf"}}),
+        (StudyError, "has the name 'osqp', which is taken", {"estimators": {"osqp": "ekf"}}),
+        (StudyError, "has the name 'observer', which is", {"estimators": {"observer": "ekf"}}),
+        (StudyError, "estimators has 3; expected some of ekf", {"estimators": 3}),
+        (StudyError, "estimators has None; expected some", {"estimators": ["ekf", None]}),
+        (StudyError, "estimators has '': 'ekf'; expected", {"estimators": {"": "ekf"}}),
+        (StudyError, "observers has None; expected some", {"observers": None}),
         (StudyError, "estimators has 'x': 3", {"estimators": {"x": 3}}),
         (StudyError, "observers is empty", {"observers": []}),
         (StudyError, "observers has 3", {"observers": [3]}),
         (ModelError, "cannot read", {"estimators": ["none.py:make"]}),
         (ModelError, "names no function; expected my.py", {"observers": ["my.py"]}),
         (OptionError, "Did you mean", {"estimator": ["ekf"]}),
+        (ModelError, "observer 'my.py:wrong' returned 3; expected a qpmhe.Observer",
+         {"observers": "my.py:wrong"}),
+        (ModelError, "'my.py:wrong' returned 3; expected an object with update(y, u)",
+         {"estimators": "my.py:wrong"}),
+        (ModelError, "my.py has no function missing", {"estimators": "my.py:missing"}),
+        (ModelError, "'ekf(iterations=0)' cannot be made: iterations is 0",
+         {"estimators": "ekf(iterations=0)"}),
+        (ModelError, "'my.py:far' cannot be made: ValueError: for 12 states",
+         {"estimators": "my.py:far"}),
     ):
         with pytest.raises(error, match=re.escape(words)):
             Study(**SMALL | options, folder=folder)
-    study = Study(qps=[1], observers=["my.py:wrong"], folder=folder, **SMALL | {"seeds": 1})
-    (row,) = computed(study)
-    assert "observer 'my.py:wrong' returned a int; expected a qpmhe.Observer" in row.reason
-    study = Study(qps=[0], estimators=["ekf(iterations=0)"], **SMALL | {"seeds": 1})
-    row = computed(study)[-1]
-    assert "estimator 'ekf(iterations=0)' cannot be made: iterations is 0" in row.reason
+    assert Study(**SMALL, estimators=[]).estimators == {}
+    # It can be made for one of the models.
+    both = {"models": ["batch_reactor", "chain_of_masses(masses=2)"]}
+    assert Study(**SMALL, **both, estimators=["my.py:far"], folder=folder).estimators
 
 
 def test_a_models_file_registers_a_backend(folder):
@@ -222,6 +278,12 @@ def test_a_models_file_registers_a_backend(folder):
         study = Study.from_toml(file)
         assert study.backends == ("of_a_file",)
         assert len(study.cells()) == 1
+        other = (folder / "model.py").read_text().replace("of_a_file", "of_another")
+        (folder / "other.py").write_text(other)
+        file.write_text('estimators = {of_another = "ekf"}\nmodels = ["other.py:make"]\n')
+        with pytest.raises(StudyError, match="line 1: estimators has the name 'of_another'"):
+            Study.from_toml(file)
+        qpmhe.solvers.unregister("of_another")
     finally:
         qpmhe.solvers.unregister("of_a_file")
 

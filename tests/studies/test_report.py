@@ -2,7 +2,7 @@
 
 import re
 from io import StringIO
-from itertools import combinations
+from itertools import combinations, pairwise
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -21,7 +21,7 @@ from qpmhe.errors import InvalidInputError, ShapeError
 from qpmhe.plots.style import _resized
 from qpmhe.studies.report import cases, write_report
 from qpmhe.studies.report.answers import limitations
-from qpmhe.studies.report.drawing import styles
+from qpmhe.studies.report.drawing import Axis, Drawing, Panel, PlotMark, draw, styles
 from qpmhe.studies.report.figures import profiles
 from qpmhe.studies.report.pictures import Part, chosen_runs, pictures
 from qpmhe.studies.report.words import configuration_words, number, seconds
@@ -310,3 +310,22 @@ def test_front_against_its_definition(rows):
     assert pareto_front(times, errors, 1e-3).tolist() == [True, False, True, True]
     with pytest.raises(ShapeError, match=r"\(2,\) and \(3,\)"):
         pareto_front([1, 2], [1, 2, 3])
+
+
+def test_a_legend_of_many_names_and_the_ticks_fit():
+    names = [f"an estimator with name {k}" for k in range(9)]
+    marks = [PlotMark("line", [1e-4, 3e-2], [1.0, 2.0], name) for name in names[1:]]
+    marks.append(PlotMark("level", [1e-4, 3e-2], [1.5, 1.5], names[0]))
+    axis = Axis("time", "time", [7e-5, 4e-2])
+    drawing = Drawing([Panel(axis, Axis("RMSE", "error", [1.0, 2.0]), marks)])
+    figure = draw(drawing, styles(names), (5.6, 5.0), "", [("a", {}), ("b", {})]).figure
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    ends = legend.get_window_extent().extents
+    assert 0.0 <= ends[0] < ends[2] <= figure.bbox.width
+    # A level is drawn dashed, whatever its style elsewhere.
+    assert legend.get_lines()[0].get_linestyle() == "--"
+    labels = [one.get_window_extent() for one in figure.axes[0].get_xticklabels()]
+    assert [one.get_text() for one in figure.axes[0].get_xticklabels()] == [
+        "100 µs", "1 ms", "10 ms"]
+    assert all(a.x1 < b.x0 for a, b in pairwise(labels))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...plots import COLORS
-from ...plots.style import LIGHT, svg
+from ...plots.style import LIGHT, legend_columns, svg
 from .words import percent, time_tick
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # Inches below which a legend has no room beside the panels.
 _NARROW = 5.0
+# A panel of fewer inches has room for fewer ticks.
+_FEW_TICKS = 3.5
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Axis:
         values = values[np.isfinite(values)]
         return (float(values.min()), float(values.max())) if values.size else (1.0, 1.0)
 
-    def ticks(self) -> list[tuple[float, str]]:
+    def ticks(self, narrow: bool = False) -> list[tuple[float, str]]:
         """Values and words of the ticks; none where the drawing program chooses them."""
         if self.kind == "values":
             return [(value, f"{value:g}") for value in self.values]
@@ -83,7 +85,7 @@ class Axis:
             return [(2.0**k, f"{2**k:g}") for k in powers]
         if low <= 0.0 or (self.kind == "error" and high <= 8 * low):
             return []
-        decades = np.log10(high / low)
+        decades = np.log10(high / low) * (1.6 if narrow else 1.0)
         steps = (1, 2, 5) if decades < 1.6 else (1, 3) if decades < 3.2 else (1,)
         powers = range(int(np.floor(np.log10(low))) - 1, int(np.ceil(np.log10(high))) + 1)
         words = time_tick if self.kind == "time" else "{:g}".format
@@ -251,6 +253,11 @@ def _positions(axis: Axis, values: Sequence[Any]) -> list[Any]:
     return [axis.values.index(one) for one in values] if axis.kind == "category" else [*values]
 
 
+def _panel_width(axes: Any) -> float:
+    """Inches for a panel and its labels."""
+    return float(axes.figure.get_figwidth() / axes.get_gridspec().ncols)
+
+
 def _set_axis(axes: Any, name: str, axis: Axis) -> None:
     from matplotlib.ticker import NullLocator
 
@@ -261,7 +268,7 @@ def _set_axis(axes: Any, name: str, axis: Axis) -> None:
     elif axis.kind == "share":
         getattr(axes, f"set_{name}lim")(-0.02, 1.03)
         line.set_major_formatter(lambda share, _: percent(round(share, 3)))
-    elif ticks := axis.ticks():
+    elif ticks := axis.ticks(name == "x" and _panel_width(axes) < _FEW_TICKS):
         low, high = axis.limits()
         if axis.kind != "values" or high > 8.0 * low > 0.0:
             getattr(axes, f"set_{name}scale")("log")
@@ -304,8 +311,10 @@ def _legends(figure: Any, drawing: Drawing, drawn: Mapping[str, Style]) -> None:
             handles=[
                 Line2D([], [], color=drawn[name].color, markersize=5.5, label=name, linewidth=1.2,
                        marker="none" if name in plain else drawn[name].marker,
-                       linestyle=drawn[name].line if "line" in kinds else "none")
+                       linestyle="none" if "line" not in kinds else
+                       "--" if name in plain else drawn[name].line)
                 for name in names
             ],
-            loc="outside lower center", ncols=min(6, len(names)), fontsize=8,
+            loc="outside lower center", fontsize=8,
+            ncols=legend_columns(names, figure.get_figwidth(), 6),
         )

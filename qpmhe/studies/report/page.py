@@ -135,6 +135,10 @@ def _page(
     done, seeds = int((frame["outcome"] == "done").sum()), frame["seed"].nunique()
     models = listed([str(model) for model in dict.fromkeys(frame["model"])])
     study = dict(meta.get("study") or {})
+    study["estimators"] = [
+        name if name == made else f"{name} = {made}"
+        for name, made in study.get("estimators", {}).items()
+    ]
     if study.get("records"):  # they have neither
         study = {key: one for key, one in study.items() if key not in ("seeds", "noise_levels")}
     several = "" if study.get("records") else f"{seeds} seed{'s' * (seeds != 1)}, "
