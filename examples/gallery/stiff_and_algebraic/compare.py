@@ -96,10 +96,11 @@ def problems(_: Path, quick: bool) -> list[Problem]:
 
 
 def own(plant: Plant, problem: Problem, weights: Weights) -> dict[str, Way]:
-    """do-mpc, where it is installed: with the first prior, and with that of a settled filter.
+    """do-mpc with the first prior, and with a settled filter's; nothing if it is not installed.
 
-    Its disturbance is a rate. Each has the deviation that gives its state that of the simulation
-    at the end of a sample: a fast state forgets, so that its rate is large.
+    Its disturbance is a rate, constant over a sample. The deviation of each rate is such that the
+    state has the simulated deviation at the end of the sample. A fast state forgets, so that its
+    rate is large.
     """
     if find_spec("do_mpc") is None:
         return {}
