@@ -18,6 +18,7 @@ from .style import (
     STYLES,
     date_axis,
     line_styles,
+    narrow,
     panels,
     run_times,
     time_words,
@@ -274,7 +275,7 @@ def _legend(drawn: list[Any], axes: Any) -> None:
     figure = drawn[0].figure
     for old in list(figure.legends):
         old.remove()
-    figure.legend(
+    narrow(figure.legend(
         shown.values(), shown.keys(), loc="outside upper center", ncols=min(len(shown), 5),
         frameon=False,
-    )
+    ), figure)
