@@ -209,10 +209,11 @@ def sizes_of(
     if disturbance is None and noise is None:
         return usual
     w, v = usual.disturbance, usual.noise
+    rest = disturbance is None or noise is None
     return Sizes(
         w if disturbance is None else stated_size("--max-disturbance", disturbance, system.r),
-        v if noise is None else stated_size("--max-noise", noise, system.p), "as stated",
-        usual.deviations and (disturbance is None or noise is None),
+        v if noise is None else stated_size("--max-noise", noise, system.p),
+        f"as stated and {usual.source}" if rest else "as stated", usual.deviations and rest,
     )
 
 

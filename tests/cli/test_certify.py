@@ -179,7 +179,8 @@ def test_a_guard_is_tried_on_the_record_or_refused_by_name(shown):
     assert re.search(r"guard +seed 0: \d+ of 20 estimates were moved; the largest", text)
     assert content["guard"].startswith("seed 0: ")
     for of, options, words in (
-        ("model", {}, "the sizes are as stated, and Gaussian noises are not bounded"),
+        ("model", {}, "the sizes are as stated and three standard deviations of the model's "
+         "scenario, and Gaussian noises are not bounded"),
         ("restarts", {"max_disturbance": "0.05"}, "restart=True restarts the observer"),
     ):
         done, text, content = shown(of=of, **stated | options)
