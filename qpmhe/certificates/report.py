@@ -72,7 +72,10 @@ def certify_model(
     if proved is None:
         text = "there is no guard: there is no bound of the observer."
         return found._replace(guard=text if guard else "", refused=guard)
-    start = place.lower[: system.n] if scenario is None else scenario.initial_estimate
+    if record is None and not guard:
+        return found
+    middle = place.sample(1, np.random.default_rng(seed))[0, : system.n]
+    start = middle if scenario is None else scenario.initial_estimate
     own = {name: options[name] for name in _BARRING if guard and name in options}
     mhe = MovingHorizonEstimator(
         system, observer, cost, horizon=horizons[-1], initial_state=start, max_qps=_QPS,
@@ -86,8 +89,10 @@ def certify_model(
             )
         except CertificateError as error:
             return found._replace(guard=str(error), refused=True)
+        text = "there is one; it was not tried, as there is no record without a scenario"
         if record is not None:
-            found = found._replace(guard=f"seed {seed}: {_guarded(watch, mhe, record)}")
+            text = f"seed {seed}: {_guarded(watch, mhe, record)}"
+        found = found._replace(guard=text)
     if scenario is not None and record is not None:
         mhe.reset()
         run = mhe.run(record.measurements, record.inputs)

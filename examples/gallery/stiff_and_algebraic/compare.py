@@ -32,7 +32,7 @@ SHOWN = "MHE, 2 QPs", "do-mpc", "EKF"
 
 
 def model(plant: Plant) -> qpmhe.System:
-    """The plant by Radau's method, and X."""
+    """The plant by Radau's method, with its bounds as X."""
     n, k, m = plant.n, len(plant.algebraic), len(plant.inputs[0])
     p, least = len(plant.noise), np.array(plant.least)
 
@@ -120,7 +120,7 @@ def own(plant: Plant, problem: Problem, weights: Weights) -> dict[str, Way]:
 
 
 def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Figure:
-    """The runs at the median of the filter's error; a column a plant."""
+    """For each plant, in a column, the run in which the EKF has its median error."""
     with rc_context(LIGHT):
         figure = Figure(figsize=(10.2, 5.0), layout="constrained")
         grid = figure.subplots(2, len(PLANTS), squeeze=False)

@@ -108,7 +108,7 @@ class DoMpc:
         mhe.set_initial_guess()
 
     def run(self, measurements: Array, inputs: Array) -> SimpleNamespace:
-        """What the gallery reads of a run."""
+        """Estimates and times of a record, as the gallery reads them."""
         self._seen = ~np.isnan(measurements)
         last, found, times = np.zeros(measurements.shape[1]), [], []
         for t, y in enumerate(measurements):

@@ -229,7 +229,7 @@ def effect_of_rates(plant: Plant, states: Array, inputs: Array) -> Array:
 
 @cache
 def _consistent(plant: Plant) -> Any:
-    """What solves the algebraic equations."""
+    """A solver of the algebraic equations, for z at x and u."""
     x, z, u = (ca.SX.sym(name, size) for name, size in zip(
         "xzu", (plant.n, len(plant.algebraic), len(plant.inputs[0])), strict=True
     ))
