@@ -20,7 +20,6 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -33,6 +32,7 @@ from report import environment
 from rich.console import Console
 from rich.table import Table
 from stopwatch import timed
+from swing import equations
 
 import qpmhe
 from qpmhe.codegen.source import model_files
@@ -44,28 +44,6 @@ START, USUAL = np.array([0.2, 0.0, 0.25, 0.0]), np.array([0.65, 0.75])
 FIRST = np.array([0.25, 0.0, 0.2, 0.0])  # the first estimate
 PRIOR, NOISE = np.full(N, 0.1), np.full(P, 0.01)
 DISTURBANCE = np.array([0.002, 0.02, 0.002, 0.02])
-
-
-def equations(x: list[Any], z: list[Any], u: list[Any], of: ModuleType) -> tuple[list[Any], ...]:
-    """Rates, algebraic residuals and outputs, by NumPy or by CasADi."""
-    first, speed, second, other = x
-    angle, voltage, far_angle, far_voltage = z
-    inner, far = first - angle, second - far_angle
-    generated = 1.1 * voltage / 0.3 * of.sin(inner), 1.05 * far_voltage / 0.25 * of.sin(far)
-    reactive = (
-        (1.1 * voltage * of.cos(inner) - voltage**2) / 0.3,
-        (1.05 * far_voltage * of.cos(far) - far_voltage**2) / 0.25,
-    )
-    both = voltage * far_voltage / 0.5
-    sent = both * of.sin(angle - far_angle)
-    kept = both * of.cos(angle - far_angle)
-    return (
-        [speed, (u[0] - generated[0] - 0.5 * speed) / 0.1,
-         other, (u[1] - generated[1] - 0.5 * other) / 0.1],
-        [generated[0] - sent - 0.6, reactive[0] - (voltage**2 / 0.5 - kept) - 0.2,
-         generated[1] + sent - 0.8, reactive[1] - (far_voltage**2 / 0.5 - kept) - 0.3],
-        [voltage, far_angle - angle, speed],
-    )
 
 
 def system() -> qpmhe.System:

@@ -18,15 +18,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from adversary import Array
+from certified_ratios import others, zoo
 
 import qpmhe
-from qpmhe.certificates import Evidence, Monitor, ObserverBound, Sizes, synthesise_gain
+from qpmhe.certificates import Evidence, Monitor, ObserverBound, synthesise_gain
 from qpmhe.certificates.guard import Guard
 from qpmhe.certificates.observer_bound import bound_observer
-from qpmhe.certificates.report import region_of
 from qpmhe.model.residuals import difference
 from qpmhe_solvers import QP, Backend, RawSolution, Solver
 
+# Systems on which many runs are cheap.
+SMALL = ("waves", "a kink", "four coupled states")
 MODELS = ("batch_reactor", "van_der_pol", "pendulum", "vehicle", "battery_cell")
 SECONDS = 300.0
 # Of the ellipsoid of steps that lower the objective: as far as rounding lets the verdict pass.
@@ -101,15 +103,11 @@ class Counts:
 def certified(name: str) -> tuple[qpmhe.models.Example, qpmhe.Luenberger, ObserverBound]:
     """A model of the zoo, an observer with the certified metric, and its bound."""
     made = qpmhe.models.catalogue()[name]()
-    system, scenario = made.system, made.scenario
-    region = region_of(system, scenario)
-    w, v = (3.0 * np.sqrt(np.diag(each)) for each in (
-        scenario.disturbance_covariance, scenario.noise_covariance))
-    sizes = Sizes(qpmhe.Box(-w, w), qpmhe.Box(-v, v))
+    system, region, sizes = zoo(name)
     found = synthesise_gain(system, region, sizes=sizes.typical, seconds=SECONDS)
     bound = bound_observer(
         system, found.observer, made.cost, region, sizes=sizes, seconds=SECONDS)
-    return made, found.observer, bound
+    return made._replace(system=system), found.observer, bound
 
 
 def drawn(kind: str, shape: tuple[int, int], half: Array, rng: np.random.Generator) -> Array:
@@ -181,30 +179,9 @@ def run(name: str, runs: int, steps: int, larger: float = 1.0, farther: float = 
     return counts
 
 
-def small_systems() -> dict[str, tuple[qpmhe.System, qpmhe.Box, Sizes]]:
-    """Systems on which many runs are cheap."""
-    A = np.array([[0.9, 0.2], [-0.1, 0.7]])
-    wave = qpmhe.System(
-        lambda x: x @ A.T + 0.05 * np.sin(x[..., :1]) * np.array([0.0, 1.0]),
-        lambda x: x[..., :1], n=2, p=1)
-    kinked = qpmhe.System(
-        lambda x: np.stack([0.8 * np.abs(x[..., 0]) - 0.5 * x[..., 1], 0.6 * x[..., 0]], -1),
-        lambda x: x[..., :1], n=2, p=1)
-    coupled = qpmhe.System(
-        lambda x: 0.8 * x + 0.1 * np.sin(np.roll(x, 1, axis=-1)) + 0.1 * np.roll(x, -1, axis=-1),
-        lambda x: x[..., ::2], n=4, p=2)
-    sizes = Sizes(qpmhe.Box(-0.02 * np.ones(2), 0.02 * np.ones(2)), qpmhe.Box([-0.05], [0.05]))
-    return {
-        "waves": (wave, qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), sizes),
-        "a kink": (kinked, qpmhe.Box([-2.0, -2.0], [2.0, 2.0]), sizes),
-        "four coupled states": (
-            coupled, qpmhe.Box(-2.0 * np.ones(4), 2.0 * np.ones(4)), Sizes(0.01, 0.01)),
-    }
-
-
 def many(name: str, runs: int, steps: int = 25, checked: int = 2) -> str:
     """Truths beside the observer, all at once; hostile estimates at the last samples, guarded."""
-    system, region, sizes = small_systems()[name]
+    system, region, sizes = others()[name]
     gain = synthesise_gain(system, region, sizes=sizes.typical, seconds=SECONDS).observer
     cost = qpmhe.QuadraticCost(
         prior=np.eye(system.n), disturbance=np.eye(system.n), noise=np.eye(system.p))
@@ -215,11 +192,12 @@ def many(name: str, runs: int, steps: int = 25, checked: int = 2) -> str:
             for each, size in zip(bound.sizes.extent, (n, system.p), strict=True))
     x = rng.uniform(-0.8, 0.8, (runs, n))
     z = x + rng.choice([-1.0, 1.0], (runs, n)) * half
-    nothing, closed = np.zeros((runs, 0)), adjoint(system, L, rng.uniform(-0.5, 0.5, n))
+    nothing, point = np.zeros((runs, 0)), rng.uniform(-0.5, 0.5, n)
+    A, C = (np.asarray(each(point, nothing[0])) for each in (system.f_jacobian, system.h_jacobian))
     rows = rng.standard_normal((runs, n))
     backwards = [rows]
     for _ in range(steps - 1):
-        backwards.append(backwards[-1] @ closed)
+        backwards.append(backwards[-1] @ (A - L @ C))
     alive, tube = np.ones(runs, np.bool_), bound.begun(qpmhe.Box(-half, half))
     guard, entering, added = Guard(bound, system), bound.entering(), bound.added()
     worst, moved, compared = 0.0, 0, 0
@@ -254,13 +232,6 @@ def many(name: str, runs: int, steps: int = 25, checked: int = 2) -> str:
     )
 
 
-def adjoint(system: qpmhe.System, gain: Array, x: Array) -> Array:
-    """A - L C at a state."""
-    nothing = np.zeros(0)
-    f, h = system.f_jacobian, system.h_jacobian
-    return np.asarray(f(x, nothing)) - gain @ np.asarray(h(x, nothing))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description="Estimates that are as wrong as may be, guarded.")
     parser.add_argument("--runs", type=int, default=10_000, help="of each small system")
@@ -268,7 +239,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50, help="samples of a run in the zoo")
     parser.add_argument("--models", nargs="*", default=MODELS)
     given, began = parser.parse_args(), time.process_time()
-    for name in small_systems() if given.runs else ():
+    for name in SMALL if given.runs else ():
         print(many(name, given.runs), flush=True)
     qpmhe.solvers.register(Backend("hostile", Hostile, "adversary"))
     print("| model | runs | samples | moved | worst / 2 b | guarded | rms / 2 b | guarded | lost "

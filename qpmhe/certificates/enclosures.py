@@ -219,7 +219,8 @@ class SmoothModel:
         """Whether f and h have their expressions' values in each cell; `reason` says where not.
 
         In cells (B, N) each, at random points, at random corners and, where a condition changes,
-        on both sides of the change.
+        on both sides of the change. Of a region that is no box, cells reach beyond it; where few of
+        these points are within, others of the region are added.
         """
         assert self._plan is not None
         lower, upper = (np.concatenate([each[k] for each in cells]) for k in range(2))
@@ -229,6 +230,8 @@ class SmoothModel:
         corner = np.where(share == 1, upper, lower)
         points = np.vstack((inner, corner, *self._plan.around_kinks(lower, upper, rng)))
         points = points[self._region.contains(points[:, : self.n])]
+        if len(points) < _LEAST:
+            points = np.vstack((points, self._region.sample(_LEAST, rng)))
         self.compared += len(points)
         self.reason = self._differs("h", points) or self._differs("f", points)
         return not self.reason

@@ -65,6 +65,10 @@ class Guard:
 
     def __call__(self, estimate: Array, observer: Array, tube: Tube) -> Guarded:
         """The estimate itself if it is in the set; else the nearest point that is."""
+        with np.errstate(all="ignore"):  # an estimate may be so far away that its square overflows
+            return self._guarded(estimate, observer, tube)
+
+    def _guarded(self, estimate: Array, observer: Array, tube: Tube) -> Guarded:
         if self._holds(estimate, observer, tube) and self._in_states(estimate):
             return Guarded(estimate, False)
         K = self._states

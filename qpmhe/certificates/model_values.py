@@ -81,4 +81,5 @@ def _values(system: System, point: Array) -> tuple[Array, Array]:
     """The values of f and h at one point."""
     x, u = point[: system.n], point[system.n :]
     with np.errstate(all="ignore"):
-        return np.array(system.f(x, u), np.float64), np.array(system.h(x, u), np.float64)
+        f, h = np.array(system.f(x, u), np.float64), np.array(system.h(x, u), np.float64)
+    return f.reshape(system.n), h.reshape(system.p)

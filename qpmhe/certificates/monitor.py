@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, flag
-from ..errors import InvalidInputError, ShapeError
+from .._checks import Array, flag, positive, vector
+from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..model.model import Model
@@ -36,6 +36,7 @@ _MOVED = (
     "sample's own bounds"
 )
 _NO_GUARD = "the monitor has no guard"
+_UNDEFINED = "the model could not be evaluated"
 _RESTORED = (
     "the candidate violated a set and was restored into it (RESTORED): the estimate's cost may be "
     "above the candidate's"
@@ -175,7 +176,7 @@ class Monitor:
         self.bound = bound.of_observer(
             estimator.observer, self._system, estimator.settings.projection_metric
         )
-        self.sizes = bound.sizes if sizes is None else sizes
+        self.sizes = bound.sizes if sizes is None else Sizes.of(sizes, self._system)
         given = self.sizes.disturbance, self.sizes.noise
         self._entering, self._added = bound.entering(*given), bound.added(*given)
         self._tube = bound.begun(initial_error)
@@ -226,21 +227,30 @@ class Monitor:
         Parameters
         ----------
         estimate : Estimate
-            An `InvalidInputError` is raised if it is not one.
+            An `InvalidInputError` is raised if it is not one, or of a system of another size.
         u : (m,) array_like, optional
-            The system's input of the sample, parameters included, or a `ShapeError`.
+            The system's input of the sample, parameters included; of another shape, a `ShapeError`
+            is raised, and an `InvalidInputError` if it is no number.
         dt : float, optional
-            Length of its step, if it is not the usual one.
+            Length of its step, if it is not the usual one; an `OptionError` if it is not above 0.
         """
         if not isinstance(estimate, Estimate):
             raise InvalidInputError(
                 f"estimate is of type {type(estimate).__name__}; expected what "
                 "MovingHorizonEstimator.update returns."
             )
-        given = np.zeros(0) if u is None else np.ravel(np.asarray(u, np.float64))
         t, z, again = estimate.time, estimate.observer_state, estimate.time == self._time - 1
-        if given.shape != (self._system.m,) and not again:
-            raise ShapeError(f"u has shape {given.shape}; expected ({self._system.m},).")
+        sizes, own = (z.size, estimate.noises.shape[1]), (self._system.n, self._system.p)
+        if sizes != own:
+            raise InvalidInputError(
+                f"estimate is of a system with (n, p) = {sizes}; expected one of the estimator "
+                f"that is monitored, {own}."
+            )
+        given = np.zeros(0)
+        if not again:
+            given = vector("u", () if u is None else u, self._system.m, finite=False)
+        if dt is not None:
+            positive("dt", dt)
         before, first = self._z, self._tube
         if self.lost is None:
             reason = self._ends or self._order(t)
@@ -325,15 +335,19 @@ class Monitor:
             return _MOVED
         if Status.OBSERVER_PROJECTED not in estimate.status:
             try:
-                output = system.h(before, u)
-                error = estimate.noises[-1] + system.h(estimate.trajectory[-2], u) - output
-                predicted, correction = system.f(before, u), bound.gain @ error
-            except Exception:  # a model that is not defined here
-                return "the model could not be evaluated"
-            size = np.abs(predicted) + np.abs(correction) + np.abs(bound.gain) @ (
-                np.abs(error) + np.abs(output)
-            )
-            if not (np.abs(z - predicted - correction) <= _ROUNDING * size).all():
+                with np.errstate(all="ignore"):
+                    output = system.h(before, u)
+                    error = estimate.noises[-1] + system.h(estimate.trajectory[-2], u) - output
+                    predicted, correction = system.f(before, u), bound.gain @ error
+                    size = np.abs(predicted) + np.abs(correction) + np.abs(bound.gain) @ (
+                        np.abs(error) + np.abs(output)
+                    )
+                    missed = np.abs(z - predicted - correction)
+            except Exception:  # a user's function may raise anything, or return it
+                return _UNDEFINED
+            if not np.isfinite(missed).all():
+                return _UNDEFINED
+            if not (missed <= _ROUNDING * size).all():
                 return (
                     "the observer's step was not f(z) + L v: it had another length (dt), other "
                     "parameters or another gain"

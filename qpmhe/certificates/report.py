@@ -72,7 +72,10 @@ def certify_model(
     if proved is None:
         text = "there is no guard: there is no bound of the observer."
         return found._replace(guard=text if guard else "", refused=guard)
-    start = place.lower[: system.n] if scenario is None else scenario.initial_estimate
+    if record is None and not guard:
+        return found
+    middle = place.sample(1, np.random.default_rng(seed))[0, : system.n]
+    start = middle if scenario is None else scenario.initial_estimate
     own = {name: options[name] for name in _BARRING if guard and name in options}
     mhe = MovingHorizonEstimator(
         system, observer, cost, horizon=horizons[-1], initial_state=start, max_qps=_QPS,
@@ -86,8 +89,10 @@ def certify_model(
             )
         except CertificateError as error:
             return found._replace(guard=str(error), refused=True)
+        text = "there is one; it was not tried, as there is no record without a scenario"
         if record is not None:
-            found = found._replace(guard=f"seed {seed}: {_guarded(watch, mhe, record)}")
+            text = f"seed {seed}: {_guarded(watch, mhe, record)}"
+        found = found._replace(guard=text)
     if scenario is not None and record is not None:
         mhe.reset()
         run = mhe.run(record.measurements, record.inputs)
@@ -209,10 +214,11 @@ def sizes_of(
     if disturbance is None and noise is None:
         return usual
     w, v = usual.disturbance, usual.noise
+    rest = disturbance is None or noise is None
     return Sizes(
         w if disturbance is None else stated_size("--max-disturbance", disturbance, system.r),
-        v if noise is None else stated_size("--max-noise", noise, system.p), "as stated",
-        usual.deviations and (disturbance is None or noise is None),
+        v if noise is None else stated_size("--max-noise", noise, system.p),
+        f"as stated and {usual.source}" if rest else "as stated", usual.deviations and rest,
     )
 
 

@@ -186,12 +186,12 @@ def lengths_of(name: str, given: Size, weight: Array) -> Array:
 
 def stated_size(option: str, given: ArrayLike, size: int) -> float | Box:
     """A length, or a box of components, of what an option has."""
-    values = np.asarray(given, np.float64)
+    values = numbers(option, given)
     if values.ndim == 1 and values.size == 1:
         values = values[0]
     if values.shape not in ((), (size,)) or not (values >= 0.0).all():
         raise OptionError(
-            f"{option} is {np.asarray(given).tolist()}; expected one number >= 0 that bounds the "
+            f"{option} is {values.tolist()}; expected one number >= 0 that bounds the "
             f"length, or {size}, one for each component."
         )
     return float(values) if values.ndim == 0 else Box(-values, values)

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag
-from scipy.optimize import brentq
 
 from qpmhe_solvers.values import shown
 
@@ -62,6 +60,8 @@ class ColouredNoise:
         WeightError, ShapeError
             If a matrix is not a covariance, or has the wrong shape.
         """
+        from scipy.linalg import block_diag  # late: `import qpmhe` does without
+
         k = len(self.correlation)
         n, r, p = self.system.n - k, self.system.r - k, self.system.p
         return {
@@ -259,6 +259,8 @@ def _correlations(
 
 def _decay(rho: float, how: Discretization) -> float:
     """The product k dt with which the discretised rate -k c multiplies c by rho in a step."""
+    from scipy.optimize import brentq  # late: `import qpmhe` does without
+
     step, _ = discretize(
         lambda c: -c, lambda c: np.full((*c.shape, 1), -1.0), Discretization(how.method)
     )

@@ -286,8 +286,8 @@ def _resized(figure: Figure, width: float | None) -> Iterator[None]:
         for name in ("_suptitle", "_supxlabel"):
             if (text := getattr(figure, name)) is not None:
                 text.set_wrap(True)
-        for legend, box in zip(legends, boxes, strict=True):
-            _narrow(legend, box, 0.98 * figure.bbox.width)
+        for legend in legends:
+            narrow(legend, figure)
         yield
     finally:
         figure.set_size_inches(size)
@@ -299,8 +299,9 @@ def _resized(figure: Figure, width: float | None) -> Iterator[None]:
                 column._children = items
 
 
-def _narrow(legend: Any, box: Any, most: float) -> None:
-    """Give a legend so few columns that it is no wider; Matplotlib fixes them when it is made."""
+def narrow(legend: Any, figure: Figure) -> None:
+    """Give a legend so few columns that it fits; Matplotlib fixes them when it is made."""
+    box, most = legend._legend_handle_box, 0.98 * figure.bbox.width
     columns = list(box.get_children())
     items = [item for column in columns for item in column.get_children()]
     for number in range(len(columns), 0, -1):

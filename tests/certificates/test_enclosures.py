@@ -210,6 +210,25 @@ def test_the_trace_of_a_proof_is_compared_with_f_inside_each_cell():
         assert prove(scalar(Counting(10**9, 1e-9))) is not None
 
 
+def test_a_region_thinner_than_its_cells_is_compared_at_points_of_its_own():
+    changed = []
+
+    def f(x):
+        return 0.5 * x + (1e-3 if changed else 0.0)
+
+    system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
+    # |x1 - 0.37 x2 - 0.1234| <= 1e-9, which the box around it does not have at its corners.
+    thin = qpmhe.Polytope([[1.0, -0.37], [-1.0, 0.37], [0.0, 1.0], [0.0, -1.0]],
+                          [0.1234 + 1e-9, -0.1234 + 1e-9, 1.0, 1.0])
+    model, region = smooth(system, thin)
+    cells = [(region.lower[None], region.upper[None])]
+    assert model.agrees(cells)
+    assert model.compared > 400 + 256
+    changed.append(True)
+    assert not model.agrees(cells)
+    assert "its expression is" in model.reason
+
+
 def of_numbers(x):
     """Code that asks what numbers and arrays answer alike, with the step."""
     more = 0.0

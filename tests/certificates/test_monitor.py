@@ -7,7 +7,8 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates import MismatchError, Monitor, Sizes, certify, certify_observer
-from qpmhe.errors import InvalidInputError, ShapeError
+from qpmhe.certificates.observer_bound import bound_observer
+from qpmhe.errors import InvalidInputError, OptionError, ShapeError
 
 from .helpers import box, linear, scalar, unit_cost
 
@@ -313,3 +314,60 @@ def test_a_model_is_looked_up_once(certificate, monkeypatch):
     monkeypatch.setattr(qpmhe.System, "model", lambda *_: pytest.fail("looked up in a sample"))
     readings = [watch.check(mhe.update(y)) for y in record(steps=8)[1]]
     assert readings[-1].reason == ""
+
+
+def test_arguments_that_are_not_of_the_estimator_are_refused(certificate):
+    mhe = estimator(certificate)
+    first = mhe.update([0.1])
+    other = qpmhe.MovingHorizonEstimator(
+        linear(0.9, 1.0), qpmhe.Luenberger([[0.4]]), unit_cost(1), horizon=4, initial_state=[0.0])
+    for given, options, error, words in (
+        (first, {"u": "word"}, InvalidInputError, "u is 'word', which is not an array"),
+        (first, {"u": [1.0]}, ShapeError, r"u has shape \(1,\); expected \(0,\)"),
+        (first, {"dt": "word"}, OptionError, "dt is 'word'; expected a finite number > 0"),
+        (first, {"dt": -1.0}, OptionError, r"dt is -1\.0; expected"),
+        (other.update([0.1]), {}, InvalidInputError, r"\(1, 1\); expected one .* \(2, 1\)"),
+    ):
+        watch = followed(certificate, estimator(certificate))
+        with pytest.raises(error, match=words):
+            watch.check(given, **options)
+        assert watch.check(first).lost is None  # as if it had not been asked
+    with pytest.raises(OptionError, match="sizes is 'word'; expected Sizes"):
+        followed(certificate, estimator(certificate), sizes="word")
+
+
+@pytest.mark.parametrize("value", [
+    ZeroDivisionError(), np.array([np.nan, 0.0]), np.array([np.inf, 0.0]), None, "word",
+    np.zeros(7),
+], ids=["raises", "nan", "huge", "None", "text", "shape"])
+def test_a_model_that_fails_in_a_check_ends_the_bound(value):
+    """Behind the update that it served: of the observer's step, or of the certified values."""
+    fails = []
+
+    def f(x):
+        if fails and fails[0](x):
+            if isinstance(value, Exception):
+                raise value
+            return value
+        return x @ A.T
+
+    system = qpmhe.System(f, lambda x: x[..., :1], n=2, p=1)
+    bound = bound_observer(
+        system, qpmhe.Luenberger(GAIN), COST, box([-10.0, -10.0], [10.0, 10.0]), sizes=SIZES)
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(GAIN), COST, horizon=4, initial_state=[0.5, 0.25], max_qps=0)
+    points = bound.stability.model.points
+    for where, words in (
+        (lambda x: True, "the model could not be evaluated"),
+        (lambda x: (x == points[0]).all(), "the system is another than was certified: f "),
+    ):
+        mhe.reset()
+        watch = Monitor(bound, mhe, initial_error=START, guard=True)
+        estimate = mhe.update([0.1])
+        fails.append(where)
+        reading = watch.check(estimate)
+        fails.clear()
+        assert reading.lost == 0
+        assert reading.reason.startswith(words)
+        assert reading.unguarded == f"from sample 0 on: {reading.reason}"
+        np.testing.assert_array_equal(reading.state, estimate.state)

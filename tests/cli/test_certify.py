@@ -178,8 +178,12 @@ def test_a_guard_is_tried_on_the_record_or_refused_by_name(shown):
     assert "guarded, x_hat is within min(2 b, |x_hat - z| + b)" in text.splitlines()[0]
     assert re.search(r"guard +seed 0: \d+ of 20 estimates were moved; the largest", text)
     assert content["guard"].startswith("seed 0: ")
+    done, text, _ = shown(of="parts", max_disturbance="0.05,0.04", horizon="3", **stated)
+    assert done  # and no warning of a start outside of a set
+    assert re.search(r"guard +there is one; it was not tried, as there is no record", text)
     for of, options, words in (
-        ("model", {}, "the sizes are as stated, and Gaussian noises are not bounded"),
+        ("model", {}, "the sizes are as stated and three standard deviations of the model's "
+         "scenario, and Gaussian noises are not bounded"),
         ("restarts", {"max_disturbance": "0.05"}, "restart=True restarts the observer"),
     ):
         done, text, content = shown(of=of, **stated | options)

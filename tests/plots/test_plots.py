@@ -98,6 +98,13 @@ def test_measurements_are_dots_on_the_states_that_they_measure():
     assert dots[2][0].get_zorder() < axes[2].collections[0].get_zorder()
     (legend,) = axes[0].figure.legends
     assert "measurement" in [each.get_text() for each in legend.get_texts()]
+    states = run.states
+    figure = plots.states(run, truth=states, band=(states - 1.0, states + 1.0))[0].figure
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == 5
+    assert legend.get_window_extent().x0 >= 0.0
+    assert legend.get_window_extent().x1 <= figure.bbox.width
     run.source = None
     assert not any("measurement" in lines(panel) for panel in plots.states(run))
 

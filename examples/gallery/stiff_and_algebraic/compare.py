@@ -32,7 +32,7 @@ SHOWN = "MHE, 2 QPs", "do-mpc", "EKF"
 
 
 def model(plant: Plant) -> qpmhe.System:
-    """The plant by Radau's method, and X."""
+    """The plant by Radau's method, with its bounds as X."""
     n, k, m = plant.n, len(plant.algebraic), len(plant.inputs[0])
     p, least = len(plant.noise), np.array(plant.least)
 
@@ -96,10 +96,11 @@ def problems(_: Path, quick: bool) -> list[Problem]:
 
 
 def own(plant: Plant, problem: Problem, weights: Weights) -> dict[str, Way]:
-    """do-mpc, where it is installed: with the first prior, and with that of a settled filter.
+    """do-mpc with the first prior, and with a settled filter's; nothing if it is not installed.
 
-    Its disturbance is a rate. Each has the deviation that gives its state that of the simulation
-    at the end of a sample: a fast state forgets, so that its rate is large.
+    Its disturbance is a rate, constant over a sample. The deviation of each rate is such that the
+    state has the simulated deviation at the end of the sample. A fast state forgets, so that its
+    rate is large.
     """
     if find_spec("do_mpc") is None:
         return {}
@@ -119,7 +120,7 @@ def own(plant: Plant, problem: Problem, weights: Weights) -> dict[str, Way]:
 
 
 def draw(problems: Sequence[Problem], results: Sequence[Sequence[Result]]) -> Figure:
-    """The runs at the median of the filter's error; a column a plant."""
+    """For each plant, in a column, the run in which the EKF has its median error."""
     with rc_context(LIGHT):
         figure = Figure(figsize=(10.2, 5.0), layout="constrained")
         grid = figure.subplots(2, len(PLANTS), squeeze=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import warnings
+from importlib import import_module
 from time import perf_counter
 from types import SimpleNamespace
 from typing import Any
@@ -19,10 +20,10 @@ from .plants import Plant
 class DoMpc:
     """An estimator of do-mpc: Radau's collocation of the same order and substeps.
 
-    Its prior is around the second state of its last solution, with a constant weight; its
-    parameter is constant in each window; its disturbance is a rate. It has neither missing
-    measurements nor windows shorter than N, so that parameters that vary in time take their place:
-    a missing measurement has weight zero, and before the first sample the state stands still.
+    The prior is around the second state of the last solution, with a constant weight. The parameter
+    is constant in each window, and the disturbance is a rate. do-mpc has neither missing
+    measurements nor windows shorter than N. Parameters that vary in time take their place: a
+    missing measurement has weight zero, and before the first sample the state stands still.
 
     Parameters
     ----------
@@ -45,7 +46,7 @@ class DoMpc:
     ) -> None:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")  # it misses ONNX, which is of no use here
-            import do_mpc  # type: ignore[import-untyped,import-not-found,unused-ignore]
+            do_mpc: Any = import_module("do_mpc")
 
             self._plant, self._horizon = plant, horizon
             model = do_mpc.model.Model("continuous", "SX")
@@ -107,7 +108,7 @@ class DoMpc:
         mhe.set_initial_guess()
 
     def run(self, measurements: Array, inputs: Array) -> SimpleNamespace:
-        """What the gallery reads of a run."""
+        """Estimates and times of a record, as the gallery reads them."""
         self._seen = ~np.isnan(measurements)
         last, found, times = np.zeros(measurements.shape[1]), [], []
         for t, y in enumerate(measurements):

@@ -25,6 +25,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from examples.benchmarks.swing import equations as swing
+
 from ..problem import Array
 
 #: Rates, algebraic residuals and outputs, of lists of the components of x, z, u and of the
@@ -132,23 +134,7 @@ def grid(
     x: list[Any], z: list[Any], u: list[Any], _: list[Any], of: ModuleType
 ) -> tuple[Any, ...]:
     """Angle (rad) and speed of two generators; angle and voltage of their buses; their power."""
-    first, speed, second, other = x
-    angle, voltage, far_angle, far_voltage = z
-    inner, far = first - angle, second - far_angle
-    generated = 1.1 * voltage / 0.3 * of.sin(inner), 1.05 * far_voltage / 0.25 * of.sin(far)
-    reactive = (
-        (1.1 * voltage * of.cos(inner) - voltage**2) / 0.3,
-        (1.05 * far_voltage * of.cos(far) - far_voltage**2) / 0.25,
-    )
-    both = voltage * far_voltage / 0.5
-    sent, kept = both * of.sin(angle - far_angle), both * of.cos(angle - far_angle)
-    return (
-        [speed, (u[0] - generated[0] - 0.5 * speed) / 0.1,
-         other, (u[1] - generated[1] - 0.5 * other) / 0.1],
-        [generated[0] - sent - 0.6, reactive[0] - (voltage**2 / 0.5 - kept) - 0.2,
-         generated[1] + sent - 0.8, reactive[1] - (far_voltage**2 / 0.5 - kept) - 0.3],
-        [voltage, far_angle - angle, speed],
-    )
+    return swing(x, z, u, of)
 
 
 PLANTS = (
@@ -237,12 +223,13 @@ def effect_of_rates(plant: Plant, states: Array, inputs: Array) -> Array:
             for w in (*np.diag(sizes), *np.diag(-sizes))
         ]
         found.append(np.diagonal(np.subtract(ends[:n], ends[n:])))
-    return np.mean(found, axis=0) / (2.0 * sizes)  # type: ignore[no-any-return]
+    effect: Array = np.mean(found, axis=0) / (2.0 * sizes)
+    return effect
 
 
 @cache
 def _consistent(plant: Plant) -> Any:
-    """What solves the algebraic equations."""
+    """A solver of the algebraic equations, for z at x and u."""
     x, z, u = (ca.SX.sym(name, size) for name, size in zip(
         "xzu", (plant.n, len(plant.algebraic), len(plant.inputs[0])), strict=True
     ))
