@@ -287,7 +287,7 @@ def _resized(figure: Figure, width: float | None) -> Iterator[None]:
             if (text := getattr(figure, name)) is not None:
                 text.set_wrap(True)
         for legend in legends:
-            narrow(legend, figure)
+            _narrow(legend, figure)
         yield
     finally:
         figure.set_size_inches(size)
@@ -299,7 +299,7 @@ def _resized(figure: Figure, width: float | None) -> Iterator[None]:
                 column._children = items
 
 
-def narrow(legend: Any, figure: Figure) -> None:
+def _narrow(legend: Any, figure: Figure) -> None:
     """Give a legend so few columns that it fits; Matplotlib fixes them when it is made."""
     box, most = legend._legend_handle_box, 0.98 * figure.bbox.width
     columns = list(box.get_children())
