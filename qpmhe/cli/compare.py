@@ -48,13 +48,13 @@ def compare(
     ] = None,
     observer: Annotated[
         list[str] | None,
-        typer.Option(help="Observer: model for the model's own, ekf, ukf, or a function as for "
-                          "--model, of a qpmhe.baselines.Problem; may be repeated."),
+        typer.Option(help="Observer: model for the model's own, ekf, ukf, or a function, named as "
+                          "for --model, that takes a qpmhe.baselines.Problem; may be repeated."),
     ] = None,
     estimator: Annotated[
         list[str] | None,
-        typer.Option(help="Another estimator to run beside: ekf, ukf, enkf, particles, or a "
-                          "function, likewise; NAME=... names it; may be repeated."),
+        typer.Option(help="Another estimator to compare with: ekf, ukf, enkf, particles, or such "
+                          "a function; NAME=... names it; may be repeated."),
     ] = None,
     qps: Annotated[
         str, typer.Option(help="QPs per sample, separated by commas; 0 is the observer, none "

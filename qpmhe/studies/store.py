@@ -200,8 +200,9 @@ class Writer:
                 if known.get(name, fingerprint) != fingerprint:
                     raise StoreError(
                         f"{name} has changed since its cells were stored in "
-                        f"{self._path}: its file, a file that it imports, its record, or the "
-                        "options for reading that. Name another store, or undo the change."
+                        f"{self._path}: its function or arguments, its file, a file that it "
+                        "imports, or a model's record or the options for reading that. Name "
+                        "another store, or undo the change."
                     )
                 connection.execute(
                     "INSERT OR IGNORE INTO models VALUES (?, ?)", (name, fingerprint)
