@@ -100,11 +100,15 @@ def estimator_fault(
         candidate="observer" if settings.restart or settings.candidate == "reinitialized"
         else "reinitialized",
     )
+    # Where no QP improves it, an estimate has the observer's measurement update.
+    observing = replace(usual, max_qps=0)
     aging = copy(cost)
     aging.discount = 1.0 if cost.discount < 1.0 else 0.95
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of an observer that is far off
-        for is_wild, weighed, options in ((False, cost, usual), (True, aging, other)):
+        for is_wild, weighed, options in (
+            (False, cost, usual), (True, aging, other), (False, cost, observing),
+        ):
             varied = library.varied(system, observer, weighed, options)
             if varied is None:
                 weighed, options = cost, usual

@@ -662,6 +662,7 @@ def test_rounding_in_a_covariance_is_not_taken_for_wrong_code(seed):
     (1e10, "s/mhe_gained(&seen, gain, out);/{ & out[1] *= 1.01; }/"),
     (1e20, "s/mhe_gained(&seen, gain, out);/{ & out[1] *= 1.01; }/"),
     (1e14, "s/mhe_add_disturbance(s, stage, following);//"),
+    (1.0, "s/mhe_moved(stage, &seen, gain, out);/& out[1] *= 1.00001;/"),
 ])
 def test_a_vague_prior_hides_no_wrong_code(prior, lie, script, monkeypatch):
     """Position and velocity are correlated to 1 - 1e-12 and more, but a root has their digits."""
