@@ -52,7 +52,8 @@ class Raises(Kept):
 
 class Diverges(Kept):
     def update(self, y):
-        self.state = self.state * 1e60
+        if abs(self.state).max() < 1e150:  # its square overflows, the state itself does not
+            self.state = self.state * 1e60
         return self.state
 
 class Lost(Kept):
