@@ -137,6 +137,7 @@ def test_an_estimator_of_them(outside):
     assert outside["backend"].Dense.solved >= improved > 20
 
 
+@pytest.mark.slow
 def test_the_command_line_finds_them_in_an_installed_package(folder):
     info = folder / "outside-1.0.dist-info"
     info.mkdir()

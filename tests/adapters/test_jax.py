@@ -43,6 +43,7 @@ def test_results_are_double_and_the_precision_of_the_process_is_left_alone(doubl
         assert jnp.ones(1).dtype == (np.float32 if double else np.float64)
 
 
+@pytest.mark.slow
 def test_a_large_model_over_a_long_window():
     weights = np.random.default_rng(1).standard_normal((24, 30)) / 5.0
 

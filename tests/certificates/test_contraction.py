@@ -58,6 +58,7 @@ def test_scalar_system_has_the_known_constants_and_limit():
     assert 2.1 <= bound.components(bound.limit())[0] <= 2.1 * (1.0 + 2e-3)
 
 
+@pytest.mark.slow
 def test_the_inequality_holds_between_any_two_states():
     system, region = qpmhe.models.cstr()[0], box([0.4, 345.0], [0.6, 355.0])
     found = certify_detectability(system, region, eta=0.9, inputs=box(290.0, 310.0))
@@ -73,6 +74,7 @@ def test_the_inequality_holds_between_any_two_states():
     assert (ahead <= (0.9 * start + supplied + seen) * (1.0 + 1e-12)).all()
 
 
+@pytest.mark.slow
 def test_nonlinear_output_takes_output_injection():
     # C in [0.7, 1.3]: with multipliers any rate is feasible, and R = (1 - eta^2) / 0.7^2.
     found = certify_detectability(
@@ -111,6 +113,7 @@ def oscillator(drift=0.0):
     return qpmhe.System(f, lambda x: x[..., :1], n=3, p=1)
 
 
+@pytest.mark.slow
 def test_a_known_parameter_is_left_out_and_what_moves_it_is_named():
     gain, sizes = np.array([[0.5], [0.2], [0.0]]), ([0.1, 0.1, 0.0], [0.2])
     known = box([-1.0, -1.0, 0.3], [1.0, 1.0, 0.3])
@@ -140,6 +143,7 @@ class Odd(qpmhe.Luenberger):
         return self.gain @ v + z, None
 
 
+@pytest.mark.slow
 def test_what_is_refused_says_why():
     hidden, plane = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]]), unit_box(2)
     reactor, paper, _, _ = qpmhe.models.batch_reactor()
@@ -198,6 +202,7 @@ def test_what_jumps_is_not_certified_from_its_derivatives():
     assert certify_detectability(kinked, unit_box(1), eta=0.8).evidence is Evidence.PROVED
 
 
+@pytest.mark.slow
 def test_what_cannot_be_enclosed_is_sampled_with_its_name_and_the_remedy(monkeypatch):
     stated = certificates.ObserverStability.assumed(rho=0.9, C_p=1.0, C_w=1.0, C_v=1.0, kappa=0.1)
     for h, word in (
@@ -240,6 +245,7 @@ def test_a_model_that_overflows_may_not_be_meant_to_hold():
     assert "a smaller region" in caught.value.suggestions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lie", "dimension"), [
     (np.negative, 2), (lambda x: np.nan * x, 2), (None, 2),
     (lambda x: 1e-9 * x, 1),  # what is said to be supplied by disturbances
@@ -280,6 +286,7 @@ def test_proofs_end_with_the_time(monkeypatch):
             question(linear(0.5, 1.0), unit_box(1), seconds=0.5)
 
 
+@pytest.mark.slow
 def test_no_search_is_begun_in_vain():
     with pytest.raises(certificates.OutOfTimeError, match=r"40 states takes about .* s were left"):
         certify_detectability(linear(0.9 * np.eye(40), np.ones((1, 40))), unit_box(40))

@@ -58,6 +58,7 @@ def responses(name):
     return np.array(found) @ G, np.array(found) @ gain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("kind", ["box", "length"])
 def test_the_bound_is_above_the_reachable_error_and_near_it(name, kind):
@@ -101,6 +102,7 @@ def test_the_bound_is_above_the_reachable_error_and_near_it(name, kind):
         assert np.linalg.norm(e) <= sums[-1]
 
 
+@pytest.mark.slow
 def test_no_true_state_leaves_the_box_of_the_monitor():
     system, gain, d, region = made("radar")
     H, K = responses("radar")
@@ -168,6 +170,7 @@ def test_the_region_is_examined_for_g_w():
         assert certificate.observer_bound.invariance.holds is stays
 
 
+@pytest.mark.slow
 def test_detectability_and_the_measured_cost_take_w():
     """x1 - x2 of two trajectories with the same outputs is what G w makes, and no more."""
     G = np.array([[30.0], [40.0]])

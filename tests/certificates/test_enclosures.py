@@ -97,6 +97,7 @@ def test_kinks_behind_other_functions(expression):
         assert violations(expression, low, high, generator) == (4, [])
 
 
+@pytest.mark.slow
 def test_models_of_numpy_and_casadi_have_the_same_enclosure():
     ca = pytest.importorskip("casadi")
     x = ca.MX.sym("x", 2)

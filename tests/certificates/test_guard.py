@@ -52,6 +52,7 @@ def in_set(bound, point, z, tube):
     )
 
 
+@pytest.mark.slow
 def test_the_guard_returns_the_nearest_point_of_the_set(bound):
     """Against a fine grid, where ball, box, the slanted side and corners of them are active."""
     guard, rng, kinds = Guard(bound, bound.stability.system), np.random.default_rng(0), set()

@@ -188,6 +188,7 @@ def estimator(plan, observer, *, horizon=4, candidate="reinitialized", **options
     )
 
 
+@pytest.mark.slow
 def test_what_was_not_certified_is_no_bound_for_a_window(double):
     system = qpmhe.System(
         lambda x, u: 0.8 * x + 0.1 * np.sin(x) * u, lambda x, u: x, n=1, p=1, m=1
@@ -206,6 +207,7 @@ def test_what_was_not_certified_is_no_bound_for_a_window(double):
     assert 1.0 < bound[11] / bound[4] < 30.0  # from anywhere in the region, as 0 was from 1 off
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_code_and_reports_it(tmp_path):
     # At 70 columns: what is to be pasted must not be broken.
     console, report = Console(file=io.StringIO(), width=70), tmp_path / "certificate.json"

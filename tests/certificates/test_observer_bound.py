@@ -121,6 +121,7 @@ def plain(vectors, weight):
     return np.sqrt(np.einsum("...i,ij,...j->...", vectors, weight, vectors))
 
 
+@pytest.mark.slow
 def test_sizes_may_be_lengths_sets_or_vectors(four):
     (four, _), rng, ones = four, np.random.default_rng(1), np.ones((3, 4))
     P, Q, R, V = four.metric, four.stability.Q, four.stability.R, four.stability.V
@@ -199,6 +200,7 @@ def scalar_certificate(slope, w=0.01):
     )
 
 
+@pytest.mark.slow
 def test_the_headline_says_whether_the_region_is_kept():
     certificate = scalar_certificate(1.5)
     points = certificate.stability.compared
@@ -248,6 +250,7 @@ def test_a_run_of_another_model_with_the_same_gain_is_refused():
             bound.along(run_of(other), initial_error=0.1)
 
 
+@pytest.mark.slow
 def test_where_the_bound_ends_the_model_need_not_be_defined():
     """The observer leaves the domain of the root, in a run of the certified model."""
     system = qpmhe.System(lambda x: 0.5 * np.sqrt(x) + 0.3, lambda x: 1.0 * x, n=1, p=1)

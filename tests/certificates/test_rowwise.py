@@ -48,6 +48,7 @@ def test_single_components_have_their_exact_limits():
     assert 0.99**after * scale[2] <= 0.11 * exact[2]
 
 
+@pytest.mark.slow
 def test_a_stiff_state_is_bound_by_its_own_row():
     """A fast state beside a slow one, whose noise the observer takes in."""
     A, C = np.array([[0.02, 3.0], [0.0, 0.98]]), np.array([[0.0, 1.0]])
@@ -245,6 +246,7 @@ def test_no_adversary_leaves_the_box(case, kind, pytestconfig):
         assert nearest.max() > 0.3  # the adversary is no straw man
 
 
+@pytest.mark.slow
 def test_the_settled_box_is_no_smaller_than_any_lasting_error(case):
     """From the truth's own start, signals that last bring no component beyond its limit."""
     rng = np.random.default_rng(3)
@@ -366,6 +368,7 @@ def test_files_and_pickles_keep_the_components(tmp_path):
     np.testing.assert_array_equal(tube.box, other.box)
 
 
+@pytest.mark.slow
 def test_the_monitor_has_the_box_that_the_run_has():
     system, gain, region, w, v, _ = fitzhugh_nagumo()
     bound = bound_of(system, gain, region, w, v)

@@ -50,6 +50,7 @@ def file(bound, tmp_path):
     return tmp_path / "two.json"
 
 
+@pytest.mark.slow
 def test_what_is_loaded_is_what_was_stored_bit_by_bit(bound, file):
     found = load(file, made(), GAIN)
     assert found.evidence is Evidence.PROVED

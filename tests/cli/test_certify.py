@@ -169,6 +169,7 @@ def test_angles_are_certified_where_they_do_not_wrap():
         certificates.certify_detectability(system, place)
 
 
+@pytest.mark.slow
 def test_a_guard_is_tried_on_the_record_or_refused_by_name(shown):
     """With the stated sizes, which the noises of the record need not keep to."""
     stated = {"box": SQUARE, "guard": True, "max_noise": "0.4"}

@@ -87,6 +87,7 @@ def test_a_bad_option_is_reported_in_a_line(option, value, words, monkeypatch, c
         assert stray not in error
 
 
+@pytest.mark.slow
 def test_compare_report_export_and_a_study_with_an_unknown_key(tmp_path):
     pytest.importorskip("jinja2")
     pytest.importorskip("joblib")

@@ -196,6 +196,7 @@ def test_damaged_snapshots_are_refused_whole():
         equal(mhe.update(**sample), twin.update(**sample))
 
 
+@pytest.mark.slow
 def test_a_record_is_its_samples():
     """Longer than what is handed to C at once, with missing samples, and in several calls."""
     one, options = wide(), {"warm_start": True}

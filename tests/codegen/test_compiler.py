@@ -182,6 +182,7 @@ def test_a_compiler_without_fast_flags_and_none(script, monkeypatch, tmp_path):
     assert np.isfinite(system(None).f(np.ones(2), None)).all()  # by CasADi's virtual machine
 
 
+@pytest.mark.slow
 def test_damaged_files_in_the_cache(script, cache):
     for damage in (
         lambda data: data[: len(data) // 2], lambda data: data.replace(b"answer", b"anxwer"),
@@ -376,6 +377,7 @@ def test_the_temporary_folder_is_private_and_not_searched_where_the_cache_works(
         assert folders.cache_folders() == []
 
 
+@pytest.mark.slow
 def test_auto_takes_what_was_compiled_without_generating_it_again(script, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(library, "estimator_files", None)
@@ -424,6 +426,7 @@ def test_auto_takes_what_was_compiled_without_generating_it_again(script, monkey
         estimator()
 
 
+@pytest.mark.slow
 def test_auto_is_the_python_step_where_the_library_is_of_no_use(script, monkeypatch):
     path = compile_it().path
     script.log.unlink()
@@ -605,6 +608,7 @@ def arrhenius(x, u):
     )
 
 
+@pytest.mark.slow
 def test_a_model_that_runs_away_is_not_taken_for_wrong_code(script):
     weights = {
         "prior": np.diag([1e4, 25.0, 9.0]), "disturbance": np.diag([4.0, 0.01, 0.0025]),
@@ -706,6 +710,7 @@ def test_sigma_points_far_apart_are_not_taken_for_wrong_code(script):
     assert mhe.engine == "compiled"
 
 
+@pytest.mark.slow
 def test_what_is_always_wrong_is_interpreted_or_the_python_step(script, monkeypatch):
     # Of both libraries; the Python step must not use the model's.
     script.lies(f"{STEP_LIES['noises']};{MODEL_LIES['residuals']}", [FAST, MIDDLE, PLAIN])

@@ -93,6 +93,7 @@ def test_it_is_the_python_step_from_any_state(name, tmp_path):
     unit.fmu.freeInstance()
 
 
+@pytest.mark.slow
 def test_what_is_refused(tmp_path, monkeypatch):
     mhe = case("inputs").estimator("python")
     unit = Unit(mhe, tmp_path)

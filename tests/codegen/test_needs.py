@@ -23,6 +23,7 @@ pytestmark = [
 COUNTS = ("qps", "corrections", "nearest_points", "iterations")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "cap"), [
     ("restored", 3), ("states in a polytope", 2), ("soft states", 1), ("restored", None),
     ("mixed losses", 2), ("inputs", None), ("fewer disturbances in sets", 2), ("soft states", None),
@@ -51,6 +52,7 @@ def test_no_step_takes_more_than_is_said(name, cap, tmp_path):
         assert found["iterations"].max() > 0
 
 
+@pytest.mark.slow
 def test_sizes_are_those_of_the_compiler(tmp_path):
     mhe = linear(horizon=4, max_qps=2)
     written = codegen.write(mhe, tmp_path, compiler="cc -O1")
@@ -85,6 +87,7 @@ def test_compilers_that_are_none(compiler, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_compilers_that_fail(tmp_path):
     for compiler in (
         "cc -no-such-option-at-all", "cc -O1 -ffast-math", "false", "true", "cc -S", "cc -o one.o",

@@ -186,6 +186,7 @@ def test_written_code_reads_well(name, tmp_path):
         assert len(re.findall(rf"\b{macro}\b", header + written)) > 1, macro
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CC is None, reason="there is no C compiler")
 @pytest.mark.parametrize(("name", "real", "level"), [
     ("inputs", "double", "-O2"), ("gated in states", "double", "-O1"),

@@ -36,6 +36,7 @@ def test_sources_with_other_weights_and_options_differ_in_the_data_only(tmp_path
     assert ".max_qps = 2147483647," in texts[1][1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 @pytest.mark.parametrize("name", ["MHE_tank", "casadi", "real", 60 * "a"])
 def test_names(name, tmp_path):

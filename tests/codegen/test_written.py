@@ -139,6 +139,7 @@ def test_single_precision_computes_nothing_in_double(name, tmp_path):
     subprocess.run(command, check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not (shutil.which("arm-none-eabi-gcc") and shutil.which("arm-none-eabi-nm")),
     reason="there is no compiler for microcontrollers",
@@ -163,6 +164,7 @@ def test_a_microcontroller_needs_no_double_precision(name, tmp_path):
     assert not [one for one in called if wide.fullmatch(one)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["-O1", "-O2", "-O3"])
 @pytest.mark.parametrize("name", ["extended", "fewer disturbances in sets", "unscented prior"])
 def test_compiles_without_warnings_when_it_is_optimised(name, level, tmp_path):
@@ -192,6 +194,7 @@ def test_levels_differ_by_contraction_only(name, tmp_path):
     assert len(bits) == 1
 
 
+@pytest.mark.slow
 def test_code_without_infinities_is_not_compiled(tmp_path, monkeypatch):
     for flag in ("-ffast-math", "-Ofast", "-ffinite-math-only"):
         with pytest.raises(subprocess.CalledProcessError):

@@ -91,6 +91,7 @@ def test_size_and_span_of_a_bias():
     assert one.where == pytest.approx((250 / 3 * 0.2, 49.8), abs=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "size"), [(0.1, "large"), (6.0, "small")])
 def test_the_factor_of_the_noise(factor, size):
     (one,) = diagnosed(planted.weighted("vehicle", 0, noise=factor)).findings
@@ -180,6 +181,7 @@ def factors(diagnosis):
             for one in diagnosis.findings}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [50.0, 200.0])
 def test_a_factor_of_one_sensor(noise):
     assert factors(weighted_wrongly([1.0, noise], [1.0, 1.0])) == {
@@ -204,6 +206,7 @@ def test_a_factor_of_all_sensors_beside_one_of_a_single_sensor():
     assert told == [("noise", (1,), 1 / 50), ("disturbance", (), 9.0), ("noise", (0, 2), 4.0)]
 
 
+@pytest.mark.slow
 def test_a_factor_without_an_upper_end():
     """The second state is not disturbed at all."""
     (one,) = weighted_wrongly([1.0, 1.0], [1.0, 30.0], moving=0.0).findings
@@ -267,6 +270,7 @@ def test_what_factors_of_covariances_do_not_explain_is_not_blamed_on_them(a, spo
     assert cause in (first.kind, *first.equals), str(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("a", "seed", "sensors"), [(SPRING, 1, [0]), (TANKS, 0, [0, 1]), (TANKS, 1, [0])]
 )
@@ -299,6 +303,7 @@ def test_the_remedy_for_coloured_noise_makes_the_innovations_white(a, seed, sens
     assert largest[1] < 0.18  # 3.1 standard errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a", [TANKS, SPRING], ids=["tanks", "spring"])
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(
@@ -418,6 +423,7 @@ def test_rows_that_are_missing_or_twice_and_noise_that_changes_against_the_whole
     assert found[0].corrected == pytest.approx(found[1].corrected, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_noted():
     system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
     y = 0.5 * np.round(3.0 * 0.8 ** np.arange(100) / 0.5)
@@ -432,6 +438,7 @@ def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_not
     assert texts == ["The observer's gate rejected y2 at 11% of its samples."]
 
 
+@pytest.mark.slow
 def test_missing_measurements_are_neither_faults_nor_evidence():
     case, generator = planted.healthy("vehicle", 0), np.random.default_rng(0)
     found = diagnosed(case, **missing(case, generator.random(case.measurements.shape) < 0.3))
@@ -451,6 +458,7 @@ def test_missing_measurements_are_neither_faults_nor_evidence():
     assert kinds(diagnosed(tank, **missing(tank, rows))) == []
 
 
+@pytest.mark.slow
 def test_a_wild_number_a_dead_sensor_and_an_estimator_worse_than_a_filter():
     case = planted.healthy("vehicle", 1)
     case.measurements[50] = 1e300
@@ -479,6 +487,7 @@ def test_what_the_prior_carries_and_claims():
     assert any("The prior says that the observer is off by" in one.text for one in notes)
 
 
+@pytest.mark.slow
 def test_changed_weights_and_compiled_runs_are_judged(monkeypatch):
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)
     case, told = planted.healthy("batch_reactor", 0), []
@@ -513,6 +522,7 @@ def test_bad_input(error, words, given, options):
         qpmhe.diagnose(given(), **options)
 
 
+@pytest.mark.slow
 def test_page_is_one_file_with_escaped_names(tmp_path):
     case = planted.measured("vehicle", 1, planted.dead)
     found = qpmhe.diagnose(case.run(), outputs=["<b>r1", "r2 & co", "b1", "b2"])
@@ -578,6 +588,7 @@ def test_filters_are_kalman_filters():
     assert told == pytest.approx(found.likelihoods[1])
 
 
+@pytest.mark.slow
 def test_command_writes_the_page(tmp_path):
     case, record = planted.scaled_input("cstr", 0, -1.0), tmp_path / "record.csv"
     times = 0.05 * np.arange(len(case.inputs))
@@ -601,6 +612,7 @@ def test_command_writes_the_page(tmp_path):
     assert "no diagnosis: the run has 20 samples" in short.output.replace("\n", " ")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::qpmhe.ModelWarning")  # the estimator says so, too
 @pytest.mark.parametrize(("method", "steps", "expected"), [
     ("rk4", 1, ["discretization"]), ("rk4", 16, []), ("radau", 2, []),

@@ -95,6 +95,7 @@ def test_a_roll_out_that_fails_is_named(raises):
     assert ("too low" if raises else "roll-out") in estimate.message
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
 @pytest.mark.parametrize("seed", [39, 72])
 def test_where_no_step_from_the_observer_helps_the_search_goes_on_from_its_roll_out(seed):

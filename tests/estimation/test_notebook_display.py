@@ -100,6 +100,7 @@ def test_a_run_in_a_file_is_the_same_run_and_anything_else_is_refused(made, tmp_
         assert "pickle" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_figures_are_pyplots_where_it_is_imported():
     code = SETUP + """
 qpmhe.plots.costs(run)

@@ -101,6 +101,7 @@ def test_the_nearest_and_the_best_trajectory_are_those_of_a_dense_solver(low, en
     assert restored >= 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_qps", [1, 3, None])
 def test_the_inequality_of_the_restored_cost(max_qps):
     """sqrt(J(restored)) <= 2 sqrt(J(raw)) + sqrt(J(truth)), sets around the truth."""

@@ -44,6 +44,7 @@ def test_the_nearest_point_is_nearer_in_its_own_metric_only():
         assert row["farther in P⁻¹"] == 0
 
 
+@pytest.mark.slow
 def test_a_vague_prior_is_worst_just_above_the_observability_index():
     rows = study.horizons(FEW)
     vague = {row["N"]: row["prior 100 P"] for row in rows}

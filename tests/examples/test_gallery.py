@@ -64,6 +64,7 @@ class Still:
         return type("Run", (), {"filtered": filtered, "times": np.zeros(len(y))})
 
 
+@pytest.mark.slow
 def test_a_problem_is_tuned_judged_and_written(parts, tmp_path, capsys):
     problem = linear(parts, steps=200, tunes=100, tuning={"objective": "likelihood"}, note="Note.")
     truth, main = problem.records[0].truth, parts["command"].main
@@ -107,6 +108,7 @@ def test_only_the_held_estimate_of_the_motors_inertia_neither_drifts_nor_gets_st
     assert max(errors[motor.HELD]) < 12.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("which", "most"), [(0, 0.04), (1, 0.005)])
 def test_projected_filters_and_mhe_of_the_reactors_settle_on_the_truth(parts, which, most):
     reactors = import_module("gallery.reactors.reactors")

@@ -39,6 +39,7 @@ def rmse(parts, cell, record, way, prior=None):
     return float(np.sqrt(np.mean(error[150:] ** 2)))
 
 
+@pytest.mark.slow
 def test_a_warming_cell_is_followed_in_spite_of_outliers_and_a_prior_too_sure(parts, cell):
     """A cell that is not quite the model: other resistances, which fall, another OCV."""
     rng, steps = np.random.default_rng(0), 500

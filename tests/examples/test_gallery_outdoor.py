@@ -45,6 +45,7 @@ def write(folder, anchors=ANCHORS):
     return folder
 
 
+@pytest.mark.slow
 def test_records_are_read_with_their_own_times_and_any_number_of_anchors(parts, tmp_path):
     walk = parts["ranges"].read(write(tmp_path / "one"))
     np.testing.assert_array_equal(walk.anchors, list(ANCHORS.values()))

@@ -450,6 +450,7 @@ def test_estimates_equal_those_of_the_ode_without_the_algebraic_state(engine):
     assert (mine.costs <= mine.candidate_costs + 1e-12).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("soft", [False, True])
 def test_a_set_of_algebraic_states_is_a_constraint_of_the_solution(soft):
     """Against the ODE without the algebraic state, with the same inequality written out."""

@@ -229,6 +229,7 @@ def test_an_iteration_that_fails_is_a_failed_stage(engine):
     assert np.isfinite(mhe.update([1.5], [0.0]).state).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "n", "options", "method"), [
     (pendulum, 2, {"m": 1, "dt": 0.2}, "rk4"),
     (robertson, 3, {"dt": 1.0, "scales": [1.0, 3e-5, 1.0]}, "radau"),

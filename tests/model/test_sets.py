@@ -128,6 +128,7 @@ def test_a_large_linear_penalty_of_a_ball_is_exact_from_its_centre():
     assert compared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bad", "penalty"), [
     ("raise", {}), ("exit", {"linear": 5.0}), ("nan", {"linear": 5.0}), ("shape", {}),
 ])

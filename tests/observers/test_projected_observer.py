@@ -104,6 +104,7 @@ def worst_excess(rng, steps, is_own):
     return worst, projected
 
 
+@pytest.mark.slow
 def test_projection_keeps_the_contraction_in_the_observers_metric():
     runs, steps = 30, 10
     for is_own in (True, False):  # the adversary beats another metric

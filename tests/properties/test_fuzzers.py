@@ -42,21 +42,22 @@ def test_cheap_steps_keep_the_promise(pytestconfig, seed):
     assert counts["CANDIDATE_OUTSIDE"] > 0.03 * steps
 
 
-@pytest.mark.parametrize(("engine", "seed"), [
-    ("python", 0), *(pytest.param("python", k, marks=pytest.mark.slow) for k in (1, 2)),
-    *(pytest.param("compiled", k, marks=[pytest.mark.slow, pytest.mark.skipif(
+@pytest.mark.parametrize(("engine", "seed", "steps"), [
+    ("python", 0, 200), *(pytest.param("python", k, 400, marks=pytest.mark.slow) for k in (1, 2)),
+    *(pytest.param("compiled", k, 1200, marks=[pytest.mark.slow, pytest.mark.skipif(
         find_compiler() is None, reason="there is no C compiler"
     )]) for k in (0, 2)),
 ])
-def test_steps_with_everything_mixed_keep_the_promise(engine, seed):
-    counts, faults = fuzz_general.run(400 if engine == "python" else 1200, seed, engine)
+def test_steps_with_everything_mixed_keep_the_promise(engine, seed, steps):
+    counts, faults = fuzz_general.run(steps, seed, engine)
     assert faults == []
-    assert counts["IMPROVED"] > 60
-    assert counts["CANDIDATE_OUTSIDE"] > (20 if engine == "python" else 0)
+    assert counts["IMPROVED"] > min(60, 0.15 * steps)
+    assert counts["CANDIDATE_OUTSIDE"] > (0.05 * steps if engine == "python" else 0)
     assert counts["set"] > 0
     assert counts["amended"] > 0
 
 
+@pytest.mark.slow
 def test_the_judge_of_mixed_steps_sees_a_broken_promise():
     seen = set()
     for seed in range(40):
@@ -223,6 +224,7 @@ LIES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", LIES)
 def test_the_campaign_notices_a_mistake(monkeypatch, words):
     monkeypatch.setattr(*wrong_update(LIES[words]))

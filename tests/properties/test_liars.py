@@ -155,6 +155,7 @@ def test_no_useful_iterate_leaves_the_candidate_and_says_so(lie, sets):
             assert estimate.qps == 1 + bool(outside)  # once more without the violated rows
 
 
+@pytest.mark.slow
 @sets_or_not
 @pytest.mark.parametrize("max_qps", [1, None])
 @pytest.mark.parametrize("lie", ODD)

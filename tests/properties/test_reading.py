@@ -81,6 +81,7 @@ def levels(x):
     return np.array([x[1], np.sqrt(x[0])])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [
     {"max_qps": None}, {"max_qps": 5, "warm_start": True}, {"infeasible": "restore"},
     *({"backend": name} for name in available() if name not in NO_BITS),
@@ -99,6 +100,7 @@ def test_of_every_backend(options):
     follow(tank, "python", 24, (2, 17), **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["traced", "untraced", "state by state"])
 def test_however_the_model_is_called(how):
     """Which way to call a model works is found while it is called, by readers as well."""
@@ -126,6 +128,7 @@ def turning(x):
     return np.array([0.9 * x[0] + 0.1 * x[1], 0.8 * x[1] + 0.1 * np.sin(x[0])])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 @pytest.mark.parametrize("loss", [qpmhe.Cauchy, lambda weight: qpmhe.Huber(weight, 0.1)])
 def test_of_a_disturbance_of_lower_dimension_beside_a_robust_cost(loss):

@@ -117,6 +117,7 @@ def test_full_while_rows_or_a_checkpoint_are_written(text):
         assert get("out.csv") == whole
 
 
+@pytest.mark.slow
 def test_the_command_says_so(text):
     for line, words in (
         ("record.csv > /dev/full", "cannot write standard output: No space left"),
@@ -183,6 +184,7 @@ print("of the model")
 WHO = ("python", "first", "library")
 
 
+@pytest.mark.slow
 def test_prints_do_not_get_among_the_rows(here):
     """Nor into a file, where standard error is closed."""
     Path("loud.py").write_text(LOUD + Path(DISCRETE.rpartition(":")[0]).read_text())

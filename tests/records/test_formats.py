@@ -351,6 +351,7 @@ def test_a_killed_run_resumes_byte_for_byte(here, name):
     assert get("out.csv") == get("whole.csv")
 
 
+@pytest.mark.slow
 def test_bad_files_are_one_line_each(here):
     mf4("record.mf4", [(T1, {"y": FAST}), (T2 + 1e9, {"other": SLOW})])
     from scipy.io import savemat

@@ -43,6 +43,7 @@ def whole(text, model=CONTINUOUS, **options):
     return get("whole.csv")
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments(here):
     text = lines(500)
     expected = whole(text)
@@ -93,6 +94,7 @@ def test_what_solvers_keep_for_the_next_start_makes_no_difference(here):
         assert get("out.csv") == expected
 
 
+@pytest.mark.slow
 def test_a_record_cut_at_any_byte(here):
     """Numbers that were cut off are numbers, too, and must not stay in what is gone on with."""
     # The time comes last: what is cut is the length of a step.

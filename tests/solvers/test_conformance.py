@@ -18,6 +18,7 @@ pytest.importorskip("quadprog")
 MARKED = {"ecos": "INACCURATE"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_every_backend_is_what_it_says_and_prints_nothing(name, capfd):
     report = check(name)

@@ -82,6 +82,7 @@ def test_a_crash_is_a_failed_qp_and_the_next_one_is_solved():
     assert copied._child._process.pid != solver._child._process.pid
 
 
+@pytest.mark.slow
 def test_the_time_limit_ends_a_solver_that_hangs():
     solver = isolated(Hanging, SolverOptions(time_limit=1.0))
     began = time.monotonic()
@@ -104,6 +105,7 @@ def test_what_it_prints_and_overrides_is_contained(capfd):
     assert solver.solve(small()).message == "ValueError: what it says"
 
 
+@pytest.mark.slow
 @POSIX
 def test_the_process_ends_with_the_solver_an_interrupt_and_its_parent(monkeypatch):
     solver = isolated(Hostile)

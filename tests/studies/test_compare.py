@@ -42,6 +42,7 @@ def shown(monkeypatch):
     return calls
 
 
+@pytest.mark.slow
 def test_compare_runs_the_study_of_its_options(tmp_path, shown):
     path, out = tmp_path / "store.sqlite", tmp_path / "report"
     for option, value, words in (
@@ -102,6 +103,7 @@ def test_what_the_report_needs_is_missed_before_any_cell_runs(tmp_path, monkeypa
     assert [one.name for one in tmp_path.iterdir()] == ["mine.toml"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
 def test_an_ended_study_ends_its_workers_and_says_how_to_resume(tmp_path, signum):
     code = """

@@ -127,6 +127,7 @@ def test_an_estimator_that_fails_at_run_time_is_a_failed_cell(folder, name, word
     assert re.search(words, row.reason)
 
 
+@pytest.mark.slow
 def test_an_estimator_takes_no_name_of_the_observer(folder):
     """Not even one that looks like an observer's in tables with several observers."""
     study = Study(
@@ -139,6 +140,7 @@ def test_an_estimator_takes_no_name_of_the_observer(folder):
     assert not sequential(rows).any()
 
 
+@pytest.mark.slow
 def test_observers_are_an_axis(folder, tmp_path):
     study = Study(
         qps=[0, 1], observers=["model", "ekf", "my.py:observer"], estimators=["ekf"],

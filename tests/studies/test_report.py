@@ -44,6 +44,7 @@ def texts(rows):
     return {answer.question: answer.text for answer in case.answers()}, case
 
 
+@pytest.mark.slow
 def test_fastest_near_the_best_the_observer_and_failures():
     found, case = texts(frame())
     rows = [row for _, row in case.summary.iterrows()]
@@ -84,6 +85,7 @@ def test_what_is_worse_than_no_qp_is_named():
     )
 
 
+@pytest.mark.slow
 def test_accuracy_alone_and_nothing_at_all(tmp_path):
     rows = frame().query("horizon == 10").assign(times=None, cost_ratio=np.nan)
     rows[["time_median", "time_p95", "time_p99", "time_max"]] = np.nan
@@ -120,6 +122,7 @@ def test_profiles_against_their_definition():
             assert (one.ratios <= tau).sum() / one.problems == share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inches", [None, 3.3])
 def test_no_text_is_clipped_or_covered(inches):
     rows = frame()
@@ -152,6 +155,7 @@ def embedded(page):
     return re.findall(r"<script[^>]*>(.*?)</script>", page.read_text("utf-8"), re.DOTALL)
 
 
+@pytest.mark.slow
 def test_the_report_is_whole_and_needs_no_network():
     page = written()
     folder, text = page.parent, page.read_text(encoding="utf-8")
@@ -183,6 +187,7 @@ def test_the_report_is_whole_and_needs_no_network():
         assert sum(one.splitlines()[0].removesuffix(" (Pareto front)") == words for one in told)
 
 
+@pytest.mark.slow
 def test_no_text_of_a_user_reaches_into_the_script_elements(tmp_path):
     label = "]]><!--<script></script>"
     rows = spoilt("proxqp", 1, "</script><b>out of time").query("horizon == 4")
@@ -208,6 +213,7 @@ def shown(summary, width):
     return text, rows[1:], set(re.split(r"\s{2,}", rows[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 120, 200])
 def test_the_terminals_room_is_used(width):
     text, _, headings = shown(summarise(frame().query("horizon == 10")), width)
@@ -224,6 +230,7 @@ def test_the_terminals_room_is_used(width):
     assert "1,230" in text
 
 
+@pytest.mark.slow
 def test_the_best_of_a_column_is_marked_once_and_of_many_rows_those_that_matter_are_shown():
     rows = frame().query("horizon == 10")
     summary = summarise(rows)

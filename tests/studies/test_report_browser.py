@@ -55,6 +55,7 @@ def page(browser, request):
     context.close()
 
 
+@pytest.mark.slow
 def test_buttons_and_the_menu_change_table_and_figures(page):
     assert len(page.evaluate(COLUMN, 0)) == 7
     assert page.evaluate(POINTS) == 7
@@ -73,6 +74,7 @@ def test_buttons_and_the_menu_change_table_and_figures(page):
     assert page.evaluate(POINTS) == 3
 
 
+@pytest.mark.slow
 def test_a_click_on_a_heading_sorts_numbers_as_numbers_and_texts_as_texts(page):
     headings = page.evaluate(HEADINGS)
     for name, read in (("time 99\u00a0% (µs)", lambda text: float(text.replace(",", ""))),

@@ -49,6 +49,7 @@ def handed(monkeypatch):
     return keys
 
 
+@pytest.mark.slow
 def test_a_study_runs_once_and_more_cells_are_added(path, handed):
     out = Console(file=io.StringIO(), width=120)
     study = Study(**SMALL)
@@ -68,6 +69,7 @@ def test_a_study_runs_once_and_more_cells_are_added(path, handed):
     assert list(more["finished"])[:4] == list(frame["finished"])
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_reported_and_the_same_call_goes_on(path, monkeypatch):
     plain = store_module._create
 
@@ -142,6 +144,7 @@ def seen(path, known):
     return now
 
 
+@pytest.mark.slow
 def test_a_study_killed_at_random_and_read_meanwhile_loses_and_repeats_nothing(tmp_path, path):
     options, known = {**SMALL, "seeds": 15}, {}
     cells = Study(**options).cells()
@@ -181,6 +184,7 @@ def ends_alone(path, models, **where):
     return study
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["crashes", "is_killed", "hangs"])
 def test_cells_that_fail_or_end_their_process_are_rows_and_can_be_tried_again(path, handed, model):
     study = ends_alone(path, (model, "raises"), jobs=2)
@@ -192,6 +196,7 @@ def test_cells_that_fail_or_end_their_process_are_rows_and_can_be_tried_again(pa
     assert [key[-6:] for key in handed] == ["seed=1"]
 
 
+@pytest.mark.slow
 def test_accuracy_and_time_are_measured_apart_and_whole_turns_are_no_errors(path):
     """Two crossings of a heading that wraps are no errors, nor jumps in the figures."""
     options = {"models": ["vehicle"], "backends": ["banded"], "qps": [0, 1], "steps": 100}

@@ -135,6 +135,7 @@ def test_what_is_no_store_is_refused_with_the_remedy(path, tmp_path):
         read(path)
 
 
+@pytest.mark.slow
 def test_a_truncated_or_changed_store_is_refused_with_the_remedy(path):
     stored(path, compute(task(keep=True)), compute(task(1)), failure(task(2), "out of time"))
     content = path.read_bytes()

@@ -131,6 +131,7 @@ def write(folder, method="euler"):
     return "changing_package.model:make"
 
 
+@pytest.mark.slow
 def test_figures_of_the_old_file_are_not_shown_for_the_new_one(here):
     def rmse(model, name):
         study = Study(models=[model], **SMALL)

@@ -58,6 +58,7 @@ def tuned(records=None, system=SYSTEM, **options):
     return qpmhe.tune(system, [simulated()] if records is None else records, **{**given, **options})
 
 
+@pytest.mark.slow
 def test_known_covariances_are_within_the_intervals_of_a_table():
     tuning = tuned([simulated(steps=2000)])
     for name, true in {"disturbance x1": 0.4, "disturbance x2": 0.3, "noise y1": 0.3}.items():
@@ -128,6 +129,7 @@ def test_recovery(name):
     assert np.mean(inside) > 0.87
 
 
+@pytest.mark.slow
 def test_what_the_records_do_not_identify_is_named():
     y = simulated(f=lambda x, u: 0.9 * x, steps=400)[0]
     unseen = tuned([y], qpmhe.System(lambda x: 0.9 * x, first_of_two, n=2, p=1))
@@ -141,6 +143,7 @@ def test_what_the_records_do_not_identify_is_named():
     assert "disturbance x2" in names
 
 
+@pytest.mark.slow
 def test_structures():
     scalar = tuned(structure="scalar", disturbance=[[1.0, 0.5], [0.5, 1.0]])
     assert list(scalar.values) == ["disturbance level", "noise level"]
@@ -252,6 +255,7 @@ def test_outliers_tune_little_where_a_threshold_or_the_observer_doubts_them(rule
     assert isinstance(tuning.cost(), qpmhe.RobustCost) == (rule == "threshold")
 
 
+@pytest.mark.slow
 def test_innovations_that_are_not_white_or_outlying_are_told():
     (y, u), generator = simulated(5, 400), np.random.default_rng(6)
     plain = tuned([(y, u)], structure="scalar")
@@ -292,6 +296,7 @@ def test_parameters_of_a_model():
         assert tuning.parameters["k"] == pytest.approx(0.9, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["prediction", "auto"])
 def test_the_estimators_own_error_is_lowered(objective):
     y, u, x = simulated(steps=300, truth=True)
@@ -345,6 +350,7 @@ def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors,
         assert note.startswith("disturbance level and noise level are outside of their intervals")
 
 
+@pytest.mark.slow
 def test_what_was_found_makes_an_estimator_and_compares_horizons():
     y, u = simulated(steps=300)
     tuning = tuned([(y, u)], horizon=6)
@@ -359,6 +365,7 @@ def test_what_was_found_makes_an_estimator_and_compares_horizons():
     assert rows[2, "constant"] != pytest.approx(rows[6, "constant"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_search_that_was_stopped_resumes(tmp_path, monkeypatch):
     path, real, calls = tmp_path / "search.json", search.search_likelihood, []
 

@@ -122,6 +122,7 @@ def test_tune_then_estimate(folder):
     call("estimate", "tuned_plant.py:weighted", "record.csv", "--out", "others.csv")
 
 
+@pytest.mark.slow
 def test_truth_several_records_and_a_new_folder(folder):
     (folder / "again.csv.gz").write_bytes(gzip.compress((folder / "record.csv").read_bytes()))
     shown = call(
