@@ -283,7 +283,7 @@ class Case:
         self.tags += drawn
         if options.get("backend") in ("banded", "quadprog"):
             options.pop("max_solver_iterations", None)
-        elif options.get("backend") in ("osqp", "scs"):  # minutes a step where QPs are ill-conditioned
+        elif options.get("backend") in ("osqp", "scs"):  # else minutes a step
             options.setdefault("max_solver_iterations", 300)
         if self.k:
             options["parameters"] = self.model.parameters
