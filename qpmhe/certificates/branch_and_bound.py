@@ -125,7 +125,8 @@ def cover(
     """Show an inequality on a region by dividing it until each cell is shown."""
     size = 2 ** min(region.lower.size, MOST_ACTIVE) * (2 * len(form.P) + len(form.R)) ** 3
     chunk = int(np.clip(_WORK / size, 1, _CHUNK))
-    cells = Cells(region, most_cells, Deadline.of(seconds), chunk)
+    deadline, model.late = Deadline.of(seconds), ""
+    cells = Cells(region, most_cells, deadline, chunk)
     nowhere = np.empty((0, region.lower.size)), np.empty((0, 0, 0))
     proved: list[tuple[Array, Array]] = []
     for low, high in cells:
@@ -142,7 +143,7 @@ def cover(
             return Cover(False, cells.taken, middle[broken], centres[broken])
         if len(left):
             cells.halve(low, high, _scores(enclosure, left))
-    done = cells.done and model.agrees(proved)
+    done = cells.done and model.agrees(proved, deadline)
     return Cover(done, cells.taken, *nowhere, late=cells.late)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .._checks import Array
 from ..errors import ModelError
 from ..model.system import System
+from .deadline import Deadline
 from .graph import Graph, Slopes
 from .intervals import Interval
 from .programs import Program
@@ -30,6 +31,8 @@ _MOST_KINKS = 3
 # How many points are compared in all cells at least, of each kind; pairs of points in a cell,
 # between which a change of a condition is looked for, in halvings.
 _LEAST, _PAIRS, _HALVINGS = 256, 2, 48
+# Between two looks at the clock, points of so many cells are compared.
+_TOGETHER = 64
 _TRACEABLE = "Write it with NumPy's functions of x and u, numpy.where in place of branches"
 
 
@@ -145,7 +148,7 @@ class SmoothModel:
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
         self._programs: dict[str, Program] = {}
         self._unknown: tuple[Array, Array] | None = None
-        self.compared = len(self.points)
+        self.compared, self.late = len(self.points), ""
         self.reason, output = self._read("h")
         following: list[int] = []
         if not self.reason:
@@ -215,26 +218,39 @@ class SmoothModel:
                 return f"{words} {found}"
         return ""
 
-    def agrees(self, cells: Sequence[tuple[Array, Array]]) -> bool:
-        """Whether f and h have their expressions' values in each cell; `reason` says where not.
+    def agrees(self, cells: Sequence[tuple[Array, Array]], deadline: Deadline) -> bool:
+        """Whether f and h have their expressions' values in each cell.
 
         In cells (B, N) each, at random points, at random corners and, where a condition changes,
         on both sides of the change. Of a region that is no box, cells reach beyond it; where few of
-        these points are within, others of the region are added.
+        these points are within, others of the region are added. ``reason`` says where they differ,
+        and ``late`` how far it came if the time is over before.
         """
         assert self._plan is not None
         lower, upper = (np.concatenate([each[k] for each in cells]) for k in range(2))
-        lower, upper = (np.tile(each, (-(-_LEAST // len(lower)), 1)) for each in (lower, upper))
-        rng = np.random.default_rng(_SEED)
-        inner, share = rng.uniform(lower, upper), rng.integers(2, size=lower.shape)
-        corner = np.where(share == 1, upper, lower)
-        points = np.vstack((inner, corner, *self._plan.around_kinks(lower, upper, rng)))
-        points = points[self._region.contains(points[:, : self.n])]
-        if len(points) < _LEAST:
-            points = np.vstack((points, self._region.sample(_LEAST, rng)))
-        self.compared += len(points)
-        self.reason = self._differs("h", points) or self._differs("f", points)
-        return not self.reason
+        own, compared, self.late = len(lower), 0, ""
+        lower, upper = (np.tile(each, (-(-_LEAST // own), 1)) for each in (lower, upper))
+        rng, parts = np.random.default_rng(_SEED), range(0, len(lower), _TOGETHER)
+        for k in parts:
+            if deadline.passed:
+                self.late = (
+                    f"f and h were compared with their expressions in {min(k, own)} of {own} cells"
+                )
+                return False
+            low, high = lower[k : k + _TOGETHER], upper[k : k + _TOGETHER]
+            inner, share = rng.uniform(low, high), rng.integers(2, size=low.shape)
+            corner = np.where(share == 1, high, low)
+            points = np.vstack((inner, corner, *self._plan.around_kinks(low, high, rng)))
+            points = points[self._region.contains(points[:, : self.n])]
+            compared += len(points)
+            if k == parts[-1] and compared < _LEAST:
+                points = np.vstack((points, self._region.sample(_LEAST, rng)))
+            self.compared += len(points)
+            if len(points):
+                self.reason = self._differs("h", points) or self._differs("f", points)
+            if self.reason:
+                return False
+        return True
 
     def _differs(self, name: str, points: Array) -> str:
         """Where a function differs from its expression by more than rounding; blank if nowhere."""

@@ -93,8 +93,9 @@ def certify_invariance(
             cells.halve(low, high, parts[left, worst])
     if leaving is not None:
         return Invariance(False, leaving, where, cells.taken)
-    if cells.done and not model.agrees(proved):
-        return Invariance(None, f"{unknown}: {model.reason}", where, cells.taken)
+    if cells.done and not model.agrees(proved, deadline):
+        why = model.reason or f"{model.late} when the time was over"
+        return Invariance(None, f"{unknown}: {why}", where, cells.taken)
     if cells.done:
         return Invariance(True, "x stays in the region", where, cells.taken)
     end = "when its time was over" if cells.late else "the most that are allowed"

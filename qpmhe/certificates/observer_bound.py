@@ -59,8 +59,9 @@ _SETTLED, _MOST_SAMPLES = 0.1, 10**6
 _MOST_STEPS, _LITTLE = 3000, 1e-5
 # Boxes of more states are bounded by sums over their sides.
 _MOST_SIGNS = 10
-# How much of the time is for the contraction, and of the rest for the region itself.
-_CONTRACTION, _INVARIANCE = 0.8, 0.6
+# How much of the time is for the contraction, of the rest for the components' step, and of what
+# that leaves for the region itself.
+_CONTRACTION, _ROWS, _INVARIANCE = 0.8, 0.5, 0.6
 
 class Tube(NamedTuple):
     """Bounds at one time: |x - z|_P <= radius, and |x_i - z_i| <= box[i]."""
@@ -184,9 +185,9 @@ class ObserverBound:
         own = projection_metric == "observer"
         return replace(self, projection=observer.metric if own else None)
 
-    def with_rows(self, system: System) -> ObserverBound:
+    def with_rows(self, system: System, seconds: float | Deadline = math.inf) -> ObserverBound:
         """The same with the step of its components, of the certified system."""
-        rows = RowwiseStep(system, self.region, self.gain, self._inverse)
+        rows = RowwiseStep(system, self.region, self.gain, self._inverse, seconds)
         return replace(self, rowwise=rows)
 
     @cached_property
@@ -630,7 +631,7 @@ def with_invariance(
     And with the step of its components.
     """
     deadline, size, inner = Deadline.of(seconds), bound.sizes.extent[0], None
-    bound = bound.with_rows(system)
+    bound = bound.with_rows(system, deadline.part(_ROWS))
     found = certify_invariance(
         system, bound.region, disturbance=size, seconds=deadline.part(_INVARIANCE)
     )

@@ -131,7 +131,8 @@ def _proved_observer(
     widths, own = (region.upper - region.lower)[: system.n], None
 
     def limits(stability: ObserverStability) -> tuple[Any, bool]:
-        limit = ObserverBound(stability, region, sizes).with_rows(system).settled.box
+        bound = ObserverBound(stability, region, sizes).with_rows(system, deadline.part(0.5))
+        limit = bound.settled.box
         return limit, bool((limit < widths)[widths > 0.0].all())
 
     try:

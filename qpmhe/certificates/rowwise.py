@@ -19,6 +19,7 @@ derive it, in *What is guaranteed*.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from .._checks import Array
 from ..model.sets import ConvexSet
 from ..model.system import System
 from .branch_and_bound import halves_of
+from .deadline import Deadline
 from .enclosures import Enclosure, SmoothModel
 from .inequalities import Matrices
 from .regions import Region, inequalities, support
@@ -53,9 +55,15 @@ class RowwiseStep:
         L.
     inverse : (n, n) array
         A matrix that is at least the inverse of P.
+    seconds : float or Deadline
+        How long the region may be divided for: coarser rows give a larger step. If the time is over
+        before f has been compared with its expression everywhere, no rows are known.
     """
 
-    def __init__(self, system: System, region: Region, gain: Array, inverse: Array) -> None:
+    def __init__(
+        self, system: System, region: Region, gain: Array, inverse: Array,
+        seconds: float | Deadline = math.inf,
+    ) -> None:
         self._region, self._gain, self._inverse = region, gain, inverse
         self._model: SmoothModel | None = SmoothModel(system, region)
         self._free, n = self._model.free, system.n
@@ -65,7 +73,9 @@ class RowwiseStep:
             region.upper > region.lower, region.upper - region.lower, 1.0
         )[: n][self._free]
         #: Rows everywhere in the region, by state; None where they are not known.
-        self.rows: Rows | None = None if self._model.reason else self._everywhere()
+        self.rows: Rows | None = None
+        if not self._model.reason:
+            self.rows = self._everywhere(Deadline.of(seconds))
         #: Whether rows vary in the region, so that fewer occur near a state.
         self.varies = self.rows is not None and any(
             len(middle) > 1 or (error > _SHARP * np.abs(middle).max()).any()
@@ -144,21 +154,22 @@ class RowwiseStep:
             rows.append((both[:, :n], both[:, n:]))
         return rows, spread
 
-    def _everywhere(self) -> Rows | None:
+    def _everywhere(self, deadline: Deadline) -> Rows | None:
         """The rows of all cells of the region."""
         model, region = self._model, self._region
         assert model is not None
         n = self._free.size
         most = int(np.clip(_HELD / (64 * n * n), 1, _MOST_CELLS))
         lower, upper = region.lower[None], region.upper[None]
+        division = deadline.part(0.5)
         while True:
             enclosure = model.enclose(lower, upper)
             rows, spread = self._rows(enclosure)
             wide = np.flatnonzero(~(spread <= _SHARP))
             wide = wide[np.argsort(-np.nan_to_num(spread[wide], nan=np.inf), kind="stable")]
             wide = wide[: most - len(lower)]
-            if not len(wide):
-                return rows if model.agrees([(lower, upper)]) else None
+            if not len(wide) or division.passed:
+                return rows if model.agrees([(lower, upper)], deadline) else None
             kept = np.setdiff1d(np.arange(len(lower)), wide)
             low, high = halves_of(region, lower[wide], upper[wide], enclosure.excess[wide])
             lower, upper = np.vstack((lower[kept], low)), np.vstack((upper[kept], high))

@@ -385,6 +385,8 @@ class Search:
             end = ", when its time was over" if found.late else ""
             why = (
                 f"the proof is of something else: {self.model.reason}" if self.model.reason else
+                f"the proof was given up when its time was over: {self.model.late}"
+                if self.model.late else
                 f"the proof was given up after dividing the region into {found.cells} cells{end}"
                 f"{self.model.unknown}"
             )

@@ -11,6 +11,7 @@ import pytest
 
 import qpmhe
 from qpmhe.certificates import Evidence, certify_detectability, certify_observer, enclosures
+from qpmhe.certificates.deadline import Deadline
 from qpmhe.certificates.enclosures import SmoothModel
 from qpmhe.certificates.invariance import certify_invariance
 from qpmhe.certificates.regions import Region, bounded_region
@@ -223,11 +224,53 @@ def test_a_region_thinner_than_its_cells_is_compared_at_points_of_its_own():
                           [0.1234 + 1e-9, -0.1234 + 1e-9, 1.0, 1.0])
     model, region = smooth(system, thin)
     cells = [(region.lower[None], region.upper[None])]
-    assert model.agrees(cells)
+    assert model.agrees(cells, Deadline(math.inf))
     assert model.compared > 400 + 256
     changed.append(True)
-    assert not model.agrees(cells)
+    assert not model.agrees(cells, Deadline(math.inf))
     assert "its expression is" in model.reason
+
+
+class Looks(Deadline):
+    """A time that is over after so many looks at the clock."""
+
+    def __init__(self, count):
+        super().__init__(math.inf)
+        self.count = count
+
+    @property
+    def passed(self):
+        self.count -= 1
+        return self.count < 0
+
+    def part(self, share):
+        return self
+
+
+def test_a_comparison_with_f_that_outlasts_its_time_is_given_up(monkeypatch):
+    """A slow f: a proof of many cells that are not all compared is none, and says so."""
+    region, fine = box(-1.0, 1.3), np.linspace(-1.0, 1.3, 301)[:, None]
+    system = scalar(lambda x: 0.5 * x + 0.1 * np.sin(x))
+    place, cells = bounded_region(system, region), [(fine[:-1], fine[1:])]
+    model = SmoothModel(system, place)
+    before = model.compared
+    assert not model.agrees(cells, Looks(2))
+    assert not model.reason
+    assert model.late == "f and h were compared with their expressions in 128 of 300 cells"
+    assert model.compared == before + 2 * 128
+    assert model.agrees(cells, Looks(5))
+    assert not model.late
+    found = certify_invariance(system, region, seconds=Looks(0))
+    assert found.holds is None
+    assert "compared with their expressions in 0 of 1 cells when the time was over" in str(found)
+    for looks, known in ((0, False), (1, False), (100, True)):
+        rows = RowwiseStep(system, place, np.array([[0.1]]), np.eye(1), Looks(looks)).rows
+        assert (rows is not None) == known
+    agrees = SmoothModel.agrees
+    monkeypatch.setattr(SmoothModel, "agrees", lambda *given: agrees(*given[:2], Looks(0)))
+    sampled = certify_observer(system, GAIN, region, rho=0.9)
+    assert (sampled.evidence, sampled.compared) == (Evidence.SAMPLED, 0)
+    assert "the proof was given up when its time was over: f and h were comp" in sampled.notes[0]
 
 
 def of_numbers(x):

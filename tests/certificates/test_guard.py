@@ -227,6 +227,23 @@ def test_usual_estimates_are_not_moved_and_nothing_feeds_back(bound):
     assert plain.unguarded == "the monitor has no guard"
 
 
+def test_a_guard_is_the_same_beside_the_compiled_step(bound):
+    """Of noises beyond the stated ones, which the observer follows less than the estimates."""
+    readings, moved = {}, {}
+    for engine in ("python", "compiled"):
+        mhe = estimator(bound, engine=engine, cost=qpmhe.QuadraticCost(
+            prior=1e-3 * np.eye(2), disturbance=np.eye(2), noise=1e6))
+        watch, rng = Monitor(bound, mhe, initial_error=START, guard=True, sizes=Sizes(
+            box([-1e-3, -1e-3], [1e-3, 1e-3]), box(-1e-3, 1e-3))), np.random.default_rng(5)
+        readings[engine] = [watch.check(mhe.update(rng.uniform(-0.2, 0.2, 1))) for _ in range(20)]
+        moved[engine] = [each.guarded for each in readings[engine]]
+    assert moved["python"] == moved["compiled"]
+    assert sum(map(bool, moved["python"])) > 5
+    for one, other in zip(*readings.values(), strict=True):
+        np.testing.assert_allclose(one.state, other.state, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(one.filtered, other.filtered, rtol=1e-9, atol=1e-12)
+
+
 def test_a_guard_that_was_off_stays_off(bound, monkeypatch):
     """Where no state is in the set, it is off though the observer's bound is not lost."""
     mhe = estimator(bound)
