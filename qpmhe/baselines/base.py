@@ -320,7 +320,7 @@ def follow(
         states.append(_read(f"the estimate of {name}", getattr(found, "state", found), n))
         filtered.append(_read(f"{name}.filtered", getattr(estimator, "filtered", unknown), n))
         if covariances:
-            value = estimator.newest_covariance() if is_mhe else getattr(
+            value = estimator.known_covariances()[-1] if is_mhe else getattr(
                 found, "covariance", getattr(estimator, "covariance", None))
             errors.append(_read(
                 f"the covariance of {name}", unknown * unknown[:, None] if value is None else value,

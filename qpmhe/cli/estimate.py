@@ -260,7 +260,7 @@ def _diagnose(console: Console, summary: Any, path: str, quiet: bool) -> None:
     try:
         found = diagnose(
             summary.run, labels=model.states, outputs=model.outputs, inputs=model.inputs,
-            dt=model.dt, time_unit=model.time_unit,
+            dt=model.dt,
         )
     except InvalidInputError as error:  # the estimates are written all the same
         _warn(console, f"no diagnosis: {error}")

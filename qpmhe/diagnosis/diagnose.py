@@ -156,7 +156,7 @@ def diagnose(
     dt : float, optional
         Length of a step, for the times in the text; the system's if left out, if it has one.
     time_unit : str, optional
-        Its unit; ``s`` if left out.
+        Its unit; the run's if left out.
 
     Returns
     -------
@@ -245,5 +245,5 @@ def _names(
         times *= scale
     if not (time_unit is None or isinstance(time_unit, str)):
         raise OptionError(f"time_unit is {time_unit!r}; expected a string, such as 'h'.")
-    unit = "samples" if step is None else time_unit or "s"
+    unit = "samples" if step is None else time_unit or str(source.time_unit)
     return Names(found[0], found[1], found[2], times, unit)

@@ -15,7 +15,7 @@ from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
-from .._checks import flag, numbers, positive, vector
+from .._checks import count, flag, numbers, positive, vector
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import ConvexSet
@@ -28,7 +28,7 @@ from .engines import EngineChangeError, engine_for
 from .estimate import Estimate
 from .estimator_memory import EstimatorMemory
 from .reach import compared
-from .run import Run, RunSource
+from .run import FixedLag, Run, RunSource
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require, with_scaled_constraints
 from .step_length import check_step
@@ -498,6 +498,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         inputs: ArrayLike | None = None,
         *,
         covariances: bool = False,
+        smoothed: int | None = None,
         time_unit: Any = "s",
     ) -> Run:
         """Update with each sample of a record, starting at the current state.
@@ -513,8 +514,12 @@ class MovingHorizonEstimator(EstimatorMemory):
         covariances : bool
             Whether to compute the covariance of each estimate; NaN where the model cannot
             be linearised along it.
+        smoothed : int, optional
+            A lag of 0 to N-1 samples: `Run.smoothed` then has the estimate of each x(t) that also
+            uses so many measurements after t, as a fixed-lag smoother gives it.
         time_unit : str or pandas.Timedelta
-            The model's unit of time, for an index of times: ``"s"``, ``"min"``, ``"h"``, ...
+            The model's unit of time, for an index of times and for figures: ``"s"``, ``"min"``,
+            ``"h"``, ...
 
         Returns
         -------
@@ -526,8 +531,15 @@ class MovingHorizonEstimator(EstimatorMemory):
         ShapeError, InvalidInputError
             If a shape is wrong, or the times of measurements and inputs do not match or are no
             steps of the model; the estimator stays unchanged.
+        OptionError
+            If ``smoothed`` is no lag within the window.
         """
         flag("covariances", covariances)
+        if smoothed is not None:
+            smoothed = count(
+                "smoothed", smoothed, 0, most=self.horizon - 1,
+                remedy=" A window of N samples has lags of up to N - 1.",
+            )
         ys, us, lengths, index, _ = paired_record(
             self.system, measurements, inputs, self._inputs, time_unit
         )
@@ -536,40 +548,48 @@ class MovingHorizonEstimator(EstimatorMemory):
         whole = self._with_parameters(us, len(ys))
         at_once = None
         try:
-            if not covariances and lengths is None:
+            if not covariances and smoothed is None and lengths is None:
                 at_once = self._engine.run(ys, whole)
         except EngineChangeError as change:
             self._change_engine(change)
         if at_once is not None:
-            at_once.source, at_once.index = self.run_source(ys, whole), index
+            at_once.source = self.run_source(ys, whole, time_unit=time_unit)
+            at_once.index = index
             return at_once
         start, observer_start = self.state.copy(), self.observer_state
+        late = None if smoothed is None else FixedLag(start, smoothed, covariances)
         estimates, collected = [], []
         for t, y in enumerate(ys):
             estimates.append(self.update(
                 y, None if us is None else us[t], dt=None if lengths is None else lengths[t]
             ))
-            if covariances:
-                collected.append(self.newest_covariance())
+            errors = self.known_covariances() if covariances else None
+            if errors is not None:
+                collected.append(errors[-1].copy())
+            if late is not None:
+                late.add(estimates[-1], errors)
         n = self.system.n
         blocks = np.array(collected).reshape(-1, n, n) if covariances else None
         run = Run.of(start, estimates, blocks, observer_start=observer_start)
-        run.source, run.index = self.run_source(ys, whole, lengths), index
+        if late is not None:
+            run.smoothed, run.smoothed_covariances = late.smoothed()
+        run.source, run.index = self.run_source(ys, whole, lengths, time_unit), index
         return run
 
     def run_source(
-        self, measurements: Array, inputs: Array | None, steps: Array | None = None
+        self, measurements: Array, inputs: Array | None, steps: Array | None = None,
+        time_unit: Any = "s",
     ) -> RunSource:
         """The source of a run that is assembled from single updates.
 
         Parameters
         ----------
-        measurements, inputs, steps : array
+        measurements, inputs, steps, time_unit
             As for `RunSource`.
         """
         system, cost = self._engine.usual.applied(self._engine.system, self.cost)
         return RunSource(
-            system, self.observer, cost, self.settings, measurements, inputs, steps
+            system, self.observer, cost, self.settings, measurements, inputs, steps, time_unit
         )
 
 

@@ -191,13 +191,13 @@ class EstimatorMemory:
                 solved, second, self.settings.tolerance, len(self.settings.parameters)
             )
 
-    def newest_covariance(self) -> Array:
-        """The covariance (n, n) of the last estimate's ``state``; NaN where there is none."""
+    def known_covariances(self) -> Array:
+        """The `covariances` of the last window, (K + 1, n, n); NaN where there are none."""
         try:
-            value: Array = self.covariances()[-1]
+            return self.covariances()
         except InvalidInputError:  # bad luck: the record goes on
-            value = np.full((self.system.n, self.system.n), np.nan)
-        return value
+            n = self.system.n
+            return np.full((self._engine.length + 1, n, n), np.nan)
 
     def state_dict(self) -> dict[str, Any]:
         """A snapshot of the estimator's memory: arrays by name, and one text for the rest.

@@ -47,6 +47,8 @@ class RunSource(NamedTuple):
         u, with the parameters last; None for a system without inputs.
     steps : (T,) array or None
         Step lengths; None if all are usual.
+    time_unit : str or pandas.Timedelta
+        The model's unit of time.
     """
 
     system: System
@@ -56,6 +58,41 @@ class RunSource(NamedTuple):
     measurements: Array
     inputs: Array | None
     steps: Array | None = None
+    time_unit: Any = "s"
+
+
+def deviations(covariances: Array) -> Array:
+    """Standard deviations (T, n) of covariances (T, n, n)."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
+
+
+class FixedLag:
+    """Collects x(t - lag) from the windows of successive updates, with covariances if wanted."""
+
+    def __init__(self, start: Array, lag: int, covariances: bool) -> None:
+        self._lag, self._taken = lag, 0
+        self._states: list[Array] = []
+        self._covariances: list[Array] | None = [] if covariances else None
+        self._window, self._errors = start[None], np.full((1, start.size, start.size), np.nan)
+
+    def add(self, estimate: Estimate, errors: Array | None) -> None:
+        """Take a window, and the covariances of its trajectory if they are wanted."""
+        self._window = estimate.trajectory.copy()
+        self._window[-2] = estimate.filtered
+        if errors is not None:
+            self._errors = errors
+        if self._taken >= self._lag:
+            self._states.append(self._window[-2 - self._lag])
+            if self._covariances is not None:
+                self._covariances.append(self._errors[-2 - self._lag].copy())
+        self._taken += 1
+
+    def smoothed(self) -> tuple[Array, Array | None]:
+        """The estimates of x(0), ..., x(T), the last ones from the last window; and covariances."""
+        rest, found = slice(-1 - min(self._lag, self._taken), None), self._covariances
+        states = np.array([*self._states, *self._window[rest]])
+        return states, None if found is None else np.array([*found, *self._errors[rest]])
 
 
 class Run:
@@ -83,6 +120,11 @@ class Run:
     covariances : (T, n, n) array, optional
         Covariances of the estimates of x(1), ..., x(T), if requested; NaN where the model
         could not be linearised.
+    smoothed : (T + 1, n) array, optional
+        Estimates of x(0), ..., x(T), of which x(t) uses y up to t plus the lag, or up to the end of
+        the run; if requested.
+    smoothed_covariances : (T + 1, n, n) array, optional
+        Their covariances, if both were requested.
     rejected_sensors : (T, s) bool array, optional
         Whether the gate of the observer rejected each of its s sensors; s is 0 without a gate.
     engine : str
@@ -120,6 +162,8 @@ class Run:
         flags: NDArray[np.integer[Any]],
         observer_states: Array,
         covariances: Array | None = None,
+        smoothed: Array | None = None,
+        smoothed_covariances: Array | None = None,
         rejected_sensors: NDArray[np.bool_] | None = None,
         engine: str = "python",
     ) -> None:
@@ -129,6 +173,7 @@ class Run:
         self.qps, self.solver_iterations = qps, solver_iterations
         self.flags, self.covariances, self.engine = flags, covariances, engine
         self.observer_states = observer_states
+        self.smoothed, self.smoothed_covariances = smoothed, smoothed_covariances
         if rejected_sensors is None:
             rejected_sensors = np.zeros((flags.size, 0), np.bool_)
         self.rejected_sensors = rejected_sensors
@@ -222,8 +267,9 @@ class Run:
             Indexed by the time of the state: t = 0, ..., T, or `index`. ``x1``, ``x2``, ... is the
             estimate of x(t) from the measurements before t, ``std1``, ... its standard deviations,
             if covariances were requested; ``filtered1``, ... is the estimate of x(t) that has used
-            y(t). ``J``, ``J_candidate``, ``status``, ``qps``, ``solver_iterations``, ``seconds``
-            and ``solver_seconds`` are of the update with y(t). The last row has no update yet.
+            y(t); ``smoothed1``, ... and ``smoothed_std1``, ... are those of `smoothed`. ``J``,
+            ``J_candidate``, ``status``, ``qps``, ``solver_iterations``, ``seconds`` and
+            ``solver_seconds`` are of the update with y(t). The last row has no update yet.
 
         Raises
         ------
@@ -234,9 +280,12 @@ class Run:
         with_gap = partial(np.pad, pad_width=((0, 1), (0, 0)), constant_values=np.nan)
         blocks = {"x": self.states, "filtered": with_gap(self.filtered)}
         if self.covariances is not None:
-            with np.errstate(invalid="ignore"):
-                deviations = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
-            blocks["std"] = with_gap(deviations)[np.arange(len(self) + 1) - 1]
+            found = with_gap(deviations(self.covariances))
+            blocks["std"] = found[np.arange(len(self) + 1) - 1]
+        if self.smoothed is not None:
+            blocks["smoothed"] = self.smoothed
+        if self.smoothed_covariances is not None:
+            blocks["smoothed_std"] = deviations(self.smoothed_covariances)
         columns: dict[str, Any] = {
             f"{name}{i + 1}": values[:, i]
             for name, values in blocks.items() for i in range(values.shape[1])

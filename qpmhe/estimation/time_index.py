@@ -152,7 +152,7 @@ def _filled(
     names: tuple[str, str],
 ) -> PairedRecord:
     """The record with its gaps filled, and its steps."""
-    seconds, unit = _elapsed(times), _unit(time_unit)
+    seconds, unit = _elapsed(times), unit_seconds(time_unit)
     spacings = np.diff(seconds)
     usual = system.dt
     if usual is None and spacings.size:
@@ -279,7 +279,7 @@ def _elapsed(times: Any) -> Array:
     return seconds
 
 
-def _unit(time_unit: Any) -> float:
+def unit_seconds(time_unit: Any) -> float:
     """Seconds of a unit of time."""
     pandas = sys.modules["pandas"]
     try:

@@ -41,7 +41,7 @@ def run_page(run: Run) -> str:
             times, None, {"estimate": run.states[:, :count]},
             run_labels(run)[:count], "" if run.has_costs else when, panels[:count],
         )
-        add_bands(run, times, [panel.lines[0] for panel in panels[:count]], 2.0)
+        add_bands(run.covariances, times, [panel.lines[0] for panel in panels[:count]], 2.0)
         if run.has_costs:
             costs(run, axes=panels[-1])
         data = BytesIO()

@@ -19,6 +19,7 @@ from qpmhe_solvers.values import finite, shown
 
 from .._checks import positive
 from ..errors import InvalidInputError, OptionError, ShapeError
+from ..estimation.time_index import unit_seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,22 +89,26 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
 def run_times(
     run: Run, dt: float | None, time_label: str | None
 ) -> tuple[NDArray[np.float64], str]:
-    """Times of the states of a run, and the label of their axis: seconds if steps are known.
+    """Times of the states of a run, and the label of their axis: its unit if steps are known.
 
     The days of Matplotlib where the run has dates, for `date_axis`.
     """
-    source, count = run.source, len(run)
-    index = _dates(run, dt)
+    source, index = run.source, _dates(run, dt)
+    unit = "s" if source is None else source.time_unit
     if index is not None:
         dates: Any = import_module("matplotlib.dates")
         return np.asarray(dates.date2num(index), np.float64), time_label or ""
+    if dt is None and run.index is not None:
+        elapsed: Any = run.index
+        times = elapsed.total_seconds().to_numpy(np.float64) / unit_seconds(unit)
+        return times, time_label or time_words(1.0, unit)
     if dt is None and source is not None:
         dt = source.system.dt
         if source.steps is not None:
             times = np.concatenate(([0.0], np.cumsum(source.steps)))
-            return times, time_label or time_words(1.0)
-    return (1.0 if dt is None else positive("dt", dt)) * np.arange(count + 1.0), (
-        time_label or time_words(dt)
+            return times, time_label or time_words(1.0, unit)
+    return (1.0 if dt is None else positive("dt", dt)) * np.arange(len(run) + 1.0), (
+        time_label or time_words(dt, unit)
     )
 
 
@@ -123,9 +128,9 @@ def date_axis(run: Run, dt: float | None, panel: Any) -> None:
         panel.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator, tz=index.tz))
 
 
-def time_words(dt: float | None) -> str:
+def time_words(dt: float | None, unit: Any = "s") -> str:
     """The label of an axis of times."""
-    return f"time t ({'samples' if dt is None else 's'})"
+    return f"time t ({'samples' if dt is None else unit})"
 
 
 def label_decades(axis: Any) -> None:

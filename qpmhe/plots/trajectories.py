@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, positive
+from .._checks import Array, flag, positive
 from ..errors import InvalidInputError
+from ..estimation.run import deviations
 from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
 from .style import (
     MEASURED,
@@ -87,8 +88,9 @@ def trajectories(
 
 
 def states(
-    run: Run, *, dt: float | None = None, labels: Sequence[str] | None = None,
-    time_label: str | None = None, truth: Array | None = None, sigmas: float = 2.0,
+    run: Run, *, smoothed: bool = False, dt: float | None = None,
+    labels: Sequence[str] | None = None, time_label: str | None = None,
+    truth: Array | None = None, sigmas: float = 2.0,
     band: tuple[ArrayLike, ArrayLike] | None = None, guarded: Array | None = None,
     axes: Any = None, residual: Residual | None = None,
 ) -> list[Any]:
@@ -101,10 +103,14 @@ def states(
     ----------
     run : Run
         From `MovingHorizonEstimator.run`, with ``covariances=True`` for the bands.
+    smoothed : bool
+        Whether to draw the run's smoothed estimates, with bands of their covariances, instead of
+        those from the measurements before.
     dt : float, optional
         Time between samples, in the unit of ``time_label``; the system's if left out.
     time_label : str, optional
-        Label of the time axis; seconds where the time between samples is known, else samples.
+        Label of the time axis; the run's unit of time where the time between samples is known,
+        else samples.
     labels, truth, axes, residual
         As for `trajectories`. Labels that are left out are the model's names of its states, where
         it has such: see `qpmhe.System.signals`.
@@ -120,7 +126,8 @@ def states(
     Raises
     ------
     InvalidInputError
-        If run is not a `Run`, labels are not strings, axes not Axes, or sides of the band swapped.
+        If run is not a `Run`, or has no smoothed estimates to be drawn, labels are not strings,
+        axes not Axes, or sides of the band swapped.
     ShapeError
         If labels, truth, axes, band or guarded do not fit the run's states and times.
     OptionError
@@ -129,14 +136,24 @@ def states(
     check_run(run)
     count, n = run.states.shape
     times, when = run_times(run, dt, time_label)
-    sigmas = positive("sigmas", sigmas)
-    lines = {"estimate": run.states} | ({} if guarded is None else {"guarded": guarded})
+    smoothed, sigmas = flag("smoothed", smoothed), positive("sigmas", sigmas)
+    drawn_states, covariances = run.states, run.covariances
+    if smoothed:
+        if run.smoothed is None:
+            raise InvalidInputError(
+                "the run has no smoothed estimates; call MovingHorizonEstimator.run with "
+                "smoothed=, a lag in samples."
+            )
+        drawn_states, covariances = run.smoothed, run.smoothed_covariances
+    lines = {"estimate" + ", smoothed" * smoothed: drawn_states}
+    if guarded is not None:
+        lines["guarded"] = guarded
     names = run_labels(run) if labels is None else label_list(labels, n)
     drawn = trajectories(times, truth, lines, names, when, axes, residual=residual)
     date_axis(run, dt, drawn[-1])
     middle = [panel.lines[-len(lines)] for panel in drawn]
-    add_bands(run, times, middle, sigmas)
-    measured = add_measurements(run, times, middle)
+    add_bands(covariances, times, middle, sigmas)
+    measured = add_measurements(run, times, middle, drawn_states)
     if band is not None:
         lower, upper = (
             curve(f"band[{side}]", values, count, n) for side, values in enumerate(_pair(band))
@@ -147,33 +164,34 @@ def states(
                 times, lower[:, j], upper[:, j], color=PROVED, linewidth=0.0, zorder=0.5,
                 label="holds the true state (proved)",
             )
-    if band is not None or measured or (run.covariances is not None and len(run)):
+    if band is not None or measured or covariances is not None:
         _legend(drawn, axes)
     return drawn
 
 
-def add_bands(run: Run, times: Array, lines: Sequence[Any], sigmas: float) -> None:
-    """Fill between so many standard deviations about the lines of the first states."""
-    if run.covariances is None or not len(run):
+def add_bands(
+    covariances: Array | None, times: Array, lines: Sequence[Any], sigmas: float
+) -> None:
+    """Fill between so many standard deviations about the last points of the first states' lines."""
+    if covariances is None or not len(covariances):
         return
-    with np.errstate(invalid="ignore"):
-        half = sigmas * np.sqrt(np.diagonal(run.covariances, axis1=1, axis2=2))
+    half = sigmas * deviations(covariances)
     for j, line in enumerate(lines):
         # A line of the usual width hides the band where samples stand close.
-        line.set_linewidth(max(0.5, min(1.3, _WIDE / len(run))))
-        middle = line.get_ydata()[1:]
+        line.set_linewidth(max(0.5, min(1.3, _WIDE / len(half))))
+        middle = line.get_ydata()[-len(half) :]
         line.axes.fill_between(
-            times[1:], middle - half[:, j], middle + half[:, j],
+            times[-len(half) :], middle - half[:, j], middle + half[:, j],
             color=STYLES[0]["color"], alpha=0.35, linewidth=0.0,
             label=f"± {sigmas:g} standard deviations",
         )
 
 
-def add_measurements(run: Run, times: Array, lines: Sequence[Any]) -> bool:
+def add_measurements(run: Run, times: Array, lines: Sequence[Any], drawn_states: Array) -> bool:
     """Dots of the measurements under the lines of the first states; whether there are any."""
     if run.source is None or not len(run):
         return False
-    system, y, x = run.source.system, run.source.measurements, run.states[:-1]
+    system, y, x = run.source.system, run.source.measurements, drawn_states[:-1]
     u = np.zeros((len(run), 0)) if run.source.inputs is None else run.source.inputs
     try:
         outputs = system.h.batch(x, u)

@@ -35,8 +35,10 @@ class _Kept(NamedTuple):
 class KeptRun:
     """Collects samples and estimates, with steps of any length."""
 
-    def __init__(self, estimator: MovingHorizonEstimator, steps: Steps) -> None:
-        self._estimator, self._steps = estimator, steps
+    def __init__(
+        self, estimator: MovingHorizonEstimator, steps: Steps, time_unit: str
+    ) -> None:
+        self._estimator, self._steps, self._time_unit = estimator, steps, time_unit
         self._start, self._observer_start = estimator.state.copy(), estimator.observer_state.copy()
         self._estimates: list[Any] = []
         self._y: list[Array] = []
@@ -66,5 +68,5 @@ class KeptRun:
             steps = np.array([usual if one is None else one for one in self._lengths])
         inputs = np.array(self._u).reshape(len(run), system.m) if system.m else None
         y = np.array(self._y).reshape(len(run), system.p)
-        run.source = self._estimator.run_source(y, inputs, steps)
+        run.source = self._estimator.run_source(y, inputs, steps, self._time_unit)
         return run

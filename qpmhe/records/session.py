@@ -325,7 +325,7 @@ class _Session:
         reader, output = self._reader, self._output
         samples, last = self._begin() if found is None else self._resume(found)
         if self._keep:
-            self._kept = KeptRun(self._mhe, self._steps)
+            self._kept = KeptRun(self._mhe, self._steps, self._model.time_unit)
         try:
             self._estimate(samples, last)
             if not self._taken:

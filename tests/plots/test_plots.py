@@ -140,6 +140,18 @@ def test_time_is_in_seconds_where_the_step_is_known(case, monkeypatch):
     assert plots.states(run)[-1].get_xlabel() == "time t (samples)"
 
 
+def test_time_is_in_the_unit_of_the_record():
+    pandas = pytest.importorskip("pandas")
+    y = SCENARIO.simulate(0, 12).measurements
+    assert plots.costs(estimator().run(y, time_unit="min")).get_xlabel() == "time t (min)"
+    minutes = 100.0 + SCENARIO.dt * np.arange(12)
+    table = pandas.DataFrame(y, index=pandas.to_timedelta(minutes, unit="min"))
+    panel = plots.states(estimator().run(table, time_unit="min"))[-1]
+    assert panel.get_xlabel() == "time t (min)"
+    drawn = lines(panel)["estimate"][:, 0]
+    np.testing.assert_allclose(drawn, 100.0 + SCENARIO.dt * np.arange(13), rtol=1e-9)
+
+
 def test_the_window_stands_at_its_times(case):
     _, _, estimate = case
     axes = plots.window(estimate)
