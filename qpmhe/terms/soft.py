@@ -289,6 +289,7 @@ class Softened:
         self._own: Array
         self._following: Array
         self._window: WindowPenalties
+        self._shift: Array  # by which `bend` has shifted the values
 
     def around(
         self, window: WindowPenalties, values: Array, derivatives: tuple[Array, Array]
@@ -296,6 +297,7 @@ class Softened:
         """Take the soft rows around a trajectory."""
         self._window, self.values = window, values
         self._own, self._following = derivatives
+        self._shift = np.zeros(values.shape)
 
     def at(self, step: Array) -> Array:
         """The linearised rows (K + 1, R) at a step (K + 1, n)."""
@@ -334,14 +336,15 @@ class Softened:
 
         They are tightened by a share of that, too, as hard rows are: a step that ends outside by
         the third order costs its linear penalty, which may be more than the step gains.
-        ``curvature`` (K, n + p) is what it misses of the residuals, less whole turns of angles.
+        ``curvature`` (K, n + p) is what linearised residuals miss, without earlier shifts and less
+        whole turns of angles.
         """
         shift, n = values - self.at(step), self._n
         for rows, place, _ in self._penalties.parts:
             if rows.name in ("disturbances", "noises"):
                 part = curvature[:, :n] if rows.name == "disturbances" else curvature[:, n:]
-                shift[:-1, place] = rows.values(part)
-        self.values = self.values + shift
+                shift[:-1, place] = rows.values(part) - self._shift[:-1, place]
+        self.values, self._shift = self.values + shift, self._shift + shift
         window = self._window
         margin = np.nan_to_num(BEYOND * np.abs(shift), nan=0.0, posinf=0.0)
         margin = np.where(window.upper - window.lower > 4.0 * margin, margin, 0.0)

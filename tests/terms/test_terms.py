@@ -164,3 +164,23 @@ def test_soft_rows_are_a_term():
     (rows,) = penalty.soft_rows(trial)
     np.testing.assert_array_equal(rows.values[:, 0], [0.3, -0.4, 0.1])
     assert trial.penalty == penalty.cost(trial)
+
+
+@pytest.mark.parametrize(
+    "name", ["soft disturbances and noises", "soft angles", "soft constraints"]
+)
+def test_each_correction_shifts_soft_rows_to_their_true_values(name):
+    """Also the second one, which finds the rows of the first."""
+    one = case(name)
+    mhe = one.estimator("python")
+    for sample in one.samples[:8]:
+        mhe.update(**sample)
+    problem, subproblem = mhe._engine.solved().problem, mhe._engine._tools.subproblem
+    around, generator = problem.candidate, np.random.default_rng(1)
+    qp = subproblem.at(problem, around)
+    for size in (0.3, 0.2):
+        away = size * generator.standard_normal(around.trajectory.shape)
+        trial = at(problem, around.trajectory + away)
+        subproblem.correct_rows(qp, problem, around, trial)
+        rows = subproblem._penalties.values(trial.trajectory, trial.residuals, trial.values)
+        np.testing.assert_allclose(subproblem._softened.at(away), rows, rtol=1e-12, atol=1e-12)

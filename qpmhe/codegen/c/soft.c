@@ -186,8 +186,9 @@ static void mhe_bend_soft(mhe_estimator *e, mhe_workspace *k)
         const real more = MHE_BEYOND * fabs(q->value[i] - q->shift[i]);
         if (q->high[i] - q->low[i] - 2 * q->margin[i] > 4 * more) q->margin[i] += more;
         q->shift[i] = q->value[i];
-        q->load[i] = q->margin[i];
-        q->value[i] = 0;
+        q->low[i] += q->margin[i];
+        q->high[i] -= q->margin[i];
+        q->load[i] = q->value[i] = 0;
     }
 }
 
