@@ -12,6 +12,7 @@ from .options import SolverOptions
 from .qp import QP, Array, Places, hessian_entries, rows_entries
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
+from .sparse_order import SparseOrder
 
 Index = NDArray[np.intp]
 
@@ -27,8 +28,9 @@ class BandedSolver(Solver):
 
     Otherwise it returns the minimiser without inequalities with the status UNCONSTRAINED: a valid
     trial, not the QP's solution. LAPACK's banded Cholesky factorisation (``pbsv``) takes O(K n^3)
-    time and no iterations. Equality rows are kept: the optimality conditions, ordered by stages,
-    are banded too, and solved by ``gbsv``.
+    time and no iterations; where blocks of H are sparse, `SparseOrder` makes the band narrower.
+    Equality rows are kept: the optimality conditions, ordered by stages, are banded too, and solved
+    by ``gbsv``.
     """
 
     _judges, _keeps = True, False
@@ -41,6 +43,7 @@ class BandedSolver(Solver):
         # Workspace for QPs of one size: windows keep theirs, once they are full.
         self._size = (0, 0)
         self._work: tuple[Array, Array, Array] | None = None
+        self._sparse = SparseOrder()
 
     def _solve(self, qp: QP, start: Array | None) -> Solution:
         if qp.rows and (qp.row_lower == qp.row_upper).any():
@@ -68,6 +71,13 @@ class BandedSolver(Solver):
         )
 
     def _cholesky(self, qp: QP) -> Array | None:
+        # A root is exact for powers of four alone: an odd unit of the cost goes before.
+        unit = _COST_UNITS[math.frexp(qp.band.item(0))[1] % 2]
+        found = self._sparse.band(qp, unit)
+        if found is not None:
+            band, flat = found
+            if self._solves(band, flat, band[0]):  # else rounding may have decided: see once more
+                return self._sparse.step(flat).reshape(qp.stages, qp.n)
         work = self._work
         if work is None or self._size != (qp.stages, qp.n):
             band, step = np.empty((qp.stages, qp.n, 2 * qp.n)), np.empty((qp.stages, qp.n))
@@ -75,17 +85,18 @@ class BandedSolver(Solver):
             work = band, band.reshape(qp.size, 2 * qp.n).T, step
             self._work, self._size = work, (qp.stages, qp.n)
         band, lapack_band, step = work
-        # A root is exact for powers of four alone: an odd unit of the cost goes before.
-        unit = _COST_UNITS[math.frexp(qp.band.item(0))[1] % 2]
         np.multiply(qp.band, unit, out=band)
         np.multiply(qp.gradient, -unit, out=step)
-        flat = step.reshape(qp.size)
-        _, _, info = self._dpbsv(lapack_band, flat, lower=1, overwrite_ab=1, overwrite_b=1)
-        finite = math.isfinite(flat.dot(flat))
-        if finite and np.count_nonzero(flat) < flat.size:
+        return step if self._solves(lapack_band, step.reshape(qp.size), band[:, :, 0]) else None
+
+    def _solves(self, band: Array, side: Array, diagonal: Array) -> bool:
+        """Solve in place, ``band`` in LAPACK's layout; whether the solution is to be believed."""
+        _, _, info = self._dpbsv(band, side, lower=1, overwrite_ab=1, overwrite_b=1)
+        finite = math.isfinite(side.dot(side))
+        if finite and np.count_nonzero(side) < side.size:
             # An infinite pivot turns its unknown into 0 and would pass: look at the factor.
-            finite = math.isfinite(np.add.reduce(band[:, :, 0], axis=None))
-        return step if info == 0 and finite else None
+            finite = math.isfinite(np.add.reduce(diagonal, axis=None))
+        return info == 0 and finite
 
     def _with_equalities(self, qp: QP) -> tuple[Array | None, Array]:
         """Minimiser (K, n) and multipliers (K rows,) subject to the equality rows alone."""
