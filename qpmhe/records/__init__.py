@@ -3,9 +3,11 @@
 from .checkpoints import CheckpointError, WriteError
 from .frame import read
 from .latency import Latency
+from .readers import ReadingOptions
 from .session import Summary, estimate_record
 from .tables import RecordError
 
 __all__ = [
-    "CheckpointError", "Latency", "RecordError", "Summary", "WriteError", "estimate_record", "read",
+    "CheckpointError", "Latency", "ReadingOptions", "RecordError", "Summary", "WriteError",
+    "estimate_record", "read",
 ]

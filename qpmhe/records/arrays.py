@@ -11,6 +11,7 @@ import numpy as np
 from .._checks import Array
 from ..estimation.steps import Steps
 from .measurements import ColumnNames, Measurement, RecordReader, seconds_between
+from .readers import ReadingOptions
 from .record_model import RecordModel
 
 
@@ -32,30 +33,31 @@ def read_record(
     path: str, model: RecordModel, *, time: str | None = None, outputs: str | None = None,
     inputs: str | None = None, truth: str | None = None, dt: float | None = None,
     time_scale: float = 1.0, max_gap: int | None = None,
-    report: Callable[[str], None] | None = None, **table: Any,
+    report: Callable[[str], None] | None = None, **options: Any,
 ) -> RecordArrays:
     """Read a record of a model; the options are those of ``qpmhe estimate``, and ``truth``.
 
     What the user should know of its steps goes to `report`.
     """
+    reading = ReadingOptions(**options)
     system, usual = model.estimator.system, model.dt if dt is None else dt
     columns = ColumnNames(model.outputs, model.inputs, time, outputs, inputs)
     make_steps = partial(Steps, system, usual=usual, scale=time_scale, max_gap=max_gap)
     steps = make_steps()
-    found, notes = _read(path, columns, steps, table)
+    found, notes = _read(path, columns, steps, reading)
     if report is not None:
         for note in [*notes, *([f"{path}: {steps.note}"] if steps.note else [])]:
             report(note)
     if truth is None:
         return found
     columns = ColumnNames(model.states, (), time, truth, option="truth")
-    return found._replace(states=_read(path, columns, make_steps(), table)[0].measurements)
+    return found._replace(states=_read(path, columns, make_steps(), reading)[0].measurements)
 
 
 def _read(
-    path: str, columns: ColumnNames, steps: Steps, table: dict[str, Any]
+    path: str, columns: ColumnNames, steps: Steps, reading: ReadingOptions
 ) -> tuple[RecordArrays, list[str]]:
-    reader = RecordReader(path, columns, **table)
+    reader = RecordReader(path, columns, reading)
     ys: list[Array] = []
     us: list[Array] = []
     lengths: list[float | None] = []

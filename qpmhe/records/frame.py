@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._checks import need, positive
 from .measurements import Columns, FieldReader, Header, RecordReader, Time, unit_of
+from .readers import ReadingOptions
 from .tables import RecordError, Table
 
 if TYPE_CHECKING:
@@ -16,10 +17,7 @@ if TYPE_CHECKING:
 
 def read(
     path: str | Path, columns: Sequence[str] | None = None, *, time: str | None = None,
-    time_scale: float = 1.0, same_time: float | None = None, log_time: bool = False,
-    separator: str | None = None, decimal: str = "auto", encoding: str = "utf-8",
-    missing: Sequence[str] = (), skip_lines: int = 0, skip_repeated: bool = False,
-    time_format: str | None = None,
+    time_scale: float = 1.0, **options: Any,
 ) -> DataFrame:
     """Read a file of measurements of any kind that qpmhe knows.
 
@@ -51,15 +49,8 @@ def read(
         Column or variable of the time, if it has no usual name.
     time_scale : float
         Seconds in the file's unit of time, for times that are numbers.
-    same_time : float, optional
-        Times of several channels that differ by at most this belong to one sample, which has
-        the earliest of them; in s, or the file's unit. By default 1e-6 of the shortest mean step:
-        only times that differ by rounding are equal.
-    log_time : bool
-        Of ROS bags, take the times of the log instead of ``header.stamp``. Messages without a
-        stamp, or a zero one, have the log's in any case.
-    separator, decimal, encoding, missing, skip_lines, skip_repeated, time_format
-        As for `qpmhe.records.estimate_record`.
+    **options
+        As for `qpmhe.records.ReadingOptions`.
 
     Returns
     -------
@@ -79,12 +70,9 @@ def read(
     pandas = need("pandas", "a data frame")
     wanted = _Wanted(None if columns is None else tuple(columns), time)
     positive("time_scale", time_scale)
-    reader = RecordReader(
-        str(path), wanted, separator=separator, encoding=encoding, decimal=decimal,
-        missing=(missing,) if isinstance(missing, str) else missing, skip_repeated=skip_repeated,
-        skip_lines=skip_lines, time_format=time_format, same_time=same_time, log_time=log_time,
-    )
-    fields = FieldReader(decimal, missing)
+    reading = ReadingOptions(**options)
+    reader = RecordReader(str(path), wanted, reading)
+    fields = FieldReader(reading.decimal, reading.missing)
     try:
         found = [_Column(fields) for _ in wanted.names]
         times: list[Time] = []

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from .._checks import Array, count
+from .._checks import Array
 from ..errors import InvalidInputError, OptionError
-from .readers import open_table
+from .readers import ReadingOptions, open_table
 from .tables import TIMES, RecordError, Table, TableRow
 
 # Units with which a column called "t" is the time, and no temperature.
@@ -65,20 +65,14 @@ class RecordReader:
     """
 
     def __init__(
-        self, path: str, names: ColumnFinder, *, separator: str | None = None,
-        encoding: str = "utf-8", decimal: str = "auto", missing: Sequence[str] = (),
-        skip_repeated: bool = False, skip_lines: int = 0, time_format: str | None = None,
-        same_time: float | None = None, log_time: bool = False, format: str = "auto",  # noqa: A002 - as the option
+        self, path: str, names: ColumnFinder, reading: ReadingOptions
     ) -> None:
         self.is_stream = path == "-"
         self.held = self.repeated = self.blank = 0
         self.cut: int | None = None
-        self._skip_repeated = skip_repeated
-        self._reader = FieldReader(decimal, missing, time_format)
-        self._table = table = open_table(
-            path, separator, encoding, count("--skip-lines", skip_lines, 0), time=names.time,
-            same_time=same_time, log_time=log_time, kind=format,
-        )
+        self._skip_repeated = reading.skip_repeated
+        self._reader = FieldReader(reading.decimal, reading.missing, reading.time_format)
+        self._table = table = open_table(path, names.time, reading)
         self.name, self.total = table.name, table.total
         try:
             columns = names.find(table)

@@ -8,11 +8,14 @@ import io
 import os
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from .._checks import choice, positive
+from qpmhe_solvers.errors import report_unknown_options
+
+from .._checks import choice, count, positive
 from ..errors import OptionError
 from .channels import Channels, ChannelTable
 from .formats import read_bag, read_hdf5, read_mat, read_mdf
@@ -47,29 +50,76 @@ _UNREADABLE = {
 }
 
 
-def open_table(
-    record: str, separator: str | None = None, encoding: str = "utf-8", skip_lines: int = 0, *,
-    time: str | None = None, same_time: float | None = None, log_time: bool = False,
-    kind: str = "auto",
-) -> Table:
-    """Open a record, a file or ``-`` for standard input; its name or first bytes show its kind.
+@report_unknown_options
+@dataclass(frozen=True, kw_only=True)
+class ReadingOptions:
+    """How a record is read, where it does not show this itself.
 
-    On standard input, `kind` says whether JSON lines are expected.
+    Parameters
+    ----------
+    separator, decimal, encoding : str, optional
+        How a CSV file is written.
+    missing : str or sequence of str
+        Words (or numbers) that stand for a missing value, besides the usual ones.
+    skip_lines : int
+        Lines of a CSV file above its header.
+    skip_repeated : bool
+        Whether to skip lines whose time repeats the line before.
+    time_format : str, optional
+        Form of the dates, as for `datetime.datetime.strptime`; if left out, ISO dates, and those
+        with dots and the day first.
+    same_time : float, optional
+        Times of several channels that differ by at most this belong to one sample, which has
+        the earliest of them; in s, or the file's unit. By default 1e-6 of the shortest mean step:
+        only times that differ by rounding are equal.
+    log_time : bool
+        Of ROS bags, take the times of the log instead of ``header.stamp``. Messages without a
+        stamp, or a zero one, have the log's in any case.
+    format : {"auto", "csv", "jsonl"}
+        Lines on standard input: CSV, or a JSON object each. In JSON, a column that is named may be
+        missing in any line, the first one included; it is missing there.
     """
-    choice("--format", kind, FORMATS)
-    if same_time is not None:
-        positive("--same-time", same_time)
+
+    separator: str | None = None
+    decimal: str = "auto"
+    encoding: str = "utf-8"
+    missing: Sequence[str] = ()
+    skip_lines: int = 0
+    skip_repeated: bool = False
+    time_format: str | None = None
+    same_time: float | None = None
+    log_time: bool = False
+    format: str = "auto"
+
+    def __post_init__(self) -> None:
+        choice("--format", self.format, FORMATS)
+        count("--skip-lines", self.skip_lines, 0)
+        if self.same_time is not None:
+            positive("--same-time", self.same_time)
+        if isinstance(self.missing, str):
+            object.__setattr__(self, "missing", (self.missing,))
+
+    @classmethod
+    def taken_from(cls, options: dict[str, Any]) -> Self:
+        """Take these options out of others."""
+        names = [one.name for one in fields(cls) if one.name in options]
+        return cls(**{name: options.pop(name) for name in names})
+
+
+def open_table(record: str, time: str | None, reading: ReadingOptions) -> Table:
+    """Open a record, a file or ``-`` for standard input; its name or first bytes show its kind."""
+    separator, encoding, skip_lines = reading.separator, reading.encoding, reading.skip_lines
     piped = record == "-"
     name = "standard input" if piped else record
     if piped and sys.stdin is None:
         raise RecordError("it is closed; pipe a record into it, or name a file.", name)
     ending = "folder" if is_bag(record) else Path(record).suffix.lower()
     reader, option = READERS.get(ending, (None, None))
-    options = {option: time if option == "time" else log_time} if option else {}
+    options = {option: time if option == "time" else reading.log_time} if option else {}
     with contextlib.ExitStack() as opened:
         try:
             if reader is not None and ending == "folder":
-                return ChannelTable(name, reader(record, **options), same_time)
+                return ChannelTable(name, reader(record, **options), reading.same_time)
             stream: Any = sys.stdin.buffer if piped else opened.enter_context(open(record, "rb"))
             if not hasattr(stream, "peek"):
                 stream = io.BufferedReader(stream)
@@ -88,14 +138,14 @@ def open_table(
                 )
             if reader is None:
                 return ParquetTable(name)
-            return ChannelTable(name, reader(record, **options), same_time)
+            return ChannelTable(name, reader(record, **options), reading.same_time)
         for magic, remedy in _UNREADABLE.items():
             if head.startswith(magic):
                 raise RecordError(remedy, name)
         if head.startswith(_GZIP):
             stream, total = gzip.GzipFile(fileobj=stream), None
         table: LineTable
-        if is_json(record, kind):
+        if is_json(record, reading.format):
             table = JsonTable(stream, name, encoding, total, skip_lines)
         else:
             table = CsvTable(stream, name, separator, encoding, total, skip_lines)

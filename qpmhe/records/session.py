@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -26,6 +26,7 @@ from .kept_run import KeptRun
 from .latency import Latency
 from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
 from .output import Output, RowFormat, standard_output_for_rows
+from .readers import ReadingOptions
 from .record_model import RecordModel, load_record_model
 from .tables import RecordError
 
@@ -96,20 +97,10 @@ def estimate_record(
     time: str | None = None,
     outputs: str | None = None,
     inputs: str | None = None,
-    separator: str | None = None,
-    decimal: str = "auto",
-    encoding: str = "utf-8",
-    missing: Sequence[str] = (),
-    skip_lines: int = 0,
-    time_format: str | None = None,
     dt: float | None = None,
     time_scale: float = 1.0,
     equal_steps: bool = False,
     max_gap: int | None = None,
-    skip_repeated: bool = False,
-    same_time: float | None = None,
-    log_time: bool = False,
-    format: str = "auto",  # noqa: A002 - as the option
     latency: Latency | None = None,
     covariances: str = "none",
     step_time: bool = True,
@@ -140,25 +131,10 @@ def estimate_record(
     time, outputs, inputs : str, optional
         Columns of the time, numbers or ISO dates (whose differences count in seconds), and of y
         and u, as ``y1=column,y2=column``, or columns in order.
-    separator, decimal, encoding : str, optional
-        How a CSV file is written, where the file does not show it.
-    missing : sequence of str
-        Words (or numbers) that stand for a missing value, besides the usual ones.
-    skip_lines : int
-        Lines of a CSV file above its header.
-    time_format : str, optional
-        Form of the dates, as for `datetime.datetime.strptime`; if left out, ISO dates, and those
-        with dots and the day first.
     dt, time_scale : float, optional
         Usual step of a discrete-time model, in its unit of time; the record's unit in the model's.
-    equal_steps, skip_repeated : bool
-        Whether steps must be equal even if the model takes any; whether to skip lines whose time
-        repeats the line before.
-    same_time, log_time : float, bool
-        As for `qpmhe.records.read`, where channels have clocks of their own.
-    format : {"auto", "csv", "jsonl"}
-        Lines on standard input and output: CSV, or a JSON object each. In JSON, a column that is
-        named may be missing in any line, the first one included; it is missing there.
+    equal_steps : bool
+        Whether steps must be equal even if the model takes any.
     latency : Latency, optional
         Counts the times from a line in to its line out, on the way.
     max_gap : int, optional
@@ -182,7 +158,8 @@ def estimate_record(
         Called after each sample with the bytes (or rows) read and their total, if it is known;
         called with a text when the model fails for the first time.
     **options
-        Options of `qpmhe.MovingHorizonEstimator` that replace the model's own.
+        As for `qpmhe.records.ReadingOptions`, of which ``format`` is that of standard output as
+        well; and options of `qpmhe.MovingHorizonEstimator` that replace the model's own.
 
     Returns
     -------
@@ -199,7 +176,8 @@ def estimate_record(
     InvalidInputError
         If model, options or files do not fit, or a file exists already.
     """
-    output = Output(out, format)
+    reading = ReadingOptions.taken_from(options)
+    output = Output(out, reading.format)
     _check_files(str(record), output)
     found = _found(output, resume, overwrite)
     every = found.every if found is not None else _EVERY
@@ -219,10 +197,7 @@ def estimate_record(
         rows = RowFormat(loaded.states, covariances, step_time, bounds)
         reader = RecordReader(
             str(record), ColumnNames(loaded.outputs, loaded.inputs, time, outputs, inputs),
-            separator=separator, decimal=decimal, encoding=encoding, skip_repeated=skip_repeated,
-            missing=(missing,) if isinstance(missing, str) else missing, skip_lines=skip_lines,
-            time_format=time_format, same_time=same_time, log_time=log_time,
-            format=format,
+            reading,
         )
         stack.callback(reader.close)
         identity = plain(loaded.identity | {

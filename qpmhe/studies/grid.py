@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
@@ -28,6 +28,7 @@ from ..errors import BackendError, InvalidInputError, ModelError, OptionError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..models.loading import ModelSource, check_named_in_file, find
 from ..observers import Observer
+from ..records.readers import ReadingOptions
 from .experiment import Source, experiment, made
 from .row import OBSERVER, USUAL_OBSERVER, Cell
 
@@ -41,9 +42,8 @@ Start = Literal["candidate", "best"]
 WORDS = {"qps": "none", "solver_iterations": "none", "horizons": "default"}
 #: How a record is read: the options and their defaults.
 READING = {
-    **dict.fromkeys(("time", "outputs", "inputs", "truth", "dt", "separator", "time_format")),
-    "time_scale": 1.0, "decimal": "auto", "encoding": "utf-8", "missing": (),
-    "skip_repeated": False, "skip_lines": 0, "same_time": None, "log_time": False,
+    **dict.fromkeys(("time", "outputs", "inputs", "truth", "dt")), "time_scale": 1.0,
+    **asdict(ReadingOptions()),
 }
 
 
@@ -93,9 +93,7 @@ class Study:
         true states are known.
     reading : mapping
         How records are read: ``time``, ``outputs``, ``inputs``, ``truth`` (columns), ``dt``,
-        ``time_scale``, ``separator``, ``decimal``, ``encoding``, ``missing``, ``skip_repeated``,
-        ``skip_lines``, ``time_format``, ``same_time`` and ``log_time``, as the options of
-        ``qpmhe estimate``.
+        ``time_scale``, and those of `qpmhe.records.ReadingOptions`.
     backends : sequence of str, optional
         QP backends; by default all that are installed, without the forms ``qpsolvers:...``.
     observers : sequence of str

@@ -1,6 +1,7 @@
 """Files with channels: each against its library's own reading, and what is wrong with one."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from qpmhe.records.channels import merged
 from qpmhe.records.record_model import load_record_model
 
 from .oscillator import DT, lines
-from .tools import CONTINUOUS, DISCRETE, command, estimate, get, put
+from .tools import CONTINUOUS, DISCRETE, estimate, get, killed, put
 
 pd = pytest.importorskip("pandas")
 
@@ -296,10 +297,6 @@ def test_estimates_of_two_clocks_are_those_of_the_merged_rows(here):
                for note in summary.notes)
 
 
-class Killed(BaseException):
-    pass
-
-
 def same_record(here):
     """One record of the continuous model in four kinds of files, and the columns where needed."""
     put("lines.csv", lines(50, irregular=False, gaps=0.0))
@@ -332,23 +329,29 @@ def test_every_kind_is_the_same_record(here):
     assert [cell.steps for cell in study.cells()] == [50]
 
 
-@pytest.mark.parametrize("name", ["record.mf4", "run"])
-def test_a_killed_run_resumes_byte_for_byte(here, name):
-    chosen = same_record(here)[name]
-
-    def stop(done, total):
-        if done == 37:
-            raise Killed
-
+@pytest.mark.slow
+@pytest.mark.parametrize("out", ["out.csv", "out.jsonl", "out.parquet"])
+@pytest.mark.parametrize(
+    "name", ["record.csv", "record.jsonl", "record.parquet", "record.mf4", "record.h5", "run"]
+)
+def test_killed_runs_resume_byte_for_byte(here, name, out):
+    """SIGKILL at a random row, and while a checkpoint, or the Parquet file, takes its place."""
+    chosen = same_record(here).get(name, {})
+    table = pd.read_csv("record.csv")
+    table.to_parquet("record.parquet")
+    put("record.jsonl", table.to_json(orient="records", lines=True, double_precision=15).split())
     options = {"checkpoint_every": 10, **chosen}
-    with pytest.raises(Killed):
-        estimate(CONTINUOUS, name, progress=stop, checkpoint_seconds=0.0, **options)
-    assert estimate(CONTINUOUS, name, resume=True, **options).before == 30
-    words = [f"--{key}={one}" for key, one in chosen.items()]
-    answer = command(CONTINUOUS, name, "--out", "whole.csv", "--no-step-time",
-                     "--checkpoint-every", "10", *words)
-    assert answer.exit_code == 0
-    assert get("out.csv") == get("whole.csv")
+    estimate(CONTINUOUS, name, f"whole-{out}", **options)
+    generator = np.random.default_rng(len(name + out))
+    options["checkpoint_seconds"] = 0.0
+    kills = [("row", generator.integers(12, 25)), ("replace", generator.integers(1, 3)),
+             ("row", generator.integers(1, 9))]
+    for place, number in [*kills, ("replace", 3)] if out == "out.parquet" else kills:
+        assert killed(CONTINUOUS, name, out, place, int(number), **options) == -signal.SIGKILL
+    done = estimate(CONTINUOUS, name, out, resume=True, **options)
+    assert done.before + done.samples == 50
+    assert done.before >= 10
+    assert get(out) == get(f"whole-{out}")
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 from qpmhe.records import CheckpointError, RecordError
 from qpmhe.records.checkpoints import load, save
 
-from .oscillator import lines
+from .oscillator import as_json, lines
 from .tools import (
     CONTINUOUS,
     DISCRETE,
@@ -36,30 +36,33 @@ def resume(record="record.csv", model=CONTINUOUS, **options):
     return estimate(model, record, resume=True, **OPTIONS | options)
 
 
-def whole(text, model=CONTINUOUS, **options):
+def whole(text, model=CONTINUOUS, kind="csv", **options):
     """The results without an interruption."""
-    put("record.csv", text)
-    estimate(model, out="whole.csv", overwrite=True, **OPTIONS | options)
-    return get("whole.csv")
+    put(f"record.{kind}", text)
+    estimate(model, f"record.{kind}", f"whole.{kind}", overwrite=True, **OPTIONS | options)
+    return get(f"whole.{kind}")
 
 
 @pytest.mark.slow
-def test_killed_at_random_moments(here):
-    text = lines(500)
-    expected = whole(text)
+@pytest.mark.parametrize("kind", ["csv", "jsonl"])
+def test_killed_at_random_moments(here, kind):
+    text, out, more = lines(500), f"out.{kind}", {}
+    if kind == "jsonl":
+        text, more = as_json(text), {"outputs": "y1=y"}
+    expected = whole(text, kind=kind, **more)
     generator, known = np.random.default_rng(5), [0]
     for target in (120, 300):
-        running = start(CONTINUOUS, "out.csv", resume=True, **OPTIONS)
-        talk(running, *text[:451], until=target)
+        running = start(CONTINUOUS, out, resume=True, format=kind, **OPTIONS, **more)
+        talk(running, *text[:451], until=target, out=out)
         time.sleep(generator.uniform(0.0, 0.05))
         running.kill()
         running.communicate()
         # All that stands there is whole rows, and those of the uninterrupted run.
-        assert get("out.csv").endswith(b"\n")
-        assert expected.startswith(get("out.csv"))
-        known.append(load(CHECKPOINT).samples)
-    summary = resume()
-    assert get("out.csv") == expected
+        assert get(out).endswith(b"\n")
+        assert expected.startswith(get(out))
+        known.append(load(Path(f"{out}.checkpoint")).samples)
+    summary = resume(f"record.{kind}", out=out, **more)
+    assert get(out) == expected
     assert (summary.before, summary.samples) == (known[2], 500 - known[2])
     assert 0 < known[1] <= known[2] < 500
 

@@ -11,20 +11,8 @@ import pytest
 from qpmhe.errors import OptionError
 from qpmhe.records import Latency, RecordError
 
-from .oscillator import lines
+from .oscillator import as_json, lines
 from .tools import CONTINUOUS, DISCRETE, STEPS, command, estimate, finish, get, put, start, talk
-
-
-def as_json(text):
-    """CSV lines as JSON lines, with blanks left out or null."""
-    names = text[0].split(",")
-    found = []
-    for k, line in enumerate(text[1:]):
-        pairs = dict(zip(names, line.split(","), strict=True))
-        kept = {name: one or None for name, one in pairs.items() if one or k % 2}
-        found.append("{" + ", ".join(
-            f'"{name}": {"null" if one is None else one}' for name, one in kept.items()) + "}")
-    return found
 
 
 def test_json_lines_are_the_record_and_the_rows_of_csv(here):

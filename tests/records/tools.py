@@ -76,11 +76,41 @@ def start(model, out, **options):
     )
 
 
-def talk(running, *text, until=0):
+_KILLED = """
+import os, signal, sys
+from qpmhe.records import estimate_record
+
+place, number, model, record, out, options = sys.argv[1:]
+left, replace = int(number), os.replace
+
+def step(*paths):
+    global left
+    left -= 1
+    if not left:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if place == "replace":
+        replace(*paths)
+
+if place == "replace":
+    os.replace = step
+estimate_record(model, record, out, resume=True, step_time=False, **eval(options),
+                progress=step if place == "row" else None)
+"""
+
+
+def killed(model, record, out, place, number, **options):
+    """The exit code of a process that kills itself at a row, or as a file takes its place."""
+    words = [place, str(number), model, record, out, repr(options)]
+    return subprocess.run(
+        [sys.executable, "-c", _KILLED, *words], capture_output=True, check=False, timeout=120
+    ).returncode
+
+
+def talk(running, *text, until=0, out="out.csv"):
     """Without closing its input, wait for a number of lines in its results."""
     running.stdin.write("\n".join([*text, ""]).encode())
     running.stdin.flush()
-    while running.poll() is None and rows() < until:
+    while running.poll() is None and rows(out) < until:
         time.sleep(0.01)
 
 
