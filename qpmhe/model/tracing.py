@@ -21,6 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from qpmhe_solvers.values import shown
+
 from .operations import ExpressionRecord
 from .points import ALL
 from .points import arguments as arguments_at
@@ -269,10 +271,10 @@ def difference(
                 spread = np.inf if other is None else np.abs(other - theirs)
                 if (gap <= _ROUNDING * np.abs(theirs) + _WEIGHT * np.nan_to_num(spread)).all():
                     continue
-        result = "an error" if theirs is None else str(theirs.tolist())
+        result = "an error" if theirs is None else shown(theirs.tolist())
         return (
             f"it returns {result} at {_shown(arguments)}, but the same expression of symbols is "
-            f"{mine.tolist()}: it depends on more than its arguments, or on their types"
+            f"{shown(mine.tolist())}: it depends on more than its arguments, or on their types"
         )
     return ""
 
@@ -285,7 +287,7 @@ def unmasked(value: Any) -> Any:
 
 
 def _shown(arguments: Sequence[Array]) -> str:
-    return ", ".join(str(one.tolist()) for one in arguments if one.size)
+    return ", ".join(shown(one.tolist()) for one in arguments if one.size)
 
 
 def _called(function: Callable[..., Any], arguments: Sequence[Array]) -> Array | None:
