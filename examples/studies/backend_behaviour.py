@@ -32,7 +32,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "backends-behaviour.md"
 SECONDS = 300.0
 #: Solvers that qpsolvers knows and qpmhe has no backend for, with their packages.
 OTHERS = {
-    "kvxopt": "kvxopt", "pyqpmad": "pyqpmad", "qpax": "qpax",
+    "jaxopt_osqp": "jaxopt", "kvxopt": "kvxopt", "pyqpmad": "pyqpmad", "qpax": "qpax",
     "qtqp": "qtqp", "sip": "sip-qp-python",
 }
 #: Problems of one kind that are counted.
