@@ -45,6 +45,9 @@ _ROUNDING, _ACCURACY = 16.0 * float(np.finfo(np.float64).eps), 2.0**20
 # Most Newton steps on the optimality conditions: each may change which rows are active.
 _NEWTON_STEPS = 10
 
+# Most solves of each for the forces of its rows.
+_ROUNDS = 5
+
 # Curvature that a slack has at least, as a share of its linear penalty per scale of its row. It
 # holds the slack near its present value, so that it vanishes where the sequence converges.
 _CURVATURE = 1e-2
@@ -490,22 +493,25 @@ class Softened:
             solved = active & ~pushed
             forces = np.where(pushed, most, 0.0)
             step = free - moved[:, pushed] @ most[pushed]
-            if solved.any():
-                bent = np.where(violated, soft, 0.0)
-                missed = (rows[solved] @ step - sides[solved]) + (bent * most)[solved]
-                reaction = rows[solved] @ moved[:, solved] + np.diag(bent[solved])
-                forces[solved] = _least_squares(reaction, missed)
-                step = step - moved[:, solved] @ forces[solved]
+            held_back, moves = rows[solved], moved[:, solved]
+            bent, beyond = np.where(violated, (soft, most), 0.0)[:, solved]
+            reaction = held_back @ moves + np.diag(bent)
+            for _ in range(_ROUNDS):  # after the first, for the rounding of the one before
+                # Solved rows are met, or missed by what their force says.
+                off = held_back @ step - sides[solved] - bent * (forces[solved] - beyond)
+                # The step is a difference of these, and may vanish.
+                terms = np.abs(free) + np.abs(step)
+                rounding = _ROUNDING * (magnitudes @ terms + np.abs(sides))
+                if (np.abs(off) <= rounding[solved]).all():
+                    break
+                change = _least_squares(reaction, off)
+                forces[solved] += change
+                step = step - moves @ change
             if not (np.isfinite(step).all() and np.isfinite(forces).all()):
                 return None
-            gap = rows @ step - sides
-            # The step is a difference of these, and may vanish.
-            terms = np.abs(free) + np.abs(step)
-            rounding = _ROUNDING * (magnitudes @ terms + np.abs(sides))
-            # Solved rows are met, or missed by what their force says.
-            off = gap - np.where(violated, soft * (forces - most), 0.0)
-            if (np.abs(off) > _ACCURACY * rounding)[solved].any():
+            if (np.abs(off) > _ACCURACY * rounding[solved]).any():
                 return None
+            gap = rows @ step - sides
             gap[solved | (np.abs(gap) <= rounding)] = 0.0
         return None
 

@@ -184,6 +184,7 @@ def test_estimators_of_the_campaign_have_no_faults(engine, seed):
 # Estimators in which the engines have differed, and samples that show it.
 MENDED = {
     21000036: 48,  # second corrections of soft rows
+    12000043: 40,  # soft rows beside hard ones and a vague prior
 }
 
 

@@ -8,6 +8,7 @@ import pytest
 import qpmhe
 from qpmhe.terms.base import Derivatives, QuadraticModel
 from qpmhe.terms.linearization import Span, StageTerms
+from qpmhe.terms.soft import Softened
 from qpmhe.terms.sum import weight_of_first
 from qpmhe_solvers import QP
 from qpmhe_solvers.qp import band_of
@@ -184,3 +185,27 @@ def test_each_correction_shifts_soft_rows_to_their_true_values(name):
         subproblem.correct_rows(qp, problem, around, trial)
         rows = subproblem._penalties.values(trial.trajectory, trial.residuals, trial.values)
         np.testing.assert_allclose(subproblem._softened.at(away), rows, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [
+    "soft states, hard noises", "soft noises, hard states", "constraints and soft sets",
+    "soft states, narrow noises",
+])
+def test_soft_rows_are_solved_exactly_beside_active_hard_ones(monkeypatch, name):
+    exact, beside = Softened._exact, []
+
+    def watched(self, base, d, solution):
+        found = exact(self, base, d, solution)
+        hard = solution.row_duals.reshape(base.stages, -1)[:, : base.rows]
+        active = np.abs(hard).max(initial=0.0) + np.abs(solution.bound_duals).max(initial=0.0)
+        beside.append((active > 1e-3, found is not None))
+        return found
+
+    monkeypatch.setattr(Softened, "_exact", watched)
+    one = case(name)
+    mhe = one.estimator("python")
+    for sample in one.samples:
+        mhe.update(**sample)
+    solved = [is_exact for is_active, is_exact in beside if is_active]
+    assert len(solved) > 2
+    assert all(solved)

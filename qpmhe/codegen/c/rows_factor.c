@@ -130,9 +130,17 @@ static int mhe_factorise_weighted(mhe_estimator *e, mhe_workspace *k, const real
                                   int active)
 {
     mhe_build(e, k, offset, nearest);
-    for (int j = 0; j < (e->length + 1) * NX; j++) k->diagonal[j] = k->panels[j * WIDTH + j % NX];
+    const size_t size = sizeof(real) * (size_t)((e->length + 1) * NX * WIDTH);
+    int missed = 0;
     if (active) {
-        memcpy(k->plain, k->panels, sizeof(real) * (size_t)((e->length + 1) * NX * WIDTH));
+        memcpy(k->plain, k->panels, size);
+        /* What a missed row opposes to active ones may be far more than the Hessian. */
+        missed = mhe_set_missed_weights(e, k);
+        if (missed) mhe_add_weights(e, k);
+    }
+    for (int j = 0; j < (e->length + 1) * NX; j++) k->diagonal[j] = k->panels[j * WIDTH + j % NX];
+    if (missed) memcpy(k->panels, k->plain, size);
+    if (active) {
         mhe_set_stiffness(e, k);
         mhe_add_weights(e, k);
     }

@@ -108,6 +108,16 @@ static void mhe_soften(mhe_estimator *e, mhe_workspace *k)
         if (mhe_is_violated(q, i)) q->weight[i] = q->bend[i];
 }
 
+/* These alone; whether there are any. */
+static int mhe_set_missed_weights(mhe_estimator *e, mhe_workspace *k)
+{
+    int any = 0;
+    memset(k->rows.weight, 0, sizeof k->rows.weight);
+    mhe_soften(e, k);
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) any |= k->rows.weight[i] > 0;
+    return any;
+}
+
 /* The place of a soft row that its solution asks for: between its limits, at one, or missed, one after
  * the other. Without a linear penalty no force holds it at a limit. */
 static void mhe_compare_soft(const mhe_rows *q, int i, int *next)

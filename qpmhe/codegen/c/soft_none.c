@@ -35,6 +35,12 @@ static void mhe_soften(mhe_estimator *e, mhe_workspace *k)
     (void)e; (void)k;
 }
 
+static int mhe_set_missed_weights(mhe_estimator *e, mhe_workspace *k)
+{
+    (void)e; (void)k;
+    return 0;
+}
+
 static void mhe_compare_soft(const mhe_rows *q, int i, int *next)
 {
     (void)q; (void)i; (void)next;
