@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._checks import Array
+from ..codegen.guard import GuardForm
 from ..estimation.estimator import MovingHorizonEstimator
 from ..model.sets import ConvexSet
 from ..model.system import System
@@ -29,8 +30,12 @@ from .evidence import CertificateError, Evidence
 from .observer_bound import ObserverBound, Tube
 from .sizes import OUTWARD, UNIT, Sizes, weighted_lengths
 
-# Halvings of the interval in which lambda / (1 + lambda) is.
-_HALVINGS = 50
+# Of a written guard: how many samples have bounds of their own at most, and when they end: once the
+# bounds are so close to their limits, as shares of these, and change so little.
+_MOST_SAMPLES, _CLOSE, _LITTLE = 1000, 0.01, 1e-3
+# Halvings of the interval in which 1 / (1 + lambda) is; and from how many radii on only the
+# direction of an estimate counts: rounding of a distance would be of the set's size.
+_HALVINGS, _FAR = 64, 1e6
 _EMPTY = (
     "no state was found in the set around the observer: the disturbances, the noises or the "
     "initial error were larger than stated, or the model is another one"
@@ -63,6 +68,22 @@ class Guard:
         self._states = region if system.states is None else region & system.states
         self._in_states = NearestPoint(self._states).contains
 
+    def c_form(self, sizes: Sizes, tube: Tube) -> GuardForm:
+        """Its numbers for written C, with the bounds in advance from a first one on."""
+        bound, region = self._bound, self._bound.region
+        given = sizes.disturbance, sizes.noise
+        tubes = tubes_in_advance(bound, sizes, tube, projected=False)
+        balls = tubes_in_advance(bound, sizes, tube, projected=True)
+        count = max(len(tubes), len(balls))
+        tubes, balls = (each + each[-1:] * (count - len(each)) for each in (tubes, balls))
+        initial = ", ".join(f"|e{i + 1}| <= {b:.4g}" for i, b in enumerate(tube.box))
+        return GuardForm(
+            bound.metric, self._covariance, bound.gain, bound.slopes, region.lower, region.upper,
+            region.states, self._states, bound.projects, np.array([each.radius for each in tubes]),
+            np.array([each.box for each in tubes]), np.array([each.radius for each in balls]),
+            f"{Sizes(*given)}; {initial}",
+        )
+
     def __call__(self, estimate: Array, observer: Array, tube: Tube) -> Guarded:
         """The estimate itself if it is in the set; else the nearest point that is."""
         with np.errstate(all="ignore"):  # an estimate may be so far away that its square overflows
@@ -81,18 +102,24 @@ class Guard:
         if (near.lower > near.upper).any():
             return Guarded(estimate, False, _EMPTY)
         nearest = NearestPoint(near)
-        # The least share of the way to z, lambda / (1 + lambda), of which the projection is in S.
-        found = self._moved(nearest, estimate, observer, 0.0, tube)
+        away = estimate - observer
+        largest = np.abs(away).max()
+        length = float(weighted_lengths(away / largest, self._bound.metric))
+        share = _FAR * tube.radius / largest / length
+        if share < 1.0:
+            estimate = observer + share * away
+        # The largest share of the way from z of which the projection is in S.
+        found = self._moved(nearest, estimate, observer, 1.0, tube)
         if found is not None:
             return Guarded(found, True)
-        best = self._moved(nearest, estimate, observer, 1.0, tube)
+        best = self._moved(nearest, estimate, observer, 0.0, tube)
         if best is None:
             return Guarded(estimate, False, _EMPTY)
         low, high = 0.0, 1.0
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
             found = self._moved(nearest, estimate, observer, middle, tube)
-            low, high = (middle, high) if found is None else (low, middle)
+            low, high = (low, middle) if found is None else (middle, high)
             best = best if found is None else found
         return Guarded(best, True)
 
@@ -100,7 +127,9 @@ class Guard:
         self, nearest: NearestPoint, estimate: Array, observer: Array, share: float, tube: Tube
     ) -> Array | None:
         """The projection of a point between, if it is in the set."""
-        target = estimate + share * (observer - estimate) if share < 1.0 else observer
+        target = observer + share * (estimate - observer) if 0.0 < share < 1.0 else (
+            estimate if share else observer
+        )
         found = target if nearest.contains(target) else nearest(target, self._covariance).point
         return found if self._holds(found, observer, tube) and self._in_states(found) else None
 
@@ -113,6 +142,47 @@ class Guard:
         )
         inside = (np.abs(difference) + rounding) * OUTWARD <= tube.box
         return bool(length * OUTWARD <= tube.radius and inside.all())
+
+
+def tubes_in_advance(
+    bound: ObserverBound, sizes: Sizes, tube: Tube, *, projected: bool
+) -> list[Tube]:
+    """The bounds at the first samples; the last of them holds at all later ones, too.
+
+    A step of the tube is larger for a larger one. So what a step makes no larger holds at all
+    times from where it first contains the tube.
+    """
+    given = sizes.disturbance, sizes.noise
+    entering, added = bound.entering(*given), bound.added(*given)
+
+    def after(one: Tube) -> Tube:
+        return bound.followed(one, entering, added, projected=projected)
+
+    def within(one: Tube, other: Tube) -> bool:
+        return one.radius <= other.radius and bool((one.box <= other.box).all())
+
+    def lasting(radius: float, box: Array) -> Tube:
+        """One that contains these and that a step makes no larger; by the ball, if no other."""
+        made = Tube(radius * (1.0 + _CLOSE), box * (1.0 + _CLOSE))
+        if within(after(made), made):
+            return made
+        return Tube(made.radius, bound.components(made.radius))
+
+    limit = bound.limit(*given)
+    box = bound.components(limit)
+    for _ in range(_MOST_SAMPLES):
+        box = np.minimum(box, after(Tube(limit, box)).box)
+    last, found = lasting(limit, box), [tube]
+    while len(found) < _MOST_SAMPLES:
+        tube = after(found[-1])
+        same = abs(tube.radius - found[-1].radius) <= _LITTLE * tube.radius
+        same &= bool((np.abs(tube.box - found[-1].box) <= _LITTLE * tube.box).all())
+        if same and within(found[-1], last):
+            break
+        found.append(tube)
+    if not within(found[-1], last):
+        last = lasting(max(last.radius, found[-1].radius), np.maximum(last.box, found[-1].box))
+    return [*found, last]
 
 
 def check_guarded(bound: ObserverBound, estimator: MovingHorizonEstimator, sizes: Sizes) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._checks import Array, flag, positive, vector
+from ..codegen.guard import GuardForm
 from ..errors import InvalidInputError
 from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
@@ -406,6 +407,33 @@ class Monitor:
             off = f", and is off {self.unguarded}" if self.unguarded else ""
             guard = f" The guard moved estimates at {self.moved} of {self.steps} samples{off}."
         return f"The observer's bound {held} The theorem {theorem}.{guard}"
+
+    def c_form(self, estimator: MovingHorizonEstimator) -> GuardForm:
+        """The numbers of the guard, as `qpmhe.codegen.write` takes them with ``guard=``.
+
+        Its bounds are those in advance, which begin at ``initial_error`` with the first sample.
+
+        Raises
+        ------
+        InvalidInputError
+            If it has no guard, or has seen samples.
+        CertificateError, MismatchError
+            If nothing is proved for a guard of this estimator.
+        """
+        if self._guard is None or self.unguarded or self.steps or self._time:
+            why = self.unguarded or "it has seen samples, and a written guard begins with the first"
+            raise InvalidInputError(
+                f"guard is a Monitor that cannot be written: {why}. Make one with guard=True of "
+                "the estimator before its first measurement."
+            )
+        changed = self.bound.stability.difference(estimator.system)
+        if changed:
+            raise MismatchError(f"the guard is of another system than the estimator's: {changed}.")
+        bound = self.bound.of_observer(
+            estimator.observer, estimator.system, estimator.settings.projection_metric
+        )
+        check_guarded(bound, estimator, self.sizes)
+        return Guard(bound, estimator.system).c_form(self.sizes, self._tube)
 
     def state_dict(self) -> dict[str, Any]:
         """What `load_state_dict` restores of the observer's bound, as plain numbers and arrays."""

@@ -9,6 +9,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from qpmhe_solvers.values import shown
+
 from .._checks import flag
 from ..errors import InvalidInputError, OptionError
 from .ahead import Compiled, compile, engine_choice, system_of
@@ -16,6 +18,7 @@ from .needs import Needs
 
 if TYPE_CHECKING:
     from ..estimation.estimator import MovingHorizonEstimator
+    from .guard import Guarding
 
 __all__ = ["Compiled", "Needs", "Written", "compile", "engine_choice", "write"]
 
@@ -58,6 +61,7 @@ class Written(tuple[Path, ...]):
 def write(
     estimator: MovingHorizonEstimator, directory: str | PathLike[str], *, name: str = "mhe",
     real: str = "double", fmu: bool = False, compiler: str | None = None,
+    guard: Guarding | None = None,
 ) -> Written:
     """Write the estimator as a C99 header and source that need only libm.
 
@@ -92,6 +96,11 @@ def write(
         The command of a C compiler on this machine, with options; a cross-compiler for the target,
         or any other. With it, header and ``needs`` also state memory, code and stack of the source
         as this command compiles it. Only GCC tells the stack, from version 10 on.
+    guard : Monitor, optional
+        A `qpmhe.certificates.Monitor` of this estimator with ``guard=True`` that has seen no
+        sample. Its guard is written, too, as ``<name>_guard_start`` and ``<name>_guard_check``,
+        with the bounds in advance from the first sample on; an FMU's outputs state and filtered are
+        the guarded ones. Double precision only.
 
     Returns
     -------
@@ -105,10 +114,13 @@ def write(
         If something has no C form, or an option is unknown; if CasADi has no C code for the model,
         or an FMU is requested and there is no C compiler, or there is not the one that is named.
     InvalidInputError
-        If this is no estimator, or the directory cannot be written.
+        If this is no estimator, if the guard is none, or the directory cannot be written.
+    CertificateError, MismatchError
+        If nothing is proved for a guard of this estimator.
     """
     from ..estimation.estimator import MovingHorizonEstimator
     from .fmu import write_fmu
+    from .guard import guarded_files
     from .library import generated
     from .needs import measured
     from .strip import stripped
@@ -121,10 +133,22 @@ def write(
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
+    if guard is not None and not hasattr(guard, "c_form"):
+        raise InvalidInputError(
+            f"guard is {shown(guard)}; expected a qpmhe.certificates.Monitor with guard=True."
+        )
+    if guard is not None and real != "double":
+        raise OptionError(
+            f"real is {real!r}, and a guard is proved for an observer in double precision; write "
+            "it with real='double', or without a guard."
+        )
+    form = None if guard is None else guard.c_form(estimator)
     files, needs = generated(
         system_of(estimator), estimator.observer, estimator.cost, estimator.settings, name, real,
         estimator.usual,
     )
+    if form is not None:
+        files = guarded_files(files, name, form)
     files = dict(zip(files, stripped(*files.values()), strict=True))
     if compiler is not None:
         needs = replace(needs, **measured(files, name, compiler))
@@ -138,7 +162,9 @@ def write(
             (folder / file).write_text(text, encoding="ascii")
         if fmu:
             initial = estimator.initial_state
-            write_fmu(folder / f"{name}.fmu", name, files, estimator.system, initial)
+            write_fmu(
+                folder / f"{name}.fmu", name, files, estimator.system, initial, form is not None
+            )
     except (OSError, TypeError, ValueError) as error:
         raise InvalidInputError(
             f"directory is {directory!r}, which cannot be written ({error})."

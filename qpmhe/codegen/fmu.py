@@ -23,10 +23,29 @@ _FOLDERS = {"Linux": "linux", "Windows": "win", "Darwin": "darwin"}
 _SUFFIXES = {"Linux": ".so", "Windows": ".dll", "Darwin": ".dylib"}
 # So that equal estimators make equal files.
 _DATE = (1980, 1, 1, 0, 0, 0)
+# What fmu.c has of a guard.
+_GUARD = {
+    "reals": "    ERROR, LAST_ERROR = ERROR + MHE_NX - 1,\n",
+    "integers": ", MOVED, GUARD_OFF",
+    "members": "    mhe_guard guard;\n",
+    "begin": """    mhe_guard_start(&m->guard, &m->estimator);
+    for (int j = 0; j < MHE_NX; j++) m->reals[ERROR + j] = m->guard.error[j];
+""",
+    "check": """    mhe_guard_check(&m->guard, &m->estimator, &m->estimate);
+    for (int j = 0; j < MHE_NX; j++) {
+        m->reals[STATE + j] = m->guard.state[j];
+        m->reals[FILTERED + j] = m->guard.filtered[j];
+        m->reals[ERROR + j] = m->guard.error[j];
+    }
+    m->integers[MOVED] = m->guard.moved;
+    m->integers[GUARD_OFF] = m->guard.off;
+""",
+}
 
 
 def write_fmu(
-    target: Path, name: str, files: dict[str, str], system: System, initial_state: Array
+    target: Path, name: str, files: dict[str, str], system: System, initial_state: Array,
+    guarded: bool = False,
 ) -> None:
     """Write an FMU for co-simulation by FMI 2.0, with the C sources and a library for this machine.
 
@@ -40,15 +59,18 @@ def write_fmu(
         Header and source of the estimator.
     system, initial_state : System and (n,) array
         Those of the estimator.
+    guarded : bool
+        Whether the source has a guard.
     """
     step = system.dt or 1.0
     guid = hashlib.sha256("\0".join((*files.values(), repr(step))).encode()).hexdigest()[:32]
     values = {
-        "start": ", ".join(map(repr, initial_state.tolist())), "step": repr(step), "guid": guid
+        "start": ", ".join(map(repr, initial_state.tolist())), "step": repr(step), "guid": guid,
+        **{place: text * guarded for place, text in _GUARD.items()},
     }
-    unit = Template(renamed(template("fmu.c"), name)).substitute(values)
+    unit = renamed(Template(template("fmu.c")).substitute(values), name)
     sources = {**files, f"{name}_fmu.c": unit.replace('"mhe.h"', f'"{name}.h"')}
-    description = _description(name, guid, system, initial_state, step)
+    description = _description(name, guid, system, initial_state, step, guarded)
     machine = platform.system()
     if machine not in _FOLDERS:
         raise CompilationError(f"FMI has no name for the platform {machine!r}.")
@@ -71,7 +93,7 @@ def write_fmu(
 
 
 def _description(
-    name: str, guid: str, system: System, initial_state: Array, step: float
+    name: str, guid: str, system: System, initial_state: Array, step: float, guarded: bool
 ) -> bytes:
     """The text of modelDescription.xml; variables in the order of fmu.c."""
     root = ET.Element("fmiModelDescription", {
@@ -126,9 +148,16 @@ def _description(
     ):
         add(label, "Real", reference, "output", None, text)
         reference += 1
-    for k, (label, text) in enumerate((
-        ("status", "bits of qpmhe.Status"), ("qps", "quadratic programs solved"),
-    )):
+    for j in range(system.n if guarded else 0):
+        add(f"error[{j + 1}]", "Real", reference + j, "output", None,
+            "proved bound on the error of state, NaN when the guard is off")
+    integers = [("status", "bits of qpmhe.Status"), ("qps", "quadratic programs solved")]
+    if guarded:
+        integers += [
+            ("moved", "whether the guard moved the state (1) and the filtered state (2)"),
+            ("guard_off", "why the guard is off, 0 while it is on"),
+        ]
+    for k, (label, text) in enumerate(integers):
         add(label, "Integer", k, "output", None, text)
     structure = ET.SubElement(root, "ModelStructure")
     for element in ("Outputs", "InitialUnknowns"):

@@ -412,7 +412,7 @@ def _observer_parts(layout: Layout) -> list[str]:
     if not layout.projects:
         return [*parts, "inside_none"]
     metric = "metric_covariance" if layout.covariance else "metric_own"
-    return [*parts, "projection", metric, "inside"]
+    return [*parts, "nearest", "projection", metric, "inside"]
 
 
 def _or_none(part: str, is_there: object) -> str:

@@ -88,6 +88,17 @@ def test_the_guard_returns_the_nearest_point_of_the_set(bound):
     assert {(True, False, False), (False, True, False), (False, False, True)} < kinds
 
 
+def test_from_far_away_the_direction_decides(bound):
+    """An estimate so far away that rounding of its distance is larger than the set."""
+    guard, rng = Guard(bound, bound.stability.system), np.random.default_rng(3)
+    for k in range(20):
+        z, direction = rng.uniform(-0.5, 0.5, 2), rng.standard_normal(2)
+        radius = 0.2 * float(np.sqrt(np.abs(bound.metric).max()))
+        tube = Tube(radius, bound.components(radius) * (1.0 if k % 2 else 0.6))
+        near, *far = (guard(z + size * direction, z, tube).point for size in (1e9, 1e40, 1e140))
+        np.testing.assert_allclose(far, [near, near], rtol=0, atol=1e-7)
+
+
 def test_no_estimate_is_farther_than_twice_the_bound_from_any_state_of_the_set(bound):
     guard, rng, P = Guard(bound, bound.stability.system), np.random.default_rng(1), bound.metric
     for size in (1e-9, 0.1, 1.0, 1e3, 1e150):

@@ -19,8 +19,8 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no 
 class Unit:
     """An FMU of an estimator, unpacked and instantiated; its variables are read by their names."""
 
-    def __init__(self, mhe, folder):
-        *files, path = codegen.write(mhe, folder, name="unit", fmu=True)
+    def __init__(self, mhe, folder, **options):
+        *files, path = codegen.write(mhe, folder, name="unit", fmu=True, **options)
         assert [file.name for file in (*files, path)] == ["unit.h", "unit.c", "unit.fmu"]
         assert not validation.validate_fmu(str(path))
         description = fmpy.read_model_description(str(path), validate=True)
@@ -45,6 +45,9 @@ class Unit:
 
     def get(self, name):
         return self.fmu.getReal(self._places(name))
+
+    def integer(self, name):
+        return self.fmu.getInteger([self.places[name]])[0]
 
     def set(self, **values):
         for name, value in values.items():

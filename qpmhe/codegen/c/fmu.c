@@ -44,8 +44,8 @@ typedef struct {
 enum {
     INITIAL = 0, Y = INITIAL + MHE_NX, U = Y + MHE_NY, STATE = U + MHE_NU,
     FILTERED = STATE + MHE_NX, COST = FILTERED + MHE_NX, CANDIDATE_COST, RESTORED_COST,
-    REALS,
-    STATUS = 0, QPS, INTEGERS
+$reals    REALS,
+    STATUS = 0, QPS$integers, INTEGERS
 };
 
 /* The sampling time, 1 for a model that is a map. */
@@ -54,7 +54,7 @@ enum {
 typedef struct {
     mhe_estimator estimator;
     mhe_estimate estimate;
-    fmi2Real reals[REALS];
+$members    fmi2Real reals[REALS];
     fmi2Integer integers[INTEGERS];
 } mhe_memory;
 
@@ -84,7 +84,7 @@ static void mhe_restart(mhe_unit *unit)
         m->reals[STATE + j] = m->reals[FILTERED + j] = m->reals[INITIAL + j];
     }
     mhe_reset(&m->estimator, &mhe_default_settings, x0);
-}
+$begin}
 
 EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
 EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
@@ -210,7 +210,7 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2
     m->reals[RESTORED_COST] = m->estimate.restored_cost;
     m->integers[STATUS] = m->estimate.status;
     m->integers[QPS] = m->estimate.qps;
-    return fmi2OK;
+$check    return fmi2OK;
 }
 
 EXPORT fmi2Status fmi2CancelStep(fmi2Component c)
