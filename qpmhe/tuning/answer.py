@@ -396,8 +396,8 @@ class Tuning:
     def _texts(self) -> list[str]:
         return [
             *([] if self._row is None else [
-                f"Estimator (*): {self._row.title}, the simplest whose score is within one standard "
-                "error, or 1 %, of the least. The weights above are its own."
+                f"Estimator (*): {self._row.title}, the simplest whose score is within one "
+                "standard error, or 1 %, of the least. The weights above are its own."
             ]),
             *(f"{row.title} fails: {row.failure}" for row in self.observers if row.failure),
             f"Chosen {self.judgement}", *([self.innovations.text] if self.innovations else []),

@@ -426,7 +426,7 @@ def test_an_observer_that_fails_is_last_and_says_why():
     assert "not detectable" in tuning.observers[-1].failure
     assert "steady fails: observer" in str(tuning)
     assert tuning.weights.observer_name == "ekf"
-    with pytest.raises(ModelError, match="no observer can be tuned .*: steady: .*not detectable"):
+    with pytest.raises(ModelError, match=r"no observer can be tuned .*: steady: .*not detectable"):
         tuned([simulated(steps=200)], system, observers=["steady"], max_qps=0)
 
 
