@@ -48,8 +48,9 @@ def compare(
     ] = None,
     observer: Annotated[
         list[str] | None,
-        typer.Option(help="Observer: model for the model's own, ekf, ukf, or a function, named as "
-                          "for --model, that takes a qpmhe.baselines.Problem; may be repeated."),
+        typer.Option(help="Observer: model for the model's own, ekf, gated, ukf, steady, or a "
+                          "function, named as for --model, that takes a "
+                          "qpmhe.baselines.Problem; may be repeated."),
     ] = None,
     estimator: Annotated[
         list[str] | None,

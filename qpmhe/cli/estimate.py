@@ -47,8 +47,8 @@ def estimate(
     engine: options.Engine = None,
     weights: Annotated[
         Path | None,
-        typer.Option(help="File that qpmhe tune wrote: take observer, cost, horizon and the "
-                          "model's parameters from it."),
+        typer.Option(help="File that qpmhe tune wrote: take observer, cost, horizon, QPs per "
+                          "sample and the model's parameters from it."),
     ] = None,
     covariances: Annotated[
         Literal["none", "std", "full"],
@@ -179,9 +179,11 @@ def _weighted(given: dict[str, Any]) -> dict[str, Any]:
             f"{path} holds weights of {sizes[0]} states, {sizes[1]} disturbances and {sizes[2]} "
             f"outputs, and model {model!r} has {system.n}, {system.r} and {system.p}; {remedy}"
         )
+    if found.max_qps is not None:
+        given = {"max_qps": found.max_qps, **given}
     return {
-        "horizon": found.horizon, **given, "model": named, "observer": found.observer(),
-        "cost": found.cost(),
+        "horizon": found.horizon, **given, "model": named,
+        "observer": found.observer(system=system), "cost": found.cost(),
     }
 
 

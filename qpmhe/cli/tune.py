@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -52,6 +53,12 @@ def tune(
         typer.Option(help="What to minimise after the likelihood; auto: the state error if --truth "
                           "is given."),
     ] = "auto",
+    observers: Annotated[
+        str | None,
+        typer.Option(metavar="LIST", help="Observers to compare, separated by commas: ekf, gated, "
+                     "ukf, steady, file.py:function, or all for the first four; each is tuned "
+                     "alone and with 1 and 2 QPs, and the best is written."),
+    ] = None,
     initial_state: options.InitialState = None,
     held_out: Annotated[float, typer.Option(help="Share of the blocks held out to judge the "
                                                  "result.")] = 0.25,
@@ -95,6 +102,7 @@ def tune(
     try:
         with named_as_options(
             "held_out", "initial_state", "structure", "objective", "threshold", "horizon",
+            "observers",
             "starts", "seed", "jobs",
         ):
             tuning = run(
@@ -103,6 +111,7 @@ def tune(
                 initial_state=mhe.initial_state, parameters=started, threshold=threshold,
                 structure={"prior": "scalar" if prior else None, "disturbance": structure,
                            "noise": structure},
+                observers=None if observers is None else _observers(observers),
                 objective=objective, held_out=held_out, starts=starts, seed=seed, jobs=jobs,
                 names={"states": loaded.states, "outputs": loaded.outputs},
                 checkpoint=out.with_name(f"{out.name}.search"), progress=Console(stderr=True),
@@ -167,6 +176,12 @@ def _starts(given: list[str] | None) -> dict[str, float]:
                 f"--parameter is {item!r}; expected NAME=START with a number, such as mass=0.5."
             )
     return found
+
+
+def _observers(text: str) -> str | list[str]:
+    """The names of --observers: those in a list that commas outside of brackets separate."""
+    found = [one.strip() for one in re.split(r",(?![^()]*\))", text) if one.strip()]
+    return "all" if found == ["all"] else found
 
 
 def _integers(option: str, text: str | None) -> list[int]:

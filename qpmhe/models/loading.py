@@ -12,6 +12,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import lru_cache
 from modulefinder import ModuleFinder
 from pathlib import Path
@@ -112,7 +113,9 @@ def find(
                 f"{_proposal((folder or Path()) / written, written, kind)}."
             )
         if written not in names:
-            raise ModelError(f"{kind} {written!r} is not known; {expected}.")
+            near = get_close_matches(written, names, 1)
+            hint = f" Did you mean {near[0]}?" if near else ""
+            raise ModelError(f"{kind} {written!r} is not known; {expected}.{hint}")
         return ModelSource(name, written if known is None else known[written], arguments, "", kind)
     place, _, function = written.rpartition(":")
     if not function.isidentifier() or not place:
@@ -303,10 +306,10 @@ def code_place(error: BaseException, file: Path | None) -> str:
 
 
 def _is_users(code: Path, file: Path) -> bool:
-    if code == file:
-        return True
     if any(code.is_relative_to(folder) for folder in _PACKAGES):
         return False
+    if code == file:
+        return True
     # A folder may have an environment with other people's packages in it.
     return code.is_relative_to(file.parent) and not (
         {"site-packages", "dist-packages"} & set(code.relative_to(file.parent).parts)

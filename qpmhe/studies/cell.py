@@ -19,6 +19,7 @@ from qpmhe_solvers import Backend, BackendError, Recording, backend, register
 
 from .._checks import Array
 from ..baselines import follow
+from ..baselines.observers import made
 from ..errors import InvalidInputError, PriorWarning, QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
@@ -26,7 +27,7 @@ from ..models import Record
 from ..models.loading import ModelSource, code_place
 from . import metrics
 from .environment import environment
-from .experiment import Source, experiment, made
+from .experiment import Source, experiment
 from .row import OBSERVER, Cell, StudyRow
 
 #: Engine of all cells: only the Python step calls the backends that a study compares.

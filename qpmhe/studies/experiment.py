@@ -11,15 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from qpmhe_solvers.values import shown
-
 from .._checks import Array
 from ..baselines import Problem
 from ..errors import InvalidInputError, ModelError
 from ..model.system import System
 from ..models import Record, Scenario
-from ..models.loading import ModelSource, build, load
-from ..observers import Observer
+from ..models.loading import ModelSource, load
 from ..records.arrays import read_record
 from ..records.record_model import load_record_model
 
@@ -115,21 +112,6 @@ class Experiment:
         """Times of the states x(0), ..., x(steps)."""
         spacing = np.full(steps, self.dt) if self.lengths is None else self.lengths[:steps]
         return np.concatenate(([0.0], np.cumsum(spacing)))
-
-
-def made(maker: ModelSource, problem: Problem) -> Any:
-    """The observer or estimator that a function of the user makes; a `ModelError` if it fails."""
-    found = build(maker, problem)
-    if maker.kind == "observer" and not isinstance(found, Observer):
-        raise ModelError(
-            f"observer {maker.name!r} returned {shown(found)}; expected a qpmhe.Observer."
-        )
-    if maker.kind == "estimator" and not callable(getattr(found, "update", None)):
-        raise ModelError(
-            f"estimator {maker.name!r} returned {shown(found)}; expected an object with "
-            "update(y, u)."
-        )
-    return found
 
 
 @lru_cache(maxsize=16)

@@ -23,13 +23,13 @@ from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import shown
 
 from .._checks import choice, count, dimension, flag, positive
-from ..baselines import Baseline
+from ..baselines import Baseline, observers
 from ..errors import BackendError, InvalidInputError, ModelError, OptionError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..models.loading import ModelSource, check_named_in_file, find
 from ..observers import Observer
 from ..records.readers import ReadingOptions
-from .experiment import Source, experiment, made
+from .experiment import Source, experiment
 from .row import OBSERVER, USUAL_OBSERVER, Cell
 
 if TYPE_CHECKING:
@@ -49,10 +49,7 @@ READING = {
 
 #: Short names of observers and estimators, and the functions that make them.
 KNOWN = {
-    "observers": {
-        "ekf": "qpmhe.baselines.observers:extended_kalman",
-        "ukf": "qpmhe.baselines.observers:unscented_kalman",
-    },
+    "observers": observers.KNOWN,
     "estimators": {
         "ekf": "qpmhe.baselines:ExtendedKalmanFilter",
         "ukf": "qpmhe.baselines:UnscentedKalmanFilter",
@@ -97,9 +94,10 @@ class Study:
     backends : sequence of str, optional
         QP backends; by default all that are installed, without the forms ``qpsolvers:...``.
     observers : sequence of str
-        Observers: ``model`` for the model's own, ``ekf``, ``ukf``, or functions, named as models
-        are. Such a function gets a `qpmhe.baselines.Problem` and returns an observer. The cost, and
-        what it says of the prior, stays the model's.
+        Observers: ``model`` for the model's own, ``ekf``, ``gated`` (with `qpmhe.Gate`), ``ukf``,
+        ``steady`` (a constant gain), or functions, named as models are. Such a function gets a
+        `qpmhe.baselines.Problem` and returns an observer. The cost, and what it says of the prior,
+        stays the model's.
     estimators : mapping or sequence of str
         Other estimators, by the names that tables give them: ``ekf``, ``ukf``, ``enkf``,
         ``particles``, the filters of `qpmhe.baselines`, with arguments where wanted
@@ -343,7 +341,7 @@ def _check_maker(maker: ModelSource, sources: Sequence[Source]) -> None:
     for source in sources:
         problem = experiment(source).problem
         try:
-            made(maker, problem)
+            observers.made(maker, problem)
             return
         except ModelError as error:
             failed = error

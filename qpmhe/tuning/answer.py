@@ -22,10 +22,11 @@ from ..diagnosis.findings import listed
 from ..errors import OptionError
 from ..observers import Observer
 from ..plots.style import STYLES, panels
+from .contest import Found, root_mean_squares
 from .innovations import innovations_of
-from .likelihood import Likelihood
-from .score import Score
+from .judge import Blocks, ObserverScore
 from .search import NORMAL, limit
+from .weights import Weights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,8 +40,8 @@ _WIDEST_LOG, _WIDEST = float(np.log(10.0)), 1.0
 _TOGETHER = 0.8
 # An axis whose ends are further apart has only powers of ten.
 _MANY_LABELS = 50.0
-# Standard errors by which a gain of the second search is beyond chance.
-_CHANCE = 2.0
+# Errors that the table of estimators shows, at most.
+_COLUMNS = 4
 # The step of a correlation's derivatives.
 _DIFFERENCE = 1e-4
 # Eigenvalues of the Hessian below this count as it; an interval is infinite then.
@@ -92,6 +93,8 @@ class Tuning:
     innovations : Innovations or None
         Whether the innovations of the filter with the likeliest weights are white, and of the size
         that these say: if not, the intervals are too narrow. None where this filter fails.
+    observers : tuple of ObserverScore
+        The estimators compared, best first; empty unless `qpmhe.tune` was given ``observers``.
     seconds : dict
         How long each search took.
     notes : tuple of str
@@ -99,33 +102,27 @@ class Tuning:
     """
 
     def __init__(
-        self, likelihood: Likelihood, score: Score, theta: Array, refined: Array | None,
-        again: tuple[Array, Array], seconds: dict[str, float],
+        self, found: Found, blocks: Blocks, again: tuple[Array, Array], seconds: dict[str, float],
         labels: Mapping[str, Sequence[str]], constant: list[int],
+        observers: Sequence[ObserverScore] = (),
     ) -> None:
-        self._likelihood, self._structure, self._score = likelihood, likelihood.structure, score
-        self._data, self._labels, self.seconds = likelihood.data, labels, seconds
-        blocks = [(one, one.block == k) for one in self._data for k in np.unique(one.block)]
-        #: Record, samples, and whether it is held out, of each block.
-        self._blocks = [(one, inside, bool(one.held[inside].any())) for one, inside in blocks]
-        every = not any(held for _, _, held in self._blocks)
-        self._judges = "all blocks" if every else "held-out blocks"
-        self._judged = [one.held | every for one in self._data]
-        judged, self.judgement = (
-            (theta, "by the likelihood alone.") if refined is None else self._judge(theta, refined)
-        )
-        structure, (self._likeliest, hessian) = self._structure, again
+        likelihood, self._score, self._blocks = found.likelihood, found.score, blocks
+        structure = self._structure = likelihood.structure
+        self._likelihood, self._data, self._labels = likelihood, likelihood.data, labels
+        self.seconds, self.judgement, self.observers = seconds, found.judgement, tuple(observers)
+        self._likeliest, hessian = again
         #: What the held-out blocks have judged, which is not yet tuned on them.
-        self._judged_theta = judged
-        self._theta = self._likeliest if judged is theta else judged
-        self.weights = structure.weights(self._theta)
+        self._judged_theta = found.best
+        self._theta = self._likeliest if found.best is found.theta else found.best
+        self._row = found.row
+        self.weights = self._named(structure.weights(self._theta))
         self.start, self.values, self.likeliest = map(
             structure.values, (structure.start, self._theta, self._likeliest)
         )
         self._find_intervals(self._likeliest, hessian)
         outside = [
             name for name, (low, high) in self.intervals.items()
-            if self._theta is refined and not low <= self.values[name] <= high
+            if self._theta is found.refined and not low <= self.values[name] <= high
         ]
         one = len(outside) == 1
         where = "is outside of its interval" if one else "are outside of their intervals"
@@ -142,6 +139,13 @@ class Tuning:
             likelihood.system(likeliest), likeliest, self._data, labels["noise"])
         if self.innovations is not None:
             self.notes += tuple(self.innovations.notes(likeliest.threshold))
+
+    def _named(self, weights: Weights) -> Weights:
+        """The weights with the estimator that was chosen."""
+        if self._row is None:
+            return weights
+        return replace(
+            weights, observer_name=self._row.observer, max_qps=self._row.max_qps)
 
     @property
     def prior(self) -> Array:
@@ -179,57 +183,12 @@ class Tuning:
 
     def observer(self) -> Observer:
         """The observer with these weights."""
-        return self.weights.observer(self._score.kind)
+        problem = self._score.problem(self._likelihood.system(self.weights), self.weights)
+        return self._score.kind(problem)
 
     def save(self, path: str | Path) -> Path:
         """Write the weights as TOML, for `qpmhe.tuning.load` and ``qpmhe estimate --weights``."""
         return self.weights.save(path, str(self))
-
-    def _judge(self, theta: Array, refined: Array) -> tuple[Array, str]:
-        """The weights to take: those of a search where they are better beyond chance."""
-        points = self._structure.start, theta, refined
-        scores = [self._score.samples(self._structure.weights(at)) for at in points]
-        held = np.array([held or self._judges == "all blocks" for _, _, held in self._blocks])
-        means = np.array([self._block_means(samples) for samples in scores])[:, held]
-        means = means[:, np.isfinite(means[0])]
-        what = "error" if self._score.truth else "prediction error"
-        blocks, count = self._judges, means.shape[1]
-        if count < 2:
-            return theta, (
-                f"by the likelihood: {count} {blocks} cannot judge the estimator's {what}; record "
-                "for longer."
-            )
-
-        def gain(old: int, new: int) -> tuple[float, float]:
-            """By how many per cent the new one is better, and the standard error."""
-            gains = 100.0 / self._mean(scores[old]) * (means[old] - means[new])
-            return float(np.mean(gains)), float(np.std(gains, ddof=1) / np.sqrt(count))
-
-        share, doubt = gain(1, 2)
-        best = 2 if share > _CHANCE * doubt else 1
-        loss, spread = gain(best, 0)
-        if loss > spread:
-            return points[0], (
-                f"as at the start: the estimator's mean square {what} on {blocks} is larger with "
-                "the tuned weights. The model's error is not white noise, or the records are too "
-                "short; tune with the truth, fewer parameters, or a better model."
-            )
-        if best == 2:
-            return refined, (
-                f"by the likelihood, then by the estimator's {what}: its mean square on {blocks} "
-                f"falls by {share:.2g} % more (standard error {doubt:.2g} %)."
-            )
-        return theta, (
-            f"by the likelihood: tuning the estimator's {what} as well would change its mean "
-            f"square on {blocks} by {-share:+.2g} % (standard error {doubt:.2g} %), no gain "
-            "beyond chance."
-        )
-
-    def _block_means(self, samples: list[Array]) -> list[float]:
-        """The mean score of each block, NaN where there is nothing to compare."""
-        of = {id(one): each for one, each in zip(self._data, samples, strict=True)}
-        parts = [of[id(one)][inside] for one, inside, _ in self._blocks]
-        return [float(np.nanmean(one)) if np.isfinite(one).any() else np.nan for one in parts]
 
     def _find_intervals(self, theta: Array, hessian: Array) -> None:
         structure = self._structure
@@ -321,29 +280,25 @@ class Tuning:
         state. Those after are of the weights before the last search, which uses these blocks, too.
         """
         structure, ahead = self._structure, self._score.ahead
-        samples = sum(int(mask.sum()) for mask in self._judged)
+        samples = sum(int(mask.sum()) for mask in self._blocks.masks)
         before, after = (
-            self._likelihood.value(at, self._judged) / samples
+            self._likelihood.value(at, self._blocks.masks) / samples
             for at in (structure.start, self._judged_theta)
         )
         found = {"negative log likelihood per sample": (before, after)}
-        sizes = []
-        for weights in (structure.first, structure.weights(self._judged_theta)):
-            errors = self._score.errors(weights)
-            every = np.concatenate(
-                [one[mask] for one, mask in zip(errors, self._judged, strict=True)]
-            )
-            there = np.isfinite(every)
-            with np.errstate(invalid="ignore"):
-                squares = np.where(there, every, 0.0) ** 2
-                sizes.append(np.sqrt(squares.sum(axis=0) / there.sum(axis=0)))
-        for label, one, other in zip(
-            self._labels["prior" if self._score.truth else "noise"], *sizes, strict=True
-        ):
-            if np.isfinite(one):
-                name = f"error of {label}" if self._score.truth else f"{label}, {ahead} ahead"
-                found[name] = float(one), float(other)
+        first, second = (
+            root_mean_squares(self._score.errors(weights), self._blocks, self._compared)
+            for weights in (structure.first, structure.weights(self._judged_theta))
+        )
+        for label, one in first.items():
+            name = f"error of {label}" if self._score.truth else f"{label}, {ahead} ahead"
+            found[name] = one, second.get(label, np.nan)
         return found
+
+    @property
+    def _compared(self) -> Sequence[str]:
+        """The names of what the score compares."""
+        return self._labels["prior" if self._score.truth else "noise"]
 
     def horizons(
         self, horizons: Sequence[int] = (2, 5, 10, 20, 40),
@@ -374,13 +329,8 @@ class Tuning:
             began = perf_counter()
             samples = self._score.samples(replace(weights, horizon=horizon, arrival=arrival))
             spent = (perf_counter() - began) / sum(map(len, self._data))
-            rows.append(HorizonScore(horizon, arrival, self._mean(samples), spent))
+            rows.append(HorizonScore(horizon, arrival, self._blocks.mean(samples), spent))
         return rows
-
-    def _mean(self, samples: list[Array]) -> float:
-        return float(np.nanmean(np.concatenate(
-            [one[mask] for one, mask in zip(samples, self._judged, strict=True)]
-        )))
 
     def __repr__(self) -> str:
         start = self.start
@@ -391,8 +341,8 @@ class Tuning:
         from rich.console import Console
 
         console = Console(file=io.StringIO(), width=110, no_color=True)
-        for heading, last, rows in self._tables():
-            console.print(_table(heading, ["", "before", "after", *last], rows))
+        for heading, headings, rows in self._tables():
+            console.print(_table(heading, headings, rows))
             console.print()
         for text in self._texts():
             console.print(text, highlight=False, markup=False)
@@ -406,13 +356,13 @@ class Tuning:
 
         tables = (
             f"<table><caption>{escape(heading)}</caption>"
-            f"{row(['', 'before', 'after', *last], 'th')}{''.join(map(row, rows))}</table>"
-            for heading, last, rows in self._tables()
+            f"{row(headings, 'th')}{''.join(map(row, rows))}</table>"
+            for heading, headings, rows in self._tables()
         )
         return "".join(tables) + "".join(f"<p>{escape(one)}</p>" for one in self._texts())
 
     def _tables(self) -> list[tuple[str, list[str], list[tuple[str, ...]]]]:
-        """Heading, last columns' headings and rows of each table."""
+        """Heading, headings of the columns and rows of each table."""
         weights: list[tuple[str, ...]] = [
             (name, f"{self.start[name]:.4g}", f"{value:.4g}",
              " to ".join(f"{end:.3g}" for end in self.intervals.get(name, ())))
@@ -423,13 +373,33 @@ class Tuning:
         ]
         title = "Weights, as standard deviations"
         title += " and correlations" * bool(self._structure.correlations)
-        return [
-            (title, ["95 % interval"], weights),
-            (f"Scores on {self._judges}, less is better", [], scores),
+        headings = ["", "before", "after"]
+        tables = [
+            (title, [*headings, "95 % interval"], weights),
+            (f"Scores on {self._blocks.name}, less is better", headings, scores),
         ]
+        return [*tables, self._table_of_observers()] if self.observers else tables
+
+    def _table_of_observers(self) -> tuple[str, list[str], list[tuple[str, ...]]]:
+        labels = [one for one in self._compared if any(one in row.errors for row in self.observers)]
+        kind = "error" if self._score.truth else f"{self._score.ahead} ahead"
+        rows = [
+            (row.title + " *" * (row is self._row), *(
+                (f"{row.score:.4g}", *(f"{row.errors[one]:.3g}" for one in labels[:_COLUMNS]),
+                 f"{1e6 * row.seconds:.3g}")
+                if not row.failure else ("failed", *[""] * len(labels[:_COLUMNS]), ""))
+            ) for row in self.observers
+        ]
+        headings = ["", "score", *(f"{one}, {kind}" for one in labels[:_COLUMNS]), "us a step"]
+        return f"Estimators on {self._blocks.name}", headings, rows
 
     def _texts(self) -> list[str]:
         return [
+            *([] if self._row is None else [
+                f"Estimator (*): {self._row.title}, the simplest whose score is within one "
+                "standard error, or 1 %, of the least. The weights above are its own."
+            ]),
+            *(f"{row.title} fails: {row.failure}" for row in self.observers if row.failure),
             f"Chosen {self.judgement}", *([self.innovations.text] if self.innovations else []),
             *(f"Not identified: {one}" for one in self.unidentified),
             *(f"Note: {one}" for one in self.notes),
@@ -498,11 +468,11 @@ class Tuning:
         from matplotlib.ticker import MaxNLocator
 
         means = np.array([
-            self._block_means(self._score.samples(weights))
+            self._blocks.means(self._score.samples(weights))
             for weights in (self._structure.first, self._structure.weights(self._judged_theta))
         ])
         shown = np.isfinite(means[0])
-        held = np.array([held for _, _, held in self._blocks])[shown]
+        held = self._blocks.held[shown]
         for k, name in enumerate(("before", "after")):
             axes.plot(means[k, shown], marker="o", markersize=3.5, label=name, **STYLES[1 - k])
         for k in np.flatnonzero(held).tolist():

@@ -5,12 +5,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from copy import copy
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from .._checks import Array
+from ..baselines import Problem, follow
+from ..baselines.base import deviations
 from ..codegen import compile as compile_ahead
 from ..errors import EngineWarning, ObserverWarning, QpmheError
 from ..estimation.engines import python_only
@@ -36,10 +39,13 @@ class Score:
 
     def __init__(
         self, data: list[Data], make: Callable[[dict[str, float]], System],
-        kind: Callable[..., Observer], start: Weights, *, ahead: int, truth: bool,
+        kind: Callable[[Problem], Observer], start: Weights, *, ahead: int, truth: bool,
         begins: bool, options: dict[str, Any],
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
+        self._compiled = False
+        #: Seconds that a step took, the median of the last run.
+        self.seconds = np.nan
         #: Steps ahead, and whether the truth is compared with.
         self.ahead, self.truth = ahead, truth
         self._robust, self._options, self._start = start.threshold is not None, options, start
@@ -50,6 +56,26 @@ class Score:
         self._used = [
             mask if mask.any() else ~one.held for mask, one in zip(later, data, strict=True)
         ]
+
+    def of(self, kind: Callable[[Problem], Observer], qps: int) -> Score:
+        """The score of another estimator, in the same units: those of this one."""
+        _, other = self.scale, copy(self)
+        other.kind, other._options = kind, {**self._options, "max_qps": qps}
+        if self._compiled:
+            other.compile()
+        return other
+
+    def typical(self, weights: Weights) -> tuple[Array, Array]:
+        """The mean state, by the truth or else by the estimates, and the mean of all inputs."""
+        system = self._make(weights.parameters)
+        states = np.concatenate([
+            self._estimates(system, weights, one) if one.truth is None or np.isnan(one.truth).any()
+            else one.truth for one in self._data
+        ])
+        usable = states[np.isfinite(states).all(axis=1)]
+        mean = deviations(system, usable, np.full(len(usable), 1.0 / len(usable)))[0]
+        inputs = [one.inputs(system, weights.parameters) for one in self._data]
+        return mean, np.concatenate(inputs).mean(axis=0)
 
     @cached_property
     def scale(self) -> Array:
@@ -76,13 +102,14 @@ class Score:
                 found.append(np.nanmean(terms, axis=1))
         return found
 
-    def compile(self, weights: Weights) -> None:
+    def compile(self) -> None:
         """Compile the step, for `qpmhe.MovingHorizonEstimator` to find, where it has a C form."""
         if self._options.get("engine", "auto") != "auto" or python_only():
             return
-        system = self._make(weights.parameters)
+        self._compiled = True
+        system = self._make(self._start.parameters)
         with suppress(QpmheError):
-            compile_ahead(self._estimator(system, weights, self._data[0]))
+            compile_ahead(self._estimator(system, self._start, self._data[0]))
 
     def errors(self, weights: Weights) -> list[Array]:
         """Errors of each record (T, n) or (T, p), NaN where there is nothing to compare."""
@@ -126,13 +153,21 @@ class Score:
         return errors
 
     def _estimator(self, system: System, weights: Weights, one: Data) -> MovingHorizonEstimator:
-        options, missing = dict(self._options), system.m - one.u.shape[1]
-        if missing:
-            options["parameters"] = list(weights.parameters.values())[:missing]
+        options, problem = dict(self._options), self.problem(system, weights, one)
+        if problem.parameters.size:
+            options["parameters"] = problem.parameters
         return MovingHorizonEstimator(
-            system, weights.observer(self.kind), weights.cost(), horizon=weights.horizon,
+            system, self.kind(problem), weights.cost(), horizon=weights.horizon,
             initial_state=one.start, **options,
         )
+
+    def problem(
+        self, system: System, weights: Weights, one: Data | None = None
+    ) -> Problem:
+        """What the observer is made for, on the first record or another one."""
+        one = one or self._data[0]
+        behind = list(weights.parameters.values())[: system.m - one.u.shape[1]]
+        return weights.problem(system, one.start, parameters=np.array(behind))
 
     def _estimates(self, system: System, weights: Weights, one: Data) -> Array:
         """The estimates of x(1), ..., x(T), each made with the y before."""
@@ -141,9 +176,6 @@ class Score:
             warnings.simplefilter("ignore", EngineWarning)
             mhe = self._estimator(system, weights, one)
             u = one.u if one.u.shape[1] else None
-            if one.dt is None:
-                return mhe.run(one.y, u).states[1:]
-            return np.array([
-                mhe.update(y, None if u is None else u[t], dt=float(one.dt[t])).state
-                for t, y in enumerate(one.y)
-            ])
+            run = mhe.run(one.y, u) if one.dt is None else follow(mhe, one.start, one.y, u, one.dt)
+        self.seconds = float(np.median(run.times))
+        return run.states[1:]

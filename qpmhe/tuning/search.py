@@ -44,6 +44,8 @@ class SearchProgress:
 
     def __init__(self, path: Path | None, identity: str) -> None:
         self.path, self._identity, self._saved = path, identity, -np.inf
+        #: What stands before the names of searches: which observer they are for.
+        self.part = ""
         self.searches: dict[str, dict[str, Any]] = {}
         if path is None or not path.exists():
             return
@@ -71,7 +73,7 @@ class SearchProgress:
 
     def note(self, name: str, theta: Array, value: float, done: bool) -> None:
         """Keep the best point of a search, and write it now and then."""
-        self.searches[name] = {"theta": theta.tolist(), "value": value, "done": done}
+        self.searches[self.part + name] = {"theta": theta.tolist(), "value": value, "done": done}
         if self.path is not None and (done or monotonic() - self._saved > _EVERY):
             text = json.dumps(
                 {"format": _FORMAT, "identity": self._identity, "searches": self.searches}
@@ -88,7 +90,7 @@ class SearchProgress:
 
     def known(self, name: str) -> tuple[Array | None, float, bool]:
         """The best point so far, its value, and whether the search has ended there."""
-        one = self.searches.get(name)
+        one = self.searches.get(self.part + name)
         if one is None:
             return None, np.inf, False
         return np.array(one["theta"]), float(one["value"]), bool(one["done"])

@@ -17,16 +17,19 @@ from numpy.typing import ArrayLike, NDArray
 from qpmhe_solvers.values import shown
 
 from .._checks import checked_path, choice, count, dimension
+from ..baselines import Problem
 from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
 from ..model.system import System
 from ..observers import ExtendedKalman, Observer
 from .answer import Tuning
+from .contest import Found, Kind, contest, kinds_of, plain, settle
 from .data import Data, check_enough, checked_data, constant_inputs, hold_out
+from .judge import Blocks
 from .likelihood import Likelihood
 from .score import Score
-from .search import SearchProgress, identity_of, polish, refine, refit, search_all
+from .search import SearchProgress, identity_of, polish, refit, search_all
 from .structures import Structure, checked_start
-from .weights import ARRIVALS, Weights
+from .weights import ARRIVALS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,6 +56,7 @@ def tune(
     threshold: float | None = None,
     discount: float = 1.0,
     observer: Callable[..., Observer] = ExtendedKalman,
+    observers: str | Sequence[str] | None = None,
     arrival: str = "observer",
     ahead: int = 5,
     held_out: float = 0.25,
@@ -111,6 +115,13 @@ def tune(
         Makes the estimator's observer from ``prior``, ``disturbance`` and ``noise``. Where it
         judges innovations, as ``functools.partial(qpmhe.ExtendedKalman, innovation=qpmhe.Gate())``
         does, those beyond its limit count in the likelihood as those beyond ``threshold`` do.
+    observers : sequence of str, optional
+        Observers to compare, instead of ``observer``: ``ekf``, ``gated`` (an extended Kalman filter
+        with `qpmhe.Gate`), ``ukf``, ``steady`` (a constant gain about the mean of the records), or
+        functions, named as for `qpmhe.Study`; ``"all"`` for these four. Each is tuned alone and
+        with 1 to ``max_qps`` QPs, and all are ranked on the blocks that judge. The result is the
+        one of the simplest estimator whose score is within one standard error, or 1 %, of the
+        least: the one with the fewest QPs, of those the first in the list.
     arrival : {"observer", "constant"}
         What weighs the prior: the observer's covariance, or ``prior`` at all times.
     ahead : int
@@ -173,8 +184,8 @@ def tune(
         {"prior": first.n, "disturbance": first.r, "noise": first.p}, prior, disturbance, noise,
         discount, threshold, started, horizon=horizon, arrival=arrival,
     )
-    judged = _made_observer(observer, start).innovation_limit
     data = checked_data(records, first, inputs, initial_state)
+    kinds = _kinds(observer, observers, start.problem(first, data[0].start), arrival)
     hold_out(data, held_out, 2 * ahead)
     labels = _labels(first, names)
     plan = Structure(start, structure, labels)
@@ -184,32 +195,65 @@ def tune(
     options = {"max_qps": 2, **options}
     if starts is None:  # a further one costs little where the filter alone is searched
         starts = 2 if objective == "likelihood" else 1
-    likelihood = Likelihood(plan, data, make, remade, judged)
-    at_start = _likelihood_at_start(likelihood)
+    likelihoods = {kind.limit: Likelihood(plan, data, make, remade, kind.limit) for kind in kinds}
+    at_start = _likelihood_at_start(likelihoods[kinds[0].limit])
     score = Score(
-        data, make, observer, start, ahead=ahead, truth=objective == "truth",
+        data, make, plain() if observers else kinds[0].make, start, ahead=ahead,
+        truth=objective == "truth",
         begins=any(name.startswith("prior ") for name in plan.names), options=options,
     )
     if objective != "likelihood":
         if sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
-            score.compile(start)
+            score.compile()
         _ = score.scale  # what is wrong with the options shows before the search
-    kept = SearchProgress(kept_in, identity_of(
-        likelihood, at_start, (objective, ahead, seed, starts, sorted(options.items(), key=str))
-    ))
-    beginnings = _beginnings(plan, starts, seed)
+    kept = SearchProgress(kept_in, identity_of(likelihoods[kinds[0].limit], at_start, (
+        objective, ahead, seed, starts, sorted(options.items(), key=str),
+        *(one.name for one in kinds if observers),
+    )))
+    beginnings, blocks = _beginnings(plan, starts, seed), Blocks(data)
+    searched: dict[float | None, Found] = {}
+    spent = {"likelihood": 0.0}
     with _interruptible(), _shown(progress) as advance:
-        found = search_all(likelihood, beginnings, kept, jobs, advance)
-        found, hessian = polish(likelihood, found)
-        seconds, refined = {"likelihood": perf_counter() - began}, None
-        if objective != "likelihood":
-            refined = refine(score, likelihood, found, kept, advance)
-            seconds["estimator"] = perf_counter() - began - seconds["likelihood"]
+        def likely(limit: float | None) -> Found:
+            if limit not in searched:
+                since, kept.part = perf_counter(), f"limit {limit}, " if observers else ""
+                theta = search_all(likelihoods[limit], beginnings, kept, jobs, advance)
+                searched[limit] = Found(
+                    likelihoods[limit], *polish(likelihoods[limit], theta), score)
+                spent["likelihood"] += perf_counter() - since
+            return searched[limit]
+
+        def settled(name: str, found: Found) -> Found:
+            kept.part = name and f"{name}, "
+            return settle(found, objective, blocks, kept, lambda text: advance(kept.part + text))
+
+        if observers:
+            best, rows = contest(
+                kinds, dimension("max_qps", options["max_qps"], 0), likely, settled, blocks,
+                labels["prior" if score.truth else "noise"],
+            )
+        else:
+            best, rows = settled("", likely(kinds[0].limit)), []
+        if best.refined is not None:
+            spent["estimator"] = perf_counter() - began - spent["likelihood"]
         advance("all blocks")
-        again = refit(likelihood, found, hessian)
-        tuning = Tuning(likelihood, score, found, refined, again, seconds, labels, constant)
+        again = refit(best.likelihood, best.theta, best.hessian)
+        tuning = Tuning(best, blocks, again, spent, labels, constant, rows)
     kept.remove()
     return tuning
+
+
+def _kinds(observer: Any, observers: Any, problem: Problem, arrival: str) -> list[Kind]:
+    """The observers to compare, or the only one."""
+    if observers is None:
+        made = _made_observer(observer, problem)
+        return [Kind("", plain(observer), made.innovation_limit)]
+    if observer is not ExtendedKalman:
+        raise OptionError(
+            "both observer and observers are given; give observers alone, which may name a "
+            "function."
+        )
+    return kinds_of(observers, problem, arrival)
 
 
 def _maker(
@@ -279,7 +323,7 @@ def _beginnings(plan: Structure, starts: int, seed: int) -> list[NDArray[np.floa
     return [plan.start, *map(plan.bounded, plan.start + spread)]
 
 
-def _made_observer(kind: Any, start: Weights) -> Observer:
+def _made_observer(kind: Any, problem: Problem) -> Observer:
     """Make one, so that what is wrong shows before the search."""
     expected = (
         "expected a callable that makes an observer from prior, disturbance and noise, such as "
@@ -288,7 +332,7 @@ def _made_observer(kind: Any, start: Weights) -> Observer:
     if not callable(kind):
         raise OptionError(f"observer is {shown(kind)}; {expected}")
     try:
-        made = start.observer(kind)
+        made = plain(kind)(problem)
     except QpmheError:
         raise
     except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
@@ -10,11 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from .._checks import Array, checked_path, choice, dimension, numbers
+from .._checks import Array, checked_path, choice, count, dimension, numbers
 from .._linalg import inverse
 from .._version import __version__
+from ..baselines import Problem
+from ..baselines.observers import KNOWN, made
 from ..costs import Cost, Huber, ObserverPrior, QuadraticCost, RobustCost
-from ..errors import InvalidInputError, QpmheError
+from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
+from ..model.system import System
+from ..models.loading import ModelSource, find
 from ..observers import ExtendedKalman, Observer
 
 _FORMAT = 1
@@ -45,6 +50,10 @@ class Weights:
         What weighs the prior: the observer's own covariance, or the one of the initial error.
     parameters : dict
         Parameters of the model, by name.
+    observer_name : str, optional
+        The observer, named as for `qpmhe.tune`; an extended Kalman filter if left out.
+    max_qps : int, optional
+        QPs per sample with which the weights were chosen, where `qpmhe.tune` compared them.
     """
 
     prior: Array
@@ -55,10 +64,34 @@ class Weights:
     threshold: float | None = None
     arrival: str = "observer"
     parameters: dict[str, float] = field(default_factory=dict)
+    observer_name: str | None = None
+    max_qps: int | None = None
 
-    def observer(self, kind: Callable[..., Observer] = ExtendedKalman) -> Observer:
-        """The observer: kind(prior=..., disturbance=..., noise=...)."""
-        return kind(prior=self.prior, disturbance=self.disturbance, noise=self.noise)
+    def observer(
+        self, kind: Callable[..., Observer] | None = None, *, system: System | None = None
+    ) -> Observer:
+        """The observer: kind(prior=..., disturbance=..., noise=...), or the one that was chosen.
+
+        The latter needs the system where it has a name. An `OptionError` says so.
+        """
+        if kind is None and self.observer_name is not None:
+            if system is None:
+                raise OptionError(
+                    f"the weights are of the observer {self.observer_name!r}, which is made for a "
+                    "system; give observer(system=system), or another kind."
+                )
+            problem = self.problem(system, np.zeros(system.n))
+            chosen: Observer = made(find_observer(self.observer_name), problem)
+            return chosen
+        return (kind or ExtendedKalman)(
+            prior=self.prior, disturbance=self.disturbance, noise=self.noise)
+
+    def problem(self, system: System, initial_state: Array, **options: Any) -> Problem:
+        """The problem of estimating with these covariances."""
+        return Problem(
+            system, initial_state=initial_state, prior=self.prior, disturbance=self.disturbance,
+            noise=self.noise, **options,
+        )
 
     def cost(self) -> Cost:
         """The cost: quadratic, or with Huber's loss of the noise where there is a threshold."""
@@ -90,6 +123,10 @@ class Weights:
             f"format = {_FORMAT}", f'version = "{__version__}"', f"horizon = {self.horizon}",
             f"discount = {float(self.discount)!r}", f'arrival = "{self.arrival}"',
         ]
+        if self.observer_name is not None:
+            lines.append(f"observer_name = {json.dumps(self.observer_name)}")
+        if self.max_qps is not None:
+            lines.append(f"max_qps = {self.max_qps}")
         if self.threshold is not None:
             lines.append(f"threshold = {float(self.threshold)!r}")
         lines += ["", "# In squared units, one row per line.", "[covariances]"]
@@ -148,13 +185,22 @@ def load(path: str | Path) -> Weights:
         found = Weights(**content)
         dimension("horizon", found.horizon, 1)
         choice("arrival", found.arrival, ARRIVALS)
+        if found.max_qps is not None:
+            count("max_qps", found.max_qps, 0)
         found.cost()
-        found.observer()
-    except (KeyError, TypeError, ValueError, InvalidInputError) as error:
+        found.observer(ExtendedKalman)
+        if found.observer_name is not None:
+            find_observer(found.observer_name)
+    except (KeyError, TypeError, ValueError, InvalidInputError, ModelError) as error:
         raise WeightsError(
             f"{target} holds no weights of qpmhe ({_reason(error)}); save them again."
         ) from error
     return found
+
+
+def find_observer(name: str) -> ModelSource:
+    """Where an observer of this name comes from, as in studies."""
+    return find(name, kind="observer", known=KNOWN)
 
 
 def _reason(error: Exception) -> str:

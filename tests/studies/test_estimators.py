@@ -227,7 +227,7 @@ def test_a_file_has_the_same_and_names_no_other_function(folder, monkeypatch):
         ('estimators = ["../my.py:filter"]', "outside of the study's folder"),
         ('estimators = ["my.py:ExtendedKalmanFilter"]', "does not define ExtendedKalmanFilter"),
         ('estimators = ["eknf"]', "estimator 'eknf' is not known; expected one of ekf, ukf, enkf"),
-        ('observers = ["enkf"]', "observer 'enkf' is not known; expected one of ekf, ukf, or"),
+        ('observers = ["enkf"]', "observer 'enkf' is not known; expected one of ekf, gated, ukf"),
     ):
         with pytest.raises(StudyError, match=re.escape(words)):
             read(text)

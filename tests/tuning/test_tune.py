@@ -11,7 +11,7 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError
-from qpmhe.tuning import TuningCheckpointError, TuningRecord, search
+from qpmhe.tuning import TuningCheckpointError, TuningRecord, contest, judge, load, search
 from qpmhe.tuning.structures import Correlated
 
 tuning_module = sys.modules["qpmhe.tuning.tune"]
@@ -330,9 +330,9 @@ def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors,
     """The second search's weights are less likely, and better by so many standard errors."""
     likely = tuned(structure="scalar", held_out=0.0)
     gains = 0.01 * (errors + np.sqrt(11.0) * np.resize([-1.0, 1.0], 12))
-    means = iter([np.full(12, 2.0), np.ones(12), 1.0 - gains])
-    monkeypatch.setattr(qpmhe.tuning.Tuning, "_block_means", lambda *_: next(means))
-    monkeypatch.setattr(tuning_module, "refine", lambda score, structure, theta, *_: theta + 0.7)
+    means = iter([np.ones(12), 1.0 - gains, 1.0 - gains, np.full(12, 2.0)])
+    monkeypatch.setattr(judge.Blocks, "means", lambda *_: next(means))
+    monkeypatch.setattr(contest, "refine", lambda score, structure, theta, *_: theta + 0.7)
     tuning = tuned(structure="scalar", held_out=0.0, objective="prediction", max_qps=1)
     found, least = (
         one.scores["negative log likelihood per sample"][1] for one in (tuning, likely)
@@ -363,6 +363,71 @@ def test_what_was_found_makes_an_estimator_and_compares_horizons():
     # On a linear system the Kalman filter's prior makes all horizons the same.
     assert rows[2, "observer"] == pytest.approx(rows[6, "observer"], rel=1e-6)
     assert rows[2, "constant"] != pytest.approx(rows[6, "constant"], rel=1e-6)
+
+
+def test_observers_are_alike_on_a_linear_system_and_the_simplest_is_taken():
+    tuning = tuned([simulated(steps=250)], horizon=3, observers="all", max_qps=1,
+                   structure="scalar")
+    rows = tuning.observers
+    assert {(row.observer.partition("(")[0], row.max_qps) for row in rows} == {
+        (name, qps) for name in ("ekf", "gated", "ukf", "steady") for qps in (0, 1)
+    }
+    scores = [row.score for row in rows]
+    assert scores == sorted(scores)
+    assert scores[-1] == pytest.approx(scores[0], rel=0.05)
+    plain = {row.score for row in rows if row.observer in ("ekf", "ukf")}
+    assert max(plain) == pytest.approx(min(plain), rel=1e-6)
+    assert (tuning.weights.observer_name, tuning.weights.max_qps) == ("ekf", 0)
+    text, page = str(tuning), tuning._repr_html_()
+    assert "ekf *" in text
+    assert "MHE, 1 QP on steady" in text
+    assert page.count("<table>") == 3
+    assert "<td>ekf *</td>" in page
+    assert all(row.seconds > 0.0 for row in rows)
+
+
+def cube(x):
+    return x**3
+
+
+def test_the_unscented_filter_wins_where_the_tangent_says_nothing(tmp_path):
+    """The slope of x^3 is 0 about the mean: the extended filter does not see x from there."""
+    generator, steps = np.random.default_rng(3), 400
+    x = np.zeros((steps + 1, 1))
+    for t in range(steps):
+        x[t + 1] = 0.95 * x[t] + 0.3 * generator.standard_normal()
+    y = cube(x[:-1]) + 0.1 * generator.standard_normal((steps, 1))
+    system = qpmhe.System(lambda x: 0.95 * x, cube, n=1, p=1)
+    given = {"prior": [[1.0]], "disturbance": [[0.09]], "noise": [[0.01]], "initial_state": [0.0]}
+    found = tuned([(y, None, x)], system, **given, observers=["ekf", "ukf"], max_qps=0,
+                  structure="scalar", ahead=1)
+    best, other = found.observers
+    assert (best.observer, other.observer) == ("ukf", "ekf")
+    assert best.errors["y1"] < 0.9 * other.errors["y1"]
+    weights = load(found.save(tmp_path / "weights.toml"))
+    assert (weights.observer_name, weights.max_qps) == ("ukf", 0)
+    with pytest.raises(OptionError, match=r"observer\(system=system\)"):
+        weights.observer()
+    assert isinstance(found.observer(), qpmhe.UnscentedKalman)
+    states = [
+        qpmhe.MovingHorizonEstimator(
+            system, observer, weights.cost(), horizon=3, initial_state=[0.0], max_qps=0,
+        ).run(y).states for observer in (weights.observer(system=system), found.observer())
+    ]
+    np.testing.assert_array_equal(*states)
+
+
+def test_an_observer_that_fails_is_last_and_says_why():
+    """No constant gain observes the integrator that no output shows."""
+    system = qpmhe.System(lambda x, u: x + 0.1 * u, first_of_two, n=2, p=1, m=1)
+    tuning = tuned([simulated(steps=200)], system, observers=["steady", "ekf"], max_qps=0,
+                   structure="scalar")
+    assert [row.observer.partition("(")[0] for row in tuning.observers] == ["ekf", "steady"]
+    assert "not detectable" in tuning.observers[-1].failure
+    assert "steady fails: observer" in str(tuning)
+    assert tuning.weights.observer_name == "ekf"
+    with pytest.raises(ModelError, match=r"no observer can be tuned .*: steady: .*not detectable"):
+        tuned([simulated(steps=200)], system, observers=["steady"], max_qps=0)
 
 
 @pytest.mark.slow
@@ -411,6 +476,12 @@ TWO = {"system": qpmhe.System(line, lambda x: x, n=2, p=2, m=1), "noise": np.eye
        "records": [(np.hstack((Y, np.nan * Y)), U)]}
 ROOT = qpmhe.System(lambda x, u: np.sqrt(x - 5.0), first_of_two, n=2, p=1, m=1,
                     f_jacobian=lambda x, u: np.eye(2), states=qpmhe.Box([0, 0], [99, 99]))
+
+
+def of_a_gain(problem):
+    return qpmhe.Luenberger([[0.1], [0.1]])
+
+
 BAD = {
     "too short": (InvalidInputError, "too few for 3 parameters",
                   {"records": [(Y[:20], U[:20])], "held_out": 0.0}),
@@ -427,6 +498,17 @@ BAD = {
     "broken model": (ModelError, "not finite at the start", {"system": ROOT}),
     "no threshold": (OptionError, "threshold=3.0", {"structure": {"threshold": True}}),
     "observer of a gain": (OptionError, "raised TypeError", {"observer": qpmhe.Luenberger}),
+    "unknown observer": (ModelError, "'eckf' is not known.*Did you mean ekf", {
+        "observers": ["ukf", "eckf"]}),
+    "no observers": (OptionError, "observers is empty", {"observers": []}),
+    "one word": (OptionError, "observers is 'ekf'; expected 'all', or a list", {
+        "observers": "ekf"}),
+    "twice": (OptionError, "'ekf' more than once", {"observers": ["ekf", "ekf"]}),
+    "two ways": (OptionError, "both observer and observers", {
+        "observers": ["ekf"], "observer": qpmhe.UnscentedKalman}),
+    "no covariance": (OptionError, "no covariance to weigh the prior, so it cannot be tuned", {
+        "observers": [f"{__name__}:of_a_gain"]}),
+    "endless QPs": (InvalidInputError, "max_qps is None", {"observers": ["ekf"], "max_qps": None}),
     "option": (QpmheError, "no option", {"objective": "prediction", "horizn": 3}),
 }  # fmt: skip
 

@@ -88,6 +88,8 @@ def test_what_is_saved_is_loaded(tmp_path):
     ("format = 2\nCOVARIANCES", "its format is not 1"),
     ("format = 1\n[covariances]\nprior = [[1]]\ndisturbance = [[1]]", "'noise' is missing"),
     ("format = 1\nhorizon = 2.5\nCOVARIANCES", r"horizon is 2\.5; expected an integer"),
+    ("format = 1\nobserver_name = 'nkf'\nCOVARIANCES", "observer 'nkf' is not known"),
+    ("format = 1\nmax_qps = -1\nCOVARIANCES", "max_qps is -1"),
     ("format = 1\nhorison = 3\nCOVARIANCES", "it has 'horison', which weights do not have"),
 ])  # fmt: skip
 def test_a_file_without_weights_is_refused_by_name(tmp_path, text, words):
@@ -134,7 +136,24 @@ def test_truth_several_records_and_a_new_folder(folder):
     assert [one.name for one in (folder / "new").iterdir()] == ["two.toml"]
 
 
+def test_the_best_observer_goes_into_the_file_and_from_there_to_estimate(folder):
+    shown = call(*TUNE, "--observers", "steady(at=[0,0],u=[0]), ukf", "--objective", "likelihood",
+                 "--structure", "scalar")
+    assert "MHE, 2 QPs on ukf" in shown
+    weights = load("weights.toml")
+    assert weights.observer_name in ("steady(at=[0, 0], u=[0])", "ukf")
+    assert weights.max_qps == 0
+    call(*ESTIMATE, "--weights", "weights.toml")
+    found = np.genfromtxt("estimates.csv", delimiter=",", names=True, dtype=None, encoding=None)
+    assert set(found["qps"]) == {0}
+    call(*ESTIMATE, "--weights", "weights.toml", "--max-qps", "1", "--overwrite")
+    found = np.genfromtxt("estimates.csv", delimiter=",", names=True, dtype=None, encoding=None)
+    assert 1 in found["qps"]
+
+
 @pytest.mark.parametrize(("arguments", "error", "text"), [
+    ([*TUNE, "--observers", "ukff"], ModelError, "observer 'ukff' is not known.*Did you mean ukf"),
+    ([*TUNE, "--observers", ","], OptionError, "--observers is empty"),
     ([*TUNE, "--truth", "x3=position"], OptionError, "--truth has 'x3=position'.* of x1, x2"),
     ([*TUNE, "--truth", "x1=WRONG"], RecordError, "with --truth x1=COLUMN, or leave it out: then"),
     ([*TUNE, "--held-out", "0.9"], OptionError, r"--held-out is 0\.9"),
