@@ -84,7 +84,7 @@ static int mhe_guard_is_within(const mhe_guard_set *set, const real *s)
 
 @dataclass(frozen=True)
 class GuardForm:
-    """The numbers of a guard, for an estimator from its first sample on.
+    r"""The numbers of a guard, for an estimator from its first sample on.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class GuardForm:
     gain : (n, p) array
         The certified gain.
     slopes : (n,) array
-        :math:`|e_j| \\le s_j |e|_P`.
+        :math:`|e_j| \le s_j |e|_P`.
     lower, upper : (n + m,) array
         Bounds on states and inputs that were certified.
     region, states : ConvexSet
