@@ -92,3 +92,27 @@ def test_the_parameter_file_and_the_target_follow_from_the_data(parts, cell):
     assert fit.misfit == pytest.approx(shipped["misfit_V"]["weighted_rms"], abs=5e-4)
     record = parts["cell"].read(cell, DATA / "hwfet_25degC.mat", False)
     assert rmse(parts, cell, record, "MHE, Huber, 1 QP") < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*reached but the optimization")
+def test_a_network_learns_an_error_of_the_voltage(cell, gallery):
+    """A record of the circuit plus a known error: what is left, and what the output becomes."""
+    pytest.importorskip("sklearn")
+    learnt, model = (import_module(f"gallery.battery.{name}") for name in ("learnt", "model"))
+    current = -3.0 + 2.0 * np.sin(np.arange(400) / 7.0)[:, None]
+    charge = DT * np.append(0.0, np.cumsum(current)[:-1]) / (3600.0 * cell.capacity)
+    x, voltage = np.array([1.0, 0.0, 0.0, 1.0]), np.zeros((400, 1))
+    system = model.system_of(cell, DT)
+    for k, u in enumerate(current):
+        x[0] = 1.0 + charge[k]
+        voltage[k] = system.h(x, u) + 0.02 + 0.1 * x[2]
+        x = system.f(x, u)
+    cycle = voltage, current, 1.0 + charge[:, None]
+    inputs, gap = learnt.left_over(cell, cycle)
+    np.testing.assert_allclose(gap, 0.02 + 0.1 * inputs[:, 2], atol=1e-12)
+    net = learnt.trained(inputs, gap)
+    assert np.abs(gap - net(inputs)[:, 0]).max() < 0.1 * np.ptp(gap) + 1e-3
+    corrected = model.system_of(cell, DT, net)
+    found = corrected.h(np.append(inputs[200, :3], 1.0), current[200])
+    np.testing.assert_allclose(found, voltage[200], atol=0.003)

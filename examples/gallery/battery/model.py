@@ -15,6 +15,7 @@ are at 25 degC and do not show how.
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +68,12 @@ class Cell:
         A h.
     tau : (2,) array
         s.
+    hppc_charge_factor : float
+        The charge in units of the C/20 test, over that which the HPPC test's counter shows.
     """
 
     def __init__(self, parameters: dict[str, Any]) -> None:
+        self.hppc_charge_factor = float(parameters["hppc_charge_factor"])
         self.capacity = float(parameters["capacity_Ah"])
         circuit, voltage = parameters["circuit"], np.array(parameters["ocv"]["V"])
         self.tau: Array = np.array(circuit["tau_s"])
@@ -106,7 +110,9 @@ def _kinks(knots: Array, values: Array) -> Array:
     return np.diff(slopes, prepend=0.0, append=0.0)
 
 
-def system_of(cell: Cell, dt: float) -> qpmhe.System:
+def system_of(
+    cell: Cell, dt: float, correction: Callable[[Array], Array] | None = None
+) -> qpmhe.System:
     """The discrete-time system; its functions take x (..., 4) and u (..., 1).
 
     Parameters
@@ -115,6 +121,8 @@ def system_of(cell: Cell, dt: float) -> qpmhe.System:
         The parameters.
     dt : float
         Sampling time in s.
+    correction : callable, optional
+        What y has beyond the circuit (V), of (SOC, v1, v2, I).
     """
     decay = np.exp(-dt / cell.tau)
     held = cell.tau * (1.0 - decay) / dt
@@ -135,6 +143,8 @@ def system_of(cell: Cell, dt: float) -> qpmhe.System:
         for j in range(2):
             dropped = (1.0 - held[j]) * rho * cell.resistance(soc, j + 1) * u
             y = y + held[j] * x[..., j + 1 : j + 2] + dropped
+        if correction is not None:
+            y = y + correction(np.concatenate((x[..., :3], u), axis=-1))
         return y
 
     free = np.inf
