@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Unpack
@@ -16,7 +17,9 @@ from ..codegen.compiler import WrongCodeError, compiled_library, find_compiler
 from ..codegen.fingerprint import source_key
 from ..codegen.source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
+from ..model.accuracy import TRIED, Choice, choice
 from ..model.augmentation import Augmentation
+from ..model.discretize import AUTO, Discretization
 from ..model.evaluation import (
     NAMES,
     RESIDUALS,
@@ -29,9 +32,10 @@ from ..model.evaluation import (
 from ..model.expressions import CasadiModel, casadi_model, import_casadi, integrated
 from ..model.functions import Trusted
 from ..model.model import Origin
+from ..model.ode import checked_method
 from ..model.sets import ConvexSet
 from ..model.system import System
-from ..model.system_arguments import SystemOptions, checked_set, timed_options
+from ..model.system_arguments import SystemOptions, checked_scales, checked_set, timed_options
 
 Array = NDArray[np.float64]
 
@@ -43,6 +47,7 @@ def from_casadi(
     dt: float | None = None,
     method: str = "rk4",
     steps: int = 1,
+    tolerance: float | None = None,
     n: int | None = None,
     p: int | None = None,
     m: int | None = None,
@@ -63,10 +68,12 @@ def from_casadi(
     dt : float, optional
         Sampling time. If given, f is the right-hand side of an ODE, in units of x per unit of time,
         discretised with u held over the step.
-    method : {"rk4", "euler", "radau", "midpoint"}
+    method : {"rk4", "euler", "radau", "midpoint", "auto"}
         How the ODE is discretised, see `qpmhe.System.from_ode`.
     steps : int
-        Number of substeps in each sample.
+        Number of substeps in each sample; left out with ``"auto"``.
+    tolerance : float, optional
+        With ``"auto"``, as for `qpmhe.System.from_ode`.
     n, p, m : int, optional
         Numbers of states, outputs and inputs; n (and m, if there are inputs) are required if f is
         not a casadi.Function.
@@ -83,7 +90,8 @@ def from_casadi(
     Raises
     ------
     ModelError, SetError, OptionError
-        If a function, size, set or option is invalid; the message names it.
+        If a function, size, set or option is invalid; the message names it. Also if ``"auto"``
+        finds no step that is accurate enough.
     InvalidInputError
         If n is missing.
     CompilationError
@@ -91,7 +99,17 @@ def from_casadi(
     """
     if not (compiled is None or isinstance(compiled, bool)):
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
-    model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, method=method, steps=steps)
+    how, allowed = checked_method(method, steps, tolerance)
+    model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, how=how)
+    chosen: Choice | None = None
+    if how.method == AUTO:
+        if model.dt is None:
+            raise OptionError(
+                "method is 'auto', but dt is missing, so that f is the step; pass dt and the rate."
+            )
+        chosen = _chosen(model, model.dt, options, allowed)
+        how = chosen.how
+        model = replace(model, how=how)
     library: ctypes.PyDLL | None = None
     if compiled or (compiled is None and find_compiler() is not None):
         library = _library(
@@ -103,12 +121,12 @@ def from_casadi(
         return from_casadi(
             change.of_one_state(model.f, join, 1.0 if dt is None else 0.0),
             change.of_one_state(model.h, join),
-            n=change.n, p=model.p, m=change.m, dt=dt, method=method, steps=steps,
+            n=change.n, p=model.p, m=change.m, dt=dt, method=how.method, steps=how.steps,
             compiled=compiled, **others,
         )
 
     recipe = {
-        "f": model.f, "h": model.h, "dt": dt, "method": method, "steps": steps,
+        "f": model.f, "h": model.h, "dt": dt, "method": how.method, "steps": how.steps,
         "compiled": compiled, **options,
     }
 
@@ -125,7 +143,7 @@ def from_casadi(
         )
         if not timed:
             origin = replace(
-                origin, dt=model.dt, how=model.how, make_augmented=augmented,
+                origin, dt=model.dt, how=model.how, choice=chosen, make_augmented=augmented,
                 make_timed=None if model.dt is None else lambda _: made(True),
                 recipe=(from_casadi, recipe),
             )
@@ -136,6 +154,20 @@ def from_casadi(
         )
 
     return made(False)
+
+
+def _chosen(model: CasadiModel, dt: float, options: SystemOptions, tolerance: float) -> Choice:
+    """The discretisation of a rate that ``method="auto"`` takes."""
+    def stepper(how: Discretization) -> Callable[[Array, Array, Array], Array]:
+        tried = Evaluator(machine(replace(model, how=how), True)).one
+        return lambda dt, x, u: tried("f", x, np.column_stack((u, dt)))
+
+    scales = options.get("scales")
+    return choice(
+        stepper, tuple(TRIED), dt, model.n, model.m,
+        checked_set("states", options.get("states"), model.n),
+        None if scales is None else checked_scales(scales, model.n), tolerance,
+    )
 
 
 def _library(

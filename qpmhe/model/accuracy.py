@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -131,10 +132,13 @@ def _named(how: Discretization) -> str:
 
 def _stepped(step: Callable[[Array, Array, Array], Array], dt: float, where: Points) -> Array:
     """The next states at all points; NaN where the functions raise."""
-    found = np.full((len(where), where[0][0].size), np.nan)
-    for k, (x, u) in enumerate(where):
+    x, u = (np.array(one) for one in zip(*where, strict=True))
+    with suppress(Exception):
+        return step(np.full(len(x), dt), x, u)
+    found = np.full(x.shape, np.nan)
+    for k in range(len(x)):
         try:
-            found[k] = step(np.array([dt]), x[None], u[None])[0]
+            found[k] = step(np.array([dt]), x[k : k + 1], u[k : k + 1])[0]
         except Exception:  # outside of the functions' domain
             continue
     return found

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Unpack, cast
 from numpy.typing import ArrayLike
 
 from .dae import made_from_dae, made_from_implicit
-from .discretize import checked_discretization
 from .functions import Trusted
 from .implicit_steps import COLLOCATIONS
 from .ode import checked_method, made_from_ode
@@ -103,6 +102,7 @@ class ContinuousTime:
         algebraic_set: ConvexSet | SoftSet | None = None,
         method: str = "radau",
         steps: int = 1,
+        tolerance: float | None = None,
         **options: Unpack[SystemOptions],
     ) -> System:
         r"""Discretise a differential-algebraic equation of index 1; u is held over the step.
@@ -135,10 +135,12 @@ class ContinuousTime:
         algebraic_set : Box or Polytope, optional
             A set of z at every sample, hard or soft: nonlinear constraints of x and u, which only
             the Python step has.
-        method : {"radau", "midpoint"}
-            As for `from_ode`.
+        method : {"radau", "midpoint", "auto"}
+            As for `from_ode`; ``"auto"`` chooses between substeps of ``"radau"``.
         steps : int
-            Number of substeps of equal length in each sample.
+            Number of substeps of equal length in each sample; left out with ``"auto"``.
+        tolerance : float, optional
+            As for `from_ode`, of the error in x.
         **options
             As for `System`.
 
@@ -149,8 +151,9 @@ class ContinuousTime:
             does not have k entries.
         ModelError, SetError
             As for `System`; also if :math:`\partial g / \partial z` is singular, structurally or at
-            all points that are tried (index 2), or at the guess (a fold). An estimator raises one
-            if no z is found at its initial state.
+            all points that are tried (index 2), or at the guess (a fold), or if ``"auto"`` finds no
+            step that is accurate enough. An estimator raises one if no z is found at its initial
+            state.
 
         Examples
         --------
@@ -164,10 +167,11 @@ class ContinuousTime:
         >>> system.algebraic_states(np.array([1.1, 0.0]))
         array([-1.])
         """
+        how, allowed = checked_method(method, steps, tolerance, tuple(COLLOCATIONS))
         return made_from_dae(
             cast("type[System]", cls), rate, algebraic, h, dt=dt, n=n, k=k, p=p, m=m,
-            how=checked_discretization(method, steps, tuple(COLLOCATIONS)),
-            guess=algebraic_guess, options=options, algebraic_set=algebraic_set,
+            how=how, guess=algebraic_guess, options=options, algebraic_set=algebraic_set,
+            tolerance=allowed,
         )
 
     @classmethod
@@ -185,6 +189,7 @@ class ContinuousTime:
         rate_guess: ArrayLike | None = None,
         method: str = "radau",
         steps: int = 1,
+        tolerance: float | None = None,
         **options: Unpack[SystemOptions],
     ) -> System:
         r"""Discretise :math:`0 = F(\dot x, x, z, u)` of index 1; u is held over the step.
@@ -204,7 +209,7 @@ class ContinuousTime:
             Numbers of states, outputs, algebraic states and inputs.
         algebraic_guess, rate_guess : (k,) and (n,) array_like, optional
             Where z and the rates are looked for. The rates' is zero if left out.
-        method, steps, **options
+        method, steps, tolerance, **options
             As for `from_dae`.
 
         Raises
@@ -225,8 +230,9 @@ class ContinuousTime:
         >>> system.algebraic_states(np.array([1.0, 0.0])).round(4)
         array([ 0.    , -0.3333])
         """
+        how, allowed = checked_method(method, steps, tolerance, tuple(COLLOCATIONS))
         return made_from_implicit(
             cast("type[System]", cls), residual, h, dt=dt, n=n, k=k, p=p, m=m,
-            how=checked_discretization(method, steps, tuple(COLLOCATIONS)),
-            guess=algebraic_guess, rate_guess=rate_guess, options=options,
+            how=how, guess=algebraic_guess, rate_guess=rate_guess, options=options,
+            tolerance=allowed,
         )

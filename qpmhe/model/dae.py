@@ -15,13 +15,14 @@ from qpmhe_solvers.values import shown
 
 from .._checks import dimension, numbers, positive, vector
 from ..errors import InvalidInputError, ModelError, QpmheError, ShapeError
+from .accuracy import TOLERANCE, TRIED, Choice, choice
 from .algebraic import AlgebraicStates
 from .algebraic_set import AlgebraicSet
 from .constraints import checked_constraints
 from .derivatives import Jacobian
-from .discretize import Discretization, of_any_shape
+from .discretize import AUTO, Discretization, of_any_shape
 from .functions import BatchedFunction, Trusted
-from .implicit_steps import ImplicitStep
+from .implicit_steps import COLLOCATIONS, ImplicitStep
 from .index import check_index, unsolved
 from .model import Origin
 from .ode import timed_by_input, without_last
@@ -109,7 +110,7 @@ def made_from_dae(
     cls: type[System], rate: Function | Trusted, algebraic: Function | Trusted,
     h: Function | Trusted, *, dt: float, n: int, k: int, p: int, m: int, how: Discretization,
     guess: ArrayLike, options: SystemOptions,
-    algebraic_set: ConvexSet | SoftSet | None = None,
+    algebraic_set: ConvexSet | SoftSet | None = None, tolerance: float = TOLERANCE,
 ) -> System:
     """The system that `System.from_dae` describes."""
     n, k, m = dimension("n", n, 1), dimension("k", k, 1), dimension("m", m, 0)
@@ -132,17 +133,28 @@ def made_from_dae(
     )
     differences = Jacobian(joint, None, m, probes)
     sizes = options.get("scales")
+    scales = None if sizes is None else checked_scales(sizes, n)
     differences.use_scales(np.concatenate((
-        np.ones(n) if sizes is None else checked_scales(sizes, n),
+        np.ones(n) if scales is None else scales,
         np.where(start == 0.0, 1.0, np.abs(start)),
     )), None, ())
     equations = Equations(joint, functions["h"], differences.batch, start)
     check_index(differences.batch, n, start, probes)
     solver, slope_of_h = equations.solver, Jacobian(functions["h"], None, m, probes)
-    step, slope = of_any_shape(
-        ImplicitStep(joint.batch, differences.batch, how.method, how.steps, solver),
-        solver.complete,
-    )
+
+    def implicit(how: Discretization) -> ImplicitStep:
+        return ImplicitStep(joint.batch, differences.batch, how.method, how.steps, solver)
+
+    chosen: Choice | None = None
+    if how.method == AUTO:
+        def stepper(how: Discretization) -> Callable[[Array, Array, Array], Array]:
+            tried = implicit(how)
+            return lambda dt, x, u: tried.value(solver.complete(x, u), u, dt)
+
+        tries = tuple(one for one in TRIED if one in COLLOCATIONS)
+        chosen = choice(stepper, tries, length, n, m, states, scales, tolerance)
+        how = chosen.how
+    step, slope = of_any_shape(implicit(how), solver.complete)
 
     def output(x: Array, u: Array = _NOTHING) -> Array:
         return _of_rows(lambda w, u: functions["h"].batch(w, u), solver, x, u, (p,))
@@ -190,8 +202,8 @@ def made_from_dae(
     made = cls.made(
         Trusted(partial(step, length)), Trusted(output),
         Origin(
-            dt=length, how=how, rate=joint, equations=equations, jacobians="finite differences",
-            make_timed=timed, make_augmented=augmented,
+            dt=length, how=how, rate=joint, equations=equations, choice=chosen,
+            jacobians="finite differences", make_timed=timed, make_augmented=augmented,
             recipe=(cls.from_dae, {
                 "rate": rate, "algebraic": algebraic, "h": h, "dt": dt, "n": n, "k": k, "p": p,
                 "m": m, "method": how.method, "steps": how.steps, "algebraic_guess": start,
@@ -209,7 +221,7 @@ def made_from_dae(
 def made_from_implicit(
     cls: type[System], residual: Function, h: Function, *, dt: float, n: int, k: int, p: int,
     m: int, how: Discretization, guess: ArrayLike | None, rate_guess: ArrayLike | None,
-    options: SystemOptions,
+    options: SystemOptions, tolerance: float = TOLERANCE,
 ) -> System:
     """The system that `System.from_implicit` describes: one whose rates are algebraic states."""
     n, k = dimension("n", n, 1), dimension("k", k, 0)
@@ -225,11 +237,11 @@ def made_from_implicit(
     of_output = _of_parts("h", h, names[1:], m, n, lambda x, _: (x,))
     made = made_from_dae(
         cls, lambda _, v: v[..., :n], of_residual, of_output, dt=dt, n=n, k=n + k, p=p, m=m,
-        how=how, guess=np.concatenate((rates, start)), options=options,
+        how=how, guess=np.concatenate((rates, start)), options=options, tolerance=tolerance,
     )
     return made.with_origin(recipe=(cls.from_implicit, {
         "residual": residual, "h": h, "dt": dt, "n": n, "k": k, "p": p, "m": m,
-        "method": how.method, "steps": how.steps, "algebraic_guess": start if k else None,
+        "method": made.method, "steps": made.steps, "algebraic_guess": start if k else None,
         "rate_guess": rates, **options,
     }))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._checks import dimension, positive
 from ..errors import InvalidInputError, ModelError
-from .discretize import Discretization, checked_discretization
+from .discretize import Discretization
 from .functions import check_inputs, takes_input
 from .products import has_products, with_products, with_slope
 
@@ -134,12 +134,10 @@ def casadi_model(
     p: int | None = None,
     m: int | None = None,
     dt: float | None = None,
-    method: str = "rk4",
-    steps: int = 1,
+    how: Discretization | None = None,
 ) -> CasadiModel:
     """Check the arguments of `qpmhe.from_casadi`, and bring the model to the common form."""
     ca = import_casadi()
-    how = checked_discretization(method, steps)
     for name, size, least in (("n", n, 1), ("p", p, 1), ("m", m, 0)):
         if size is not None:
             dimension(name, size, least)

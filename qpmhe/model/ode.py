@@ -30,15 +30,17 @@ Function = Callable[..., Any]
 
 
 def checked_method(
-    method: str, steps: int, tolerance: float | None
+    method: str, steps: int, tolerance: float | None, methods: tuple[str, ...] = METHODS
 ) -> tuple[Discretization, float]:
     """The arguments of `System.from_ode` of these names, checked."""
-    how = checked_discretization(method, steps, (*METHODS, AUTO))
+    how = checked_discretization(method, steps, (*methods, AUTO))
     if tolerance is not None and method != AUTO:
         raise OptionError(
             f"tolerance is {shown(tolerance)}, but method is {method!r}, whose steps are as "
             "many as steps says; leave it out, or take method='auto'."
         )
+    if tolerance is not None:
+        tolerance = positive("tolerance", tolerance)
     if steps != 1 and method == AUTO:
         raise OptionError(f"steps is {steps}, but method='auto' chooses steps; leave steps out.")
     return how, TOLERANCE if tolerance is None else tolerance
@@ -77,7 +79,7 @@ def made_from_ode(
             return lambda dt, x, u: tried(dt, x, *([u] if m else []))
 
         chosen = choice(
-            stepper, tuple(TRIED), length, n, m, states, scales, positive("tolerance", tolerance)
+            stepper, tuple(TRIED), length, n, m, states, scales, tolerance
         )
         how = chosen.how
     step, step_jacobian = discretize(over_leading, slope if how.is_implicit else (

@@ -1,6 +1,7 @@
 """What only CasADi's models have: ways of writing, matrix functions, code, failed evaluations."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -295,3 +296,30 @@ def test_a_model_that_overflows_is_compared_without_a_warning():
 
     with pytest.raises(ModelError, match="one formula for both"):
         from_casadi(another, lambda x: x[1], n=2, p=1)
+
+
+def test_auto_chooses_once_and_a_pickle_has_the_choice():
+    def kinetics(x):
+        one, two, three = 0.04 * x[0], 1e4 * x[1] * x[2], 3e7 * x[1] ** 2
+        return ca.vertcat(two - one, one - two - three, three)
+
+    options = {"dt": 1.0, "n": 3, "p": 1, "scales": [1.0, 3e-5, 1.0], "compiled": False}
+    made = from_casadi(kinetics, lambda x: x[2], method="auto", tolerance=1e-3, **options)
+    assert (made.method, made.steps) == ("radau", 1)
+    words = made.explain().split("step: ")[1].splitlines()
+    assert words[0].startswith("radau with 1 substep, the cheapest")
+    assert len(words) == 12
+    other = from_casadi(kinetics, lambda x: x[2], method="radau", **options)
+    x = np.array([0.9, 2e-5, 0.1])
+    np.testing.assert_array_equal(made.f(x), other.f(x))
+    assert pickle.loads(pickle.dumps(made)).method == "radau"
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"method": "auto"}, "method is 'auto', but dt is missing"),
+    ({"method": "auto", "dt": 0.1, "steps": 2}, "method='auto' chooses steps"),
+    ({"dt": 0.1, "tolerance": 1e-6}, "tolerance is 1e-06, but method is 'rk4'"),
+])
+def test_bad_arguments_of_auto(options, words):
+    with pytest.raises(OptionError, match=words):
+        from_casadi(lambda x: -x, lambda x: x, n=1, compiled=False, **options)

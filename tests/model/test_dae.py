@@ -318,6 +318,20 @@ def test_steps_of_other_lengths_and_pickles():
     np.testing.assert_array_equal(again.f(X, U), system.f(X, U))
 
 
+@pytest.mark.slow
+def test_auto_takes_the_fewest_substeps_that_are_accurate():
+    options = {"dt": 1.0, "method": "auto", "scales": [1.0, 3e-5]}
+    made = robertson_system(tolerance=1e-6, **options)
+    other = robertson_system(**options | {"method": "radau", "steps": made.steps})
+    x = np.array([0.7, 1e-5])
+    np.testing.assert_array_equal(made.f(x), other.f(x))
+    words = made.explain().split("step: ")[1].splitlines()
+    assert words[0].startswith(f"radau with {made.steps} substeps, the cheapest")
+    errors = {int(one.split()[1]): float(one.split()[-3]) for one in words[1:]}
+    assert list(errors) == [1, 2, 4, 8, 16]
+    assert errors[made.steps] <= 1e-6 < errors[made.steps // 2]
+
+
 def test_algebraic_states_over_leading_dimensions():
     system = swing_system()
     z = system.algebraic_states(X, U)
