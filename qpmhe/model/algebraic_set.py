@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -82,8 +81,7 @@ class AlgebraicSet:
         if self._traced is None or self._traced[0] is not now:
             solver, model = self._written, now.model
             if model is not None:
-                parts = replace(model, n=model.width, guess=(), dt=None, how=None)
-                one = Evaluator(VirtualMachine(parts, False)).one
+                one = Evaluator(VirtualMachine(model.equations, False)).one
                 solver = AlgebraicStates(
                     partial(one, "f"), partial(one, "f_jacobian"), self._written.guess
                 )

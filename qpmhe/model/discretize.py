@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import choice, dimension
-from .implicit_steps import COLLOCATIONS, ImplicitStep
+from .implicit_steps import COLLOCATIONS, Collocation, ImplicitStep
 
 Array = NDArray[Any]
 Function = Callable[..., Any]
@@ -31,6 +31,11 @@ class Discretization(NamedTuple):
     def is_implicit(self) -> bool:
         """Whether a step solves equations."""
         return self.method in COLLOCATIONS
+
+    @property
+    def collocation(self) -> Collocation:
+        """The coefficients, of an implicit method."""
+        return COLLOCATIONS[self.method]
 
 
 def checked_discretization(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -168,9 +167,8 @@ class ImplicitMachine:
 
     def __init__(self, model: CasadiModel, timed: bool) -> None:
         assert model.how is not None
-        parts = replace(model, n=model.width, guess=(), dt=None, how=None)
         self._model, self._timed = model, timed
-        self._evaluator = evaluator = Evaluator(VirtualMachine(parts, False))
+        self._evaluator = evaluator = Evaluator(VirtualMachine(model.equations, False))
         functions = partial(evaluator.one, "f"), partial(evaluator.one, "f_jacobian")
         self._algebraic: AlgebraicStates | None = None
         if model.guess:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,11 @@ class CasadiModel:
     def width(self) -> int:
         """Number of states and algebraic states, which f and h are functions of."""
         return self.n + len(self.guess)
+
+    @property
+    def equations(self) -> CasadiModel:
+        """The functions of w alone, as those of a map."""
+        return replace(self, n=self.width, guess=(), dt=None, how=None)
 
     @property
     def is_implicit(self) -> bool:

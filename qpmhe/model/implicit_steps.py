@@ -12,6 +12,7 @@ stages: exact, whatever the iteration did.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -96,38 +97,47 @@ class ImplicitStep:
         self._rate, self._jacobian, self._steps = rate, jacobian, steps
         self._method, self._algebraic = COLLOCATIONS[method], algebraic
 
-    def value(self, w: Array, u: Array, dt: Array) -> Array:
-        """The next states (K, n), from w = (x, z) (K, n + k), inputs (K, m) and lengths (K,)."""
+    def substeps(self, w: Array, u: Array, dt: Array) -> Iterator[tuple[Array, Array, Array]]:
+        """State (K, n), stages (K, s, n + k) and length (K,) of each substep, from w = (x, z)."""
         h, n = dt / self._steps, w.shape[1] - self._k
         for k in range(self._steps):
-            w = w if k == 0 else self._completed(w, u)
-            w = w[:, :n] + np.einsum("i,kin->kn", self._method.d, self._stages(w, u, h)[..., :n])
-        return w
+            w = w if k == 0 else self.completed(w, u)
+            x, W = w[:, :n], self._stages(w, u, h)
+            yield x, W, h
+            w = self._end(x, W)
+
+    def value(self, w: Array, u: Array, dt: Array) -> Array:
+        """The next states (K, n), from w = (x, z) (K, n + k), inputs (K, m) and lengths (K,)."""
+        for x, W, _ in self.substeps(w, u, dt):
+            following = self._end(x, W)
+        return following
 
     def linear(self, w: Array, u: Array, dt: Array) -> tuple[Array, Array]:
         """The next states (K, n) and their derivatives by x (K, n, n)."""
-        h, method, count, n = dt / self._steps, self._method, len(w), w.shape[1] - self._k
+        method, count, n = self._method, len(w), w.shape[1] - self._k
         s, identity = len(method.A), np.eye(n)
         slopes = np.broadcast_to(identity, (count, n, n))
-        for k in range(self._steps):
-            w = w if k == 0 else self._completed(w, u)
-            x, W = w[:, :n], self._stages(w, u, h)
+        for x, W, h in self.substeps(w, u, dt):
             with np.errstate(all="ignore"):
                 J = eliminated(np.zeros_like(W), self._slopes(x, u, W), n).jacobian
             # (I - h A J) dZ/dx = h A J (1, ..., 1).
             right = h[:, None, None, None] * np.einsum("ij,kjab->kiab", method.A, J)
-            matrix = _newton_matrix(method.A, h, J)
+            matrix = newton_matrix(method.A, h, J)
             dZ = solved(matrix, right.reshape(count, s * n, n), inverse(matrix))
             own = identity + np.einsum("i,kiab->kab", method.d, dZ.reshape(count, s, n, n))
-            slopes = own @ slopes
-            w = x + np.einsum("i,kin->kn", method.d, W[..., :n])
-        return w, slopes
+            slopes, following = own @ slopes, self._end(x, W)
+        return following, slopes
+
+    def _end(self, x: Array, W: Array) -> Array:
+        found: Array = x + np.einsum("i,kin->kn", self._method.d, W[..., : x.shape[1]])
+        return found
 
     @property
     def _k(self) -> int:
         return 0 if self._algebraic is None else self._algebraic.guess.size
 
-    def _completed(self, x: Array, u: Array) -> Array:
+    def completed(self, x: Array, u: Array) -> Array:
+        """The states w = (x, z), where there are algebraic states, else x."""
         return x if self._algebraic is None else self._algebraic.complete(x, u)
 
     def _at_stages(self, function: Batched, x: Array, u: Array, W: Array) -> Array:
@@ -173,7 +183,7 @@ class ImplicitStep:
         for iteration in range(MOST_ITERATIONS):
             J = self._slopes(x[at], u[at], W[at])
             found = eliminated(values, J, n)
-            inverses = inverse(_newton_matrix(self._method.A, h[at], found.jacobian))
+            inverses = inverse(newton_matrix(self._method.A, h[at], found.jacobian))
             moves = self._correction(found, inverses, h[at], W[at])
             step, k = moves[..., :n], W.shape[2] - n
             # What rounding of the states and of their flows amounts to in each equation.
@@ -226,7 +236,7 @@ class ImplicitStep:
         return np.concatenate((step, move), axis=2)
 
 
-def _newton_matrix(A: Array, h: Array, J: Array) -> Array:
+def newton_matrix(A: Array, h: Array, J: Array) -> Array:
     """I - h A_ij J_j, (K, sn, sn), of Jacobians (K, s, n, n)."""
     count, s, n = J.shape[:3]
     blocks = -h[:, None, None, None, None] * A[:, :, None, None] * J[:, None]

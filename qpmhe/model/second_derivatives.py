@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .evaluation import fixed_call
 from .expressions import CasadiModel, import_casadi
+from .implicit_curvature import ImplicitCurvature
 
 if TYPE_CHECKING:
     from .model import Model
@@ -58,17 +59,20 @@ class SecondDerivatives:
         self._model, self._system = model, model.system
         #: Typical magnitudes of the states, (n,).
         self.scales: Array = np.ones(self._system.n) if model.scales is None else model.scales
-        self._calls: dict[int, tuple[tuple[Array, ...], Curvature, Any]] = {}
-        self._function: Any = None
+        self._exact: _Expressions | None = None
+        self._implicit: ImplicitCurvature | None = None
         symbolic = model.symbolic
-        if symbolic is not None and not symbolic.is_implicit:
+        if symbolic is not None:
+            parts = symbolic.equations if symbolic.is_implicit else symbolic
             with suppress(Exception):  # an operation whose derivative CasADi does not know
-                self._function = _function(symbolic)
+                self._exact = exact = _Expressions(parts)
+                if symbolic.is_implicit:
+                    self._implicit = ImplicitCurvature(symbolic, exact.at)
 
     @property
     def exact(self) -> bool:
         """Whether they are exact."""
-        return self._function is not None
+        return self._exact is not None
 
     def at(self, states: Array, inputs: Array, forces: Array) -> Curvature:
         """The derivatives along states (K, n).
@@ -80,30 +84,13 @@ class SecondDerivatives:
         inputs : (K, m) or (K, m + 1) array
             u, with the lengths of the steps in a last column if they are not all usual.
         """
-        if self._function is None:
+        if self._exact is None:
             return self._differences(states, inputs, forces)
-        count, m = len(states), self._system.m
-        if count not in self._calls:
-            if len(self._calls) >= _MOST_KEPT:
-                self._calls.clear()
-            self._calls[count] = self._call(count)
-        (x, u, p), found, call = self._calls[count]
-        x[...], p[...] = states, forces
-        u[:, : inputs.shape[1]] = inputs
-        if inputs.shape[1] == m:
-            u[:, m] = self._system.dt or 0.0
-        if not call():
-            return Curvature(*(np.full_like(array, np.nan) for array in found))
-        return Curvature(*(array.copy() for array in found))
-
-    def _call(self, count: int) -> tuple[tuple[Array, ...], Curvature, Any]:
-        n, p, m = self._system.n, self._system.p, self._system.m
-        arguments = tuple(np.zeros((count, size)) for size in (n, m + 1, n + p))
-        found = Curvature(*(
-            np.zeros((count, *shape)) for shape in ((n, n), (n, m), (n + p, m))
-        ))
-        function = self._function.map(count) if count > 1 else self._function
-        return arguments, found, fixed_call(function, arguments, found)
+        if self._implicit is None:
+            return self._exact.at(states, inputs, forces)
+        m, usual = self._system.m, np.full(len(states), self._system.dt or 0.0)
+        dt = inputs[:, m] if inputs.shape[1] > m else usual
+        return Curvature(*self._implicit.at(states, inputs[:, :m], dt, forces))
 
     def _differences(self, states: Array, inputs: Array, forces: Array) -> Curvature:
         system, n, m = self._system, self._system.n, self._system.m
@@ -147,6 +134,39 @@ class SecondDerivatives:
             mixed[:, :, j] = (slopes(states, ahead) - slopes(states, behind)) / double
             by_input[:, :, j] = (values(states, ahead) - values(states, behind)) / double
         return Curvature(0.5 * (own + own.transpose(0, 2, 1)), mixed, by_input)
+
+
+class _Expressions:
+    """The derivatives of a model whose f and h are expressions, by CasADi's virtual machine."""
+
+    def __init__(self, model: CasadiModel) -> None:
+        self._model, self._function = model, _function(model)
+        self._calls: dict[int, tuple[tuple[Array, ...], Curvature, Any]] = {}
+
+    def at(self, states: Array, inputs: Array, forces: Array) -> Curvature:
+        """See `SecondDerivatives.at`."""
+        count, m = len(states), self._model.m
+        if count not in self._calls:
+            if len(self._calls) >= _MOST_KEPT:
+                self._calls.clear()
+            self._calls[count] = self._call(count)
+        (x, u, p), found, call = self._calls[count]
+        x[...], p[...] = states, forces
+        u[:, : inputs.shape[1]] = inputs
+        if inputs.shape[1] == m:
+            u[:, m] = self._model.dt or 0.0
+        if not call():
+            return Curvature(*(np.full_like(array, np.nan) for array in found))
+        return Curvature(*(array.copy() for array in found))
+
+    def _call(self, count: int) -> tuple[tuple[Array, ...], Curvature, Any]:
+        n, p, m = self._model.n, self._model.p, self._model.m
+        arguments = tuple(np.zeros((count, size)) for size in (n, m + 1, n + p))
+        found = Curvature(*(
+            np.zeros((count, *shape)) for shape in ((n, n), (n, m), (n + p, m))
+        ))
+        function = self._function.map(count) if count > 1 else self._function
+        return arguments, found, fixed_call(function, arguments, found)
 
 
 def _function(model: CasadiModel) -> Any:
