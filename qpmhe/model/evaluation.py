@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .algebraic import AlgebraicStates
-from .expressions import CasadiModel, import_casadi
+from .expressions import CasadiModel, functions_within, import_casadi
 from .implicit_steps import ImplicitStep
+from .quiet import quiet
 
 Array = NDArray[np.float64]
 # Fixed arrays for states, inputs and results, and what computes these from those.
@@ -21,6 +23,8 @@ Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
 Maker = Callable[[int, tuple[str, ...]], Buffers]
 
 _MOST_KEPT = 64
+# Kinds of CasADi's functions that print nothing where they fail.
+_SILENT = {"SXFunction", "MXFunction", "Map", "MapSum", "Switch"}
 # Estimators of several threads may share a system, and so the symbols of its expressions.
 _MAKING = threading.RLock()
 NAMES = ("f", "h", "f_jacobian", "h_jacobian")
@@ -109,13 +113,17 @@ def fixed_call(
     for i, array in enumerate(results):
         buffer.set_res(i, array.data)
     kept = function, buffer, arguments, results  # `run` has no more than addresses
+    prints = fallible and any(  # a solver, for one
+        one.class_name() not in _SILENT for one in functions_within(function)
+    )
 
     def call() -> bool:
         if not fallible:
             run()
             return bool(kept)
         try:
-            run()
+            with quiet() if prints else nullcontext():
+                run()
         except RuntimeError:  # of a solver or a callback within the function
             return False
         code: int = buffer.ret()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,6 +14,7 @@ from ..errors import InvalidInputError, ModelError
 from .discretize import Discretization
 from .functions import check_inputs, takes_input
 from .products import has_products, with_products, with_slope
+from .quiet import quiet
 
 
 def import_casadi() -> Any:
@@ -253,11 +254,12 @@ def _check_same(
     for scale in (1.0, 0.1, 10.0):
         x, u = (scale * generator.uniform(0.2, 1.0, size) for size in (n, m))
         try:
-            value = call(ca.DM(x), ca.DM(u))
-            if isinstance(value, (list, tuple)):
-                value = ca.vertcat(*value)
-            theirs = ca.DM(value).full().ravel(order="F")
-            mine = function(x, u).full().ravel()
+            with quiet():
+                value = call(ca.DM(x), ca.DM(u))
+                if isinstance(value, (list, tuple)):
+                    value = ca.vertcat(*value)
+                theirs = ca.DM(value).full().ravel(order="F")
+                mine = function(x, u).full().ravel()
         except Exception:  # of symbols alone, or outside of its domain
             continue
         size = np.max(np.abs(theirs), initial=0.0, where=np.isfinite(theirs))
@@ -285,20 +287,25 @@ def _graph(ca: Any, name: str, call: Callable[[Any, Any], Any], n: int, m: int) 
 
 def _asserts(ca: Any, function: Any) -> bool:
     """Whether there is an assertion (attachAssert) in a graph, or in a function that it calls."""
+    return any(
+        one.is_a("MXFunction")
+        and any(one.instruction_id(k) == ca.OP_ASSERTION for k in range(one.n_instructions()))
+        for one in functions_within(function)
+    )
+
+
+def functions_within(function: Any) -> Iterator[Any]:
+    """A function and all that it calls."""
     found, waiting = set(), [function]
     while waiting:
         one = waiting.pop()
         if hash(one) in found:
             continue
         found.add(hash(one))
-        if one.is_a("MXFunction") and any(
-            one.instruction_id(k) == ca.OP_ASSERTION for k in range(one.n_instructions())
-        ):
-            return True
+        yield one
         # Those of a graph, and those of a map or switch.
         waiting += one.find_functions()
         waiting += [one.get_function(name) for name in one.get_function()]
-    return False
 
 
 def _without_input(function: Callable[[Any], Any]) -> Callable[[Any, Any], Any]:

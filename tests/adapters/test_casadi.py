@@ -2,6 +2,8 @@
 
 import math
 import pickle
+import sys
+import threading
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import qpmhe
 from qpmhe import from_casadi
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import CompilationError, InvalidInputError, ModelError, OptionError, ShapeError
+from qpmhe.model.quiet import quiet
 from tests.adapters.twins import NONE, M, N, P, check, output, plain, points, rate
 
 ca = pytest.importorskip("casadi")
@@ -219,6 +222,38 @@ def test_a_solver_without_c_code_is_refused_by_name_before_casadi_prints(kind, n
     ]
     np.testing.assert_allclose(slope, np.transpose(differences), atol=1e-3)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("kind", ["newton", "fast_newton", "kinsol"])
+def test_a_solver_that_fails_prints_nothing(kind, capfd):
+    x, z, q = ca.MX.sym("x", 2), ca.SX.sym("z"), ca.SX.sym("q")
+    residual = z**2 - 1 + q  # without a solution for q > 1
+    root = ca.rootfinder("root", kind, {"x": z, "p": q, "g": residual}, {"max_iter": 30})
+    h = ca.Function("h", [x], [root(1.0, x[0]) + 0 * x[1]])
+    system = from_casadi(ca.Function("f", [x], [0.9 * x]), h, compiled=False)
+    states = np.array([[3.0, 0.1], [0.5, 0.2], [1.0, 0.3]])
+    for name in ("h", "h_jacobian"):
+        found = getattr(system, name).batch(states, np.zeros((3, 0)))
+        assert np.isnan(found[0]).all()
+    mhe = estimator(system)
+    for y in (0.5, 60.0, 0.5):
+        mhe.update([y])
+    system.model().second_derivatives.at(states, np.zeros((3, 0)), np.ones((3, 3)))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_other_threads_print_while_one_is_quiet(capsys):
+    before = sys.stderr
+    with quiet():
+        print("lost", file=sys.stderr)
+        thread = threading.Thread(target=print, args=("kept",), kwargs={"file": sys.stderr})
+        thread.start()
+        thread.join()
+        with quiet():
+            print("lost", file=sys.stderr)
+    assert sys.stderr is before
+    print("later", file=sys.stderr)
+    assert capsys.readouterr() == ("", "kept\nlater\n")
 
 
 @pytest.mark.parametrize("timed", [False, True])
