@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ from ..model.system import System
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
 from .exchange import empty_record, hand_over, own_fields, record_of, write
+from .failure import FAILED, FAILED_TRIAL, Failure
 from .layout import CHANGES
 from .library import EstimatorLibrary
 from .sample import SampleRecord
@@ -97,6 +99,8 @@ class CompiledEngine:
         self._call = library.update
         self._observer, self._watch = observer, CompiledWatch(horizon)
         self._rejects = observer.rejects
+        # What somebody may ask the words for.
+        self._failing = FAILED if system.constraints is None else FAILED | FAILED_TRIAL
         self._time = self._memory["time"]
         # Holds the present window where that is asked for.
         self._mirror: PythonEngine | None = None
@@ -173,7 +177,7 @@ class CompiledEngine:
         tools = self._tools_for(usual)
         self._held = tools, before
         bits = sum(1 << k for k, name in enumerate(CHANGES) if getattr(changes, name) is not None)
-        given = None if parameters is None else np.ascontiguousarray(parameters)
+        given = None if parameters is None else np.array(parameters, np.float64)
         try:
             self._library.set(
                 *self._amending, ctypes.c_void_p(tools.record.ctypes.data), bits,
@@ -184,6 +188,10 @@ class CompiledEngine:
             if not self.length:
                 return None
             estimate = self._collect(self.time - 1)
+            if self._numbers[1] & self._failing:
+                estimate.failure = self._failure(
+                    memory, before.usual, lambda engine: engine.set(changes, given)
+                )
             estimate.step_time = perf_counter() - began
             return estimate
         except BaseException:
@@ -206,6 +214,13 @@ class CompiledEngine:
                 self._own.fill(dt, own)
                 self._call(*self._special)
             estimate = self._collect(time)
+            if self._numbers[1] & self._failing:
+                inputs = y.copy(), u.copy(), dt, own
+                memory = self._memory.copy()
+                self._library.undo(ctypes.c_void_p(memory.ctypes.data), self._undoing[1])
+                estimate.failure = self._failure(
+                    memory, self.usual, lambda engine: engine.step(*inputs, math.nan)
+                )
             estimate.step_time = perf_counter() - began
             if self._numbers[1] & WATCHED:
                 far, dropped = self._memory[0]["watched"].tolist()
@@ -276,11 +291,23 @@ class CompiledEngine:
                 *self._amending, time, ctypes.c_void_p(self._y.ctypes.data), self._result
             )
             estimate = self._collect(self.time - 1)
+            if self._numbers[1] & self._failing:
+                late = y.copy()
+                estimate.failure = self._failure(
+                    before, self.usual, lambda engine: engine.amend(time, late)
+                )
             estimate.step_time = perf_counter() - began
             return estimate
         except BaseException:
             self._memory[...] = before
             raise
+
+    def _failure(
+        self, memory: NDArray[Any], usual: Conditions,
+        step: Callable[[PythonEngine], Estimate | None],
+    ) -> Failure:
+        parts = self._system, self._observer, self._given_cost, self._settings
+        return Failure(parts, self._library, usual, memory, step)
 
     def run(self, ys: Array, us: Array | None) -> Run:
         """Process a whole record without leaving C; times are means over some samples."""

@@ -43,7 +43,7 @@ def _read(value: Callable[[CompiledEstimate], Any]) -> Any:
 class CompiledEstimate(Estimate):
     """An estimate whose arrays are views of one block, made on access."""
 
-    __slots__ = ("_block", "_missed", "_numbers", "_sizes", "_to_disturbances")
+    __slots__ = ("_block", "_missed", "_numbers", "_sizes", "_to_disturbances", "failure")
 
     engine = "compiled"
 
@@ -56,6 +56,8 @@ class CompiledEstimate(Estimate):
         self._sizes, self.dropped = sizes, dropped
         self._to_disturbances, self._rejected = to_disturbances, rejected
         self._missed = missed
+        #: What failed in words, or what finds them when they are asked for.
+        self.failure: str | Callable[[], str] = ""
         n = sizes[0]
         end = _COSTS + (numbers[0] + 1) * n
         self.state = block[end - n : end]
@@ -65,7 +67,12 @@ class CompiledEstimate(Estimate):
             self._block, self._numbers, self.time, self._sizes, self.dropped,
             self._to_disturbances, self._rejected, self._missed,
         )
-        return _restored, (arguments, self.step_time)
+        return _restored, (arguments, self.step_time, self._failed())
+
+    def _failed(self) -> str:
+        if not isinstance(self.failure, str):
+            self.failure = self.failure()
+        return self.failure
 
     def _rows(self, start: int, rows: int, width: int) -> Array:
         return self._block[start : start + rows * width].reshape(rows, width)
@@ -83,7 +90,9 @@ class CompiledEstimate(Estimate):
 
     @_read
     def message(self) -> str:
-        """Why the solver failed, and which rows no trajectory satisfies."""
+        """What failed, and which rows no trajectory satisfies."""
+        if text := self._failed():
+            return text
         return naming_missed(self._missed, _MESSAGE if self._numbers[1] & _SOLVER_FAILED else "")
 
     @_read
@@ -117,7 +126,7 @@ class CompiledEstimate(Estimate):
         return self._block[-2 * n : self._block.size - n]
 
 
-def _restored(arguments: tuple[Any, ...], step_time: float) -> CompiledEstimate:
+def _restored(arguments: tuple[Any, ...], step_time: float, failure: str) -> CompiledEstimate:
     estimate = CompiledEstimate(*arguments)
-    estimate.step_time = step_time
+    estimate.step_time, estimate.failure = step_time, failure
     return estimate

@@ -1,0 +1,67 @@
+"""What failed in a step in C, in the words of the step in Python."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..costs import Cost
+from ..estimation.conditions import Conditions
+from ..estimation.engine import PythonEngine
+from ..estimation.estimate import Estimate, Status
+from ..estimation.settings import Settings
+from ..model.system import System
+from ..observers import Observer
+from .exchange import hand_over
+from .library import EstimatorLibrary
+
+#: Flags of a step in which a function of the model, the observer or the cost has failed; and those
+#: with which a nonlinear constraint may have failed along a trial.
+FAILED = Status.MODEL_FAILED.value
+FAILED_TRIAL = (Status.NO_DECREASE | Status.CAP_REACHED).value
+
+
+class Failure:
+    """The message of a step in C that has failed: that of the Python step from the same memory.
+
+    C has no words. The Python step is taken when somebody asks for them, so that no step in C takes
+    longer; until then an estimate holds a copy of the memory.
+
+    Parameters
+    ----------
+    parts : tuple
+        System, observer, cost and settings of the estimator.
+    library : EstimatorLibrary
+        Its library.
+    usual : Conditions
+        The usual conditions before the step.
+    memory : array
+        An ``mhe_estimator`` before the step; a copy.
+    step : callable
+        Takes the step with a Python engine.
+    """
+
+    def __init__(
+        self, parts: tuple[System, Observer, Cost, Settings], library: EstimatorLibrary,
+        usual: Conditions, memory: NDArray[Any], step: Callable[[PythonEngine], Estimate | None],
+    ) -> None:
+        self._parts, self._library, self._usual = parts, library, usual
+        self._memory, self._step = memory, step
+
+    def __call__(self) -> str:
+        """The message; blank if the Python step does not fail."""
+        system, observer, cost, settings = self._parts
+        library, record = self._library, self._memory[0]
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")  # the step in C has given them
+            engine = PythonEngine(
+                system, observer, cost, replace(settings, time_budget=None), record["z_end"].copy()
+            )
+            hand_over(record, library.layout, library.directions, self._usual, engine, True)
+            estimate = self._step(engine)
+        return "" if estimate is None else estimate.message
