@@ -143,7 +143,8 @@ def diagnose(
     * an input with the wrong sign, or another gain; one of the estimator's `parameters` that is
       wrong.
 
-    It also reports directions of the state that the data do not see, innovations that are
+    It also reports directions of the state that the data do not see, or that seem to be seen at
+    the points of linearisation alone, innovations that are
     correlated with themselves or with the inputs, steps that kept the candidate, with the reason,
     and how much the prior still matters.
 

@@ -15,6 +15,7 @@ from ..estimation.observability import observability, prior_shares
 from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
 from ..terms.information import prior_units
+from .apparent import apparent_information
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
 from .causes import in_words
 from .faults import SCALED, Evidence, Fault
@@ -36,6 +37,8 @@ _OUTLIER = 4.0
 _UNSEEN, _UNLEARNT, _REMAINS = 0.1, 0.5, 0.5
 # A filter that has lost the record is linearised nowhere near it: a step moves nothing that much.
 _LOST = 1e3
+# By how much information must seem to grow where there is none.
+_APPARENT = 2.0
 # By how much the estimator's predictions may be worse than those of a Kalman filter, and by how
 # many standard errors they must be.
 _WORSE, _CLEARLY = 1.4, 3.0
@@ -296,6 +299,7 @@ class Examination:
             yield self._not_white(sensor, lag, size, why + _CAUSES)
         if np.isfinite(self.along.logs).all():
             yield from self._unseen()
+            yield from self._apparent()
 
     def _correlations(self, normalised: Array) -> Correlations:
         """Correlations of innovations; outliers count as the limit that they exceed."""
@@ -371,6 +375,23 @@ class Examination:
                 "unseen", f"{direction} is not seen by the data{names.between(*span)}.",
                 "Excite it, give the prior or Q of it less room, or leave it out of the state.",
                 where=None if whole else names.span(*span),
+            )
+
+    def _apparent(self) -> Iterator[Finding]:
+        """Information of the points of linearisation, which the data do not have."""
+        found = apparent_information(
+            self.bank, self.along, self.bank.full_inputs(self.base.inputs), self.noise, self.prior
+        ) if self.along.states.shape[1] == self.bank.n else None
+        if found is not None and found[0] > _APPARENT:
+            growth, direction = found
+            yield Finding(
+                "apparent",
+                f"{_direction(direction, self.names.states)} is not seen by the data, and the "
+                "filter's information on it comes from its points of linearisation only: its "
+                f"standard deviation there is too small by a factor of {number(np.sqrt(growth))} "
+                "at least, as are those of the estimates.",
+                "Do not believe these there; add a measurement that shows it, or state it "
+                "relative to what is measured.", "warning",
             )
 
     def _worse(self) -> Iterator[Finding]:

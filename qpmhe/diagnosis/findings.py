@@ -21,8 +21,9 @@ class Finding:
         ``dead``, ``saturated``, ``missing``, ``failing``, ``noise``, ``disturbance``, ``gain``,
         ``bias``, ``ramp``, ``swapped``, ``step``, ``sign``, ``input``, ``parameter``, ``shift``,
         ``lag``, ``clock``, ``jitter``, ``dropped``, ``doubled``, ``outliers``, ``coloured``,
-        ``change``, ``quantised``, ``discretization``, ``unseen``, ``correlated``, ``estimator``; a
-        note also has ``prior``, ``kept``, ``innovations``, ``drift``, ``record`` or ``rejected``.
+        ``change``, ``quantised``, ``discretization``, ``unseen``, ``apparent``, ``correlated``,
+        ``estimator``; a note also has ``prior``, ``kept``, ``innovations``, ``drift``, ``record``
+        or ``rejected``.
     text : str
         What it is, as a sentence.
     remedy : str

@@ -41,11 +41,14 @@ class Record:
         y(0), ..., y(T-1).
     inputs : (T, m) array or None
         u(0), ..., u(T-1); None for a system without inputs.
+    initial_estimate : (n,) array or None
+        Where the estimation starts, if that is known.
     """
 
     states: Array
     measurements: Array
     inputs: Array | None = None
+    initial_estimate: Array | None = None
 
     def __iter__(self) -> Iterator[Array]:
         yield self.states
@@ -212,7 +215,8 @@ class Scenario:
             if matrix is not None:
                 disturbance = matrix @ disturbance
             states[t + 1] = _within_turn(system, reached + disturbance)
-        return Record(states, measurements, inputs if system.m else None)
+        return Record(
+            states, measurements, inputs if system.m else None, self.initial_estimate)
 
     def _measured(self, output: Array, noise: Array) -> Array:
         step = self.resolution

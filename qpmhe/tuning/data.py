@@ -41,7 +41,7 @@ class TuningRecord:
         Length of each step, from t to t + 1, where they are not the sampling time; to be left out
         where the measurements have times.
     initial_state : (n,) array_like, optional
-        The estimate of x(0); the one given to `qpmhe.tune` if left out.
+        The estimate of x(0); the one given to `qpmhe.tune`, or the system's, if left out.
     name : str, optional
         What messages call it, such as its file.
     time_unit : str or pandas.Timedelta
@@ -161,10 +161,15 @@ def checked_data(
             "measurements (T, p) and inputs (T, m), or of qpmhe.tuning.TuningRecord."
         )
     start = None if initial_state is None else vector("initial_state", initial_state, system.n)
+    if start is None and system.signals is not None:
+        start = np.array([float(one.value) for one in system.signals.states])
     found = []
     for k, one in enumerate(records):
         if isinstance(one, Record):
-            made = TuningRecord(one.measurements, one.inputs, one.states)
+            made = TuningRecord(
+                one.measurements, one.inputs, one.states,
+                initial_state=one.initial_estimate if initial_state is None else None,
+            )
         elif isinstance(one, TuningRecord):
             made = one
         elif isinstance(one, tuple) and 1 <= len(one) <= 3:

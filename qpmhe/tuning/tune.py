@@ -93,7 +93,9 @@ def tune(
     horizon : int
         N of the estimator.
     initial_state : (n,) array_like, optional
-        The estimate of x(0); needed unless each record has its own.
+        The estimate of x(0). If left out, it is the one of each record (`TuningRecord` and
+        simulated records have one), else the values that the system's ``signals`` have at the
+        start, as those of an FMU do.
     structure : str or dict
         What is tuned. ``"diagonal"``: each standard deviation of w and v, with the correlations
         of the start; ``"scalar"``: one factor for each of the two covariances; ``"full"``: their

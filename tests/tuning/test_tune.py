@@ -11,6 +11,7 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError
+from qpmhe.model.signals import Signal, Signals
 from qpmhe.tuning import TuningCheckpointError, TuningRecord, contest, judge, load, search
 from qpmhe.tuning.structures import Correlated
 
@@ -428,6 +429,24 @@ def test_an_observer_that_fails_is_last_and_says_why():
     assert tuning.weights.observer_name == "ekf"
     with pytest.raises(ModelError, match=r"no observer can be tuned .*: steady: .*not detectable"):
         tuned([simulated(steps=200)], system, observers=["steady"], max_qps=0)
+
+
+def test_the_initial_state_is_the_records_or_the_systems_where_none_is_given():
+    system, _, _, scenario = qpmhe.models.van_der_pol()
+    record, given = scenario.simulate(0, 60), {
+        "prior": np.eye(2), "disturbance": 0.01 * np.eye(2), "noise": [[1.0]], "held_out": 0.0,
+        "structure": "scalar", "objective": "likelihood", "progress": False,
+    }
+    np.testing.assert_array_equal(record.initial_estimate, scenario.initial_estimate)
+    alone = qpmhe.tune(system, [record], **given).values
+    start = {"initial_state": scenario.initial_estimate}
+    assert alone == qpmhe.tune(system, [(record.measurements,)], **start, **given).values
+    other = qpmhe.tune(system, [record], initial_state=[3.0, 3.0], **given).values
+    assert other != alone
+    states = tuple(Signal(name, value=value) for name, value in (("a", 3.0), ("b", 3)))
+    system = system.with_origin(signals=Signals(states))
+    assert other == qpmhe.tune(system, [(record.measurements,)], **given).values
+    assert alone == qpmhe.tune(system, [record], **given).values
 
 
 @pytest.mark.slow
