@@ -112,6 +112,21 @@ def test_faults_are_found(fault, part, words):
     assert str(report).startswith("faulty: does not conform")
 
 
+def test_who_ignores_limits_and_gives_no_multipliers_is_told_so_in_few_words():
+    class Dense(qpmhe.solvers.Solver):
+        def _solve(self, qp, start):
+            found = np.linalg.solve(qp.dense(), -qp.gradient.ravel())
+            return RawSolution(found.reshape(qp.stages, qp.n), claimed=True)
+
+    with registered(Backend("dense", Dense, "-", inequalities=False)):
+        report = check("dense")
+    assert report.measured == report.declared
+    faults = {one.check: one.detail for one in report.findings if not one.passed}
+    assert "no multipliers to check the claim" in faults["no inequality"]
+    assert faults["20 QPs in turn"].endswith("; and 17 more")
+    assert "limits that come and go" not in faults
+
+
 @pytest.mark.parametrize(
     "flag", ["iteration_cap", "iterate_at_cap", "warm_start", "time_limit", "keeps_duals"]
 )
