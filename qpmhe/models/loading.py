@@ -34,6 +34,8 @@ _FORM = re.compile(r"(?P<where>[^()]+)(?:\((?P<arguments>.*)\))?", re.DOTALL)
 _PARTS = ((System, "system"), (Observer, "observer"), (Cost, "cost"), (Scenario, "scenario"))
 _EXPECTED = "name(keyword=value), package.module:function or path/file.py:function"
 _PACKAGES = (Path(__file__).parents[1], Path(qpmhe_solvers.__file__).parent)
+# Of the names of modules that are users' files.
+_PREFIX = "qpmhe_model_"
 # Fingerprint at the time when this process imported a place.
 _imported_as: dict[str, str] = {}
 
@@ -461,8 +463,21 @@ def _import_path(place: str) -> Iterator[None]:
             sys.path.remove(folder)
 
 
+def file_of(thing: Any) -> Path | None:
+    """The file of a user that defines a function or class, if it was imported as a model's is."""
+    name = str(getattr(thing, "__module__", ""))
+    module = sys.modules.get(name) if name.startswith(_PREFIX) else None
+    return None if module is None else Path(str(module.__file__))
+
+
+def import_file(path: Path) -> None:
+    """Import a file of a user, whose functions another process may know, with those beside it."""
+    with _import_path(str(path)):
+        _import_file(path)
+
+
 def _import_file(path: Path) -> ModuleType:
-    name = f"qpmhe_model_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    name = f"{_PREFIX}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
     specification = importlib.util.spec_from_file_location(name, path)

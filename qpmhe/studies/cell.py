@@ -24,7 +24,7 @@ from ..errors import InvalidInputError, PriorWarning, QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..models import Record
-from ..models.loading import ModelSource, code_place
+from ..models.loading import ModelSource, code_place, import_file
 from . import metrics
 from .environment import environment
 from .experiment import Source, experiment
@@ -42,9 +42,10 @@ class Task:
 
     It gives up between two steps after ``timeout`` seconds. ``keep`` returns the trajectory,
     ``shared`` says that other cells run on the machine at the same time, ``registered`` is the
-    backend for workers that do not know it, and ``isolated`` runs the solver in another process.
-    QPs on which the backend failed go to a folder in ``failing``. ``observer`` makes an observer
-    in place of the model's, ``estimator`` an estimator in place of moving horizon estimation.
+    backend for workers that do not know it, or the user's file that registers it, and
+    ``isolated`` runs the solver in another process. QPs on which the backend failed go to a folder
+    in ``failing``. ``observer`` makes an observer in place of the model's, ``estimator`` an
+    estimator in place of moving horizon estimation.
     """
 
     cell: Cell
@@ -53,7 +54,7 @@ class Task:
     timeout: float
     keep: bool = False
     shared: bool = False
-    registered: Backend | None = None
+    registered: Backend | Path | None = None
     isolated: bool = False
     failing: Path | None = None
     observer: ModelSource | None = None
@@ -111,7 +112,9 @@ def _fields(task: Task) -> dict[str, Any]:
 
 def _measured(task: Task, limit: float) -> StudyRow:
     cell, found = task.cell, experiment(task.source)
-    if task.registered is not None:
+    if isinstance(task.registered, Path):
+        import_file(task.registered)
+    elif task.registered is not None:
         _register(task.registered)
     record = found.record(cell.seed, cell.steps, cell.noise_level)
     if "time" in task.parts:

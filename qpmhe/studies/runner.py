@@ -21,6 +21,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import dimension, flag, make_folder, need
 from ..errors import OptionError
+from ..models.loading import file_of
 from .cell import ENGINE, Task, compute, failure
 from .environment import environment, revision
 from .grid import Study, StudyError
@@ -330,11 +331,14 @@ def _tasks(
             continue
         estimator = study.makers["estimators"].get(cell.backend)
         alone = estimator is not None or cell.backend == OBSERVER
+        entry = None if alone else backend(cell.backend)
+        # What a model's file defines, other processes know once they have imported the file.
+        file = None if entry is None else file_of(entry.factory)
         tasks.append(
             Task(
                 cell, sources[cell.model], wanted | known, study.cell_timeout,
                 keep=first, shared=shared,
-                registered=None if alone else backend(cell.backend), failing=failing,
+                registered=file or entry, failing=failing,
                 observer=study.makers["observers"].get(cell.observer), estimator=estimator,
             )
         )

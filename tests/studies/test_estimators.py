@@ -291,6 +291,29 @@ def test_a_models_file_registers_a_backend(folder):
         qpmhe.solvers.unregister("of_a_file")
 
 
+@pytest.mark.slow
+def test_a_backend_whose_class_is_in_a_models_file_runs_in_the_studys_processes(folder, tmp_path):
+    """Also where another model's file registers it; the class is known there by its file alone."""
+    (folder / "solving.py").write_text(
+        "import numpy as np\nimport qpmhe\nfrom qpmhe.models import batch_reactor\n"
+        "class Dense(qpmhe.solvers.Solver):\n"
+        "    def _solve(self, qp, start):\n"
+        "        d = np.linalg.solve(qp.dense(), -qp.gradient.ravel())\n"
+        "        return qpmhe.solvers.RawSolution(d.reshape(qp.stages, qp.n), claimed=True)\n"
+        "qpmhe.solvers.register(qpmhe.solvers.Backend('dense', Dense, 'LU', inequalities=False))\n"
+        "def make():\n    return batch_reactor()\n"
+    )
+    try:
+        study = Study(models=["solving.py:make", "batch_reactor"], backends=["dense", "banded"],
+                      seeds=1, qps=[1], solver_iterations=[None], steps=20, folder=folder)
+        frame = run(study, tmp_path / "study.sqlite", progress=False).frame()
+    finally:
+        qpmhe.solvers.unregister("dense")
+    assert frame["outcome"].tolist() == ["done"] * len(frame), frame["reason"].tolist()
+    errors = frame.set_index(["backend", "model"])["rmse"]
+    assert errors["dense"].to_numpy() == pytest.approx(errors["banded"].to_numpy(), rel=0.05)
+
+
 def _without_models(file):
     other = file.with_name("other.toml")
     other.write_text(file.read_text().replace('models = ["model.py:make"]\n', ""))
