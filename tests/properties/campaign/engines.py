@@ -1,10 +1,12 @@
 """The Python step beside the step in C: each step of both begins at the same memory.
 
-A difference is explained, in this order: by rounding, where an engine differs as much from itself
-when its memory and its data change in their last digits; by the tolerance of the Python step's QPs,
-where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
-where it differs as much from itself when the QPs change in their last digits; by a cap or
-by a QP that a method has not solved, mostly since it has no feasible point. What is left is a
+A difference is explained, in this order: by the tolerance of the sequence, where both have
+converged and J is the same up to it; by a fall, where J is 1e-11 of the candidate's, or the
+estimates differ by so much of the step from it; by rounding, where an engine differs as much from
+itself when its memory and its data change in their last digits; by the tolerance of the Python
+step's QPs, where this step follows the one in C once it solves them to 1e-12; by the rounding of
+its Hessian, where it differs as much from itself when the QPs change in their last digits; by a cap
+or by a QP that a method has not solved, mostly since it has no feasible point. What is left is a
 fault. `docs/how-to/speed.md` lists these reasons.
 """
 
@@ -24,6 +26,8 @@ from qpmhe_solvers.options import SolverOptions
 from .judge import nudged
 
 CLOSE = 1e-6  # of two estimates in units, and of their J as a share
+CONVERGED = 1e-9  # the default of `tolerance`
+FALL = 1e-11
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
@@ -172,6 +176,10 @@ class Beside:
         return x, abs(one.cost - other.cost) / (abs(one.cost) + 1e-300)
 
     def _reason(self, estimate, other, kind, x, J, act):
+        if Status.CONVERGED in estimate.status & other.status and J <= CONVERGED:
+            return "tolerance of the sequence"
+        if kind != "candidate" and self._is_fall(estimate, other):
+            return "a fall of 12 digits"
         engine = self.compiled._engine
         after, kept = engine._memory.copy(), self._kept() if kind == "memory" else None
         try:
@@ -189,6 +197,14 @@ class Beside:
         if solver.unsolved or STOPPED & (estimate.status | other.status):
             return "unsolved QP"
         return "open"
+
+    def _is_fall(self, estimate, other):
+        """Whether J or the estimate has left the candidate by all digits that a number has."""
+        if max(estimate.cost, other.cost) <= FALL * estimate.candidate_cost < np.inf:
+            return True
+        units, one = self.case.x_units, estimate.trajectory
+        moved = np.abs((one - estimate.candidate) / units)
+        return bool((np.abs((one - other.trajectory) / units) <= FALL * moved.max(axis=0)).all())
 
     def _is_rounding(self, estimate, other, kind, x, J, act):
         r, engine = np.random.default_rng(3), self.compiled._engine

@@ -274,7 +274,7 @@ class Judge:
             and case.G is None and not restored and of_candidate.J + slack < own.J
         ):
             moved_by = sum(rounding(case, one, window, mean, True) for one in (x, candidate))
-            if not own.J - of_candidate.J <= MEASURED * moved_by:
+            if not MEASURED * moved_by >= own.J - of_candidate.J:
                 found.append(("own J above the candidate's", (own.J, of_candidate.J)))
         if moved:
             found += self._of_sets(estimate, window, own, of_candidate)
