@@ -264,13 +264,13 @@ def test_the_campaign_notices_a_mistake(monkeypatch, words):
 def test_the_campaign_notices_engines_that_differ(monkeypatch):
     compare, kinds = engines.Beside.compare, set()
 
-    def wrong(self, estimate, act, explain=True):
+    def wrong(self, estimate, act):
         told = SimpleNamespace(**{name: getattr(estimate, name) for name in (
             "candidate", "candidate_cost", "status", "solver_iterations", "dropped",
         )})
         told.trajectory = estimate.trajectory + 1e-3 * self.case.x_units
         told.cost = 1.001 * estimate.cost
-        return compare(self, told, act, explain)
+        return compare(self, told, act)
 
     monkeypatch.setattr(engines.Beside, "compare", wrong)
     for seed in range(3, 7):

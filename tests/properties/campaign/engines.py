@@ -3,11 +3,11 @@
 A difference is explained, in this order: by the tolerance of the sequence, where both have
 converged and J is the same up to it; by a fall, where J is 1e-11 of the candidate's, or the
 estimates differ by so much of the step from it; by rounding, where an engine differs as much from
-itself when its memory and its data change in their last digits; by the tolerance of the Python
-step's QPs, where this step follows the one in C once it solves them to 1e-12; by the rounding of
-its Hessian, where it differs as much from itself when the QPs change in their last digits; by a cap
-or by a QP that a method has not solved, mostly since it has no feasible point. What is left is a
-fault. `docs/how-to/speed.md` lists these reasons.
+itself when its memory and its data change in their last digits; by the tolerance of QPs, where one
+step follows the other once it solves them to 1e-12; by the rounding of the Hessian, where the
+Python step differs as much from itself when the QPs change in their last digits; by a cap or by a
+QP that a method has not solved, mostly since it has no feasible point. What is left is a fault.
+`docs/how-to/speed.md` lists these reasons.
 """
 
 from __future__ import annotations
@@ -93,13 +93,20 @@ class Beside:
     def __init__(self, case, compiled):
         self.case, self.compiled = case, compiled
         self.python, self.exact, self.explained = case.estimator("python"), None, Counter()
-        self.nudging = self.memory = self.far = None
+        self.nudging = self.memory = self.tools = self.far = None
 
     def begin(self, compiled):
         """The next step of both begins here."""
         self.compiled = compiled
-        self.memory = compiled._engine._memory.copy()
+        self.memory, self.tools = compiled._engine._memory.copy(), compiled._engine._tools
         self._hand_over(self.python)
+
+    def _begin_again(self, *pythons):
+        """The step is to be done again, also one that has changed the usual conditions."""
+        engine = self.compiled._engine
+        engine._memory[...], engine._tools = self.memory, self.tools
+        for python in pythons:
+            self._hand_over(python)
 
     def _hand_over(self, python):
         engine = self.compiled._engine
@@ -109,7 +116,7 @@ class Beside:
             False,
         )
 
-    def compare(self, estimate, act, explain=True):
+    def compare(self, estimate, act):
         """The Python step's estimate, and a `Difference` or None.
 
         ``act(mhe, change)`` does what the compiled estimator has done, with changed numbers.
@@ -138,7 +145,7 @@ class Beside:
             better = "compiled" if estimate.cost < other.cost else "python"
         self.explained[kind, rows] += 1
         reason = "not examined"
-        if explain and self.explained[kind, rows] <= _MEASURED[rows]:
+        if self.explained[kind, rows] <= _MEASURED[rows]:
             reason = self._reason(estimate, other, kind, x, J, act)
         detail = (
             f"x {x:.1e}, J {J:.1e}, candidate {candidate:.1e}, by rounding {self.far}",
@@ -181,16 +188,17 @@ class Beside:
         if kind != "candidate" and self._is_fall(estimate, other):
             return "a fall of 12 digits"
         engine = self.compiled._engine
-        after, kept = engine._memory.copy(), self._kept() if kind == "memory" else None
+        after, tools = engine._memory.copy(), engine._tools
+        kept = self._kept() if kind == "memory" else None
         try:
             if self._is_rounding(estimate, other, kind, x, J, act):
                 return "rounding"
-            if self._is_tolerance(estimate, x, act, kept):
+            if self._is_tolerance(estimate, x, act, kept) or self._is_tolerance_in_c(kind, x, act):
                 return "tolerance of QPs"
             if self._is_hessian(x, act):
                 return "rounding of the Hessian"
         finally:
-            engine._memory[...] = after
+            engine._memory[...], engine._tools = after, tools
         solver = self.nudging.settings.backend
         if "max_solver_iterations" in self.case.options:
             return "cap"
@@ -210,7 +218,7 @@ class Beside:
         r, engine = np.random.default_rng(3), self.compiled._engine
         far, statuses, first, far_kept = np.zeros(2), set(), {}, 0.0
         for k in range(_TRIES):
-            engine._memory[...] = self.memory
+            self._begin_again()
             if k:  # the first one repeats the step
                 _nudge(r, engine._memory)
             self._hand_over(self.python)
@@ -236,8 +244,7 @@ class Beside:
         found, solver = [], self.nudging.settings.backend
         solver.unsolved = False
         for _ in range(_TRIES):
-            self.compiled._engine._memory[...] = self.memory
-            self._hand_over(self.nudging)
+            self._begin_again(self.nudging)
             found.append(act(self.nudging, _same))
         return x <= 10.0 * max(self._apart(found[0], one)[0] for one in found)
 
@@ -248,8 +255,7 @@ class Beside:
                 for tight in _TIGHT
             ]
         for python in self.exact:
-            self.compiled._engine._memory[...] = self.memory
-            self._hand_over(python)
+            self._begin_again(python)
             try:
                 again = act(python, _same)
             except QpmheError:  # a backend that cannot solve such QPs
@@ -260,4 +266,23 @@ class Beside:
             same = (again.status & ~STOPPED) == (estimate.status & ~STOPPED)
             if away <= max(1e-7, 0.02 * x) or (J <= 1e-9 and same):
                 return True
+        return False
+
+    def _is_tolerance_in_c(self, kind, x, act):
+        """Whether the step in C follows: what its active sets leave to the interior point."""
+        settings = self.tools.record["solver_tolerance"]
+        usual = settings.copy()
+        try:
+            for tolerance in (1e-9, 1e-12):
+                for python in (self.python, self.exact[0]):
+                    settings[...] = tolerance
+                    self._begin_again(python)
+                    again, other = act(self.compiled, _same), act(python, _same)
+                    away = self._apart(other, again)[0]
+                    if kind == "memory":
+                        away = self._far_from(self._kept(), python._engine._window)
+                    if away <= max(1e-7, 0.02 * x):
+                        return True
+        finally:
+            settings[...] = usual
         return False
