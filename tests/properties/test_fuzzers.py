@@ -172,7 +172,7 @@ COMPILED = [pytest.mark.slow, pytest.mark.skipif(
 
 
 @pytest.mark.parametrize(("engine", "seed"), [
-    *(("python", seed) for seed in range(8)),
+    *(("python", seed) for seed in (*range(8), 22000083)),  # the last: J of rounding
     *(pytest.param("compiled", seed, marks=COMPILED) for seed in range(3)),
 ])
 def test_estimators_of_the_campaign_have_no_faults(engine, seed):
@@ -185,6 +185,7 @@ def test_estimators_of_the_campaign_have_no_faults(engine, seed):
 MENDED = {
     21000036: 48,  # second corrections of soft rows
     12000043: 40,  # soft rows beside hard ones and a vague prior
+    21000089: 12, 12000042: 25,  # rows whose forces settle slowly
 }
 
 
@@ -263,13 +264,13 @@ def test_the_campaign_notices_a_mistake(monkeypatch, words):
 def test_the_campaign_notices_engines_that_differ(monkeypatch):
     compare, kinds = engines.Beside.compare, set()
 
-    def wrong(self, estimate, act, explain=True):
+    def wrong(self, estimate, act):
         told = SimpleNamespace(**{name: getattr(estimate, name) for name in (
             "candidate", "candidate_cost", "status", "solver_iterations", "dropped",
         )})
         told.trajectory = estimate.trajectory + 1e-3 * self.case.x_units
         told.cost = 1.001 * estimate.cost
-        return compare(self, told, act, explain)
+        return compare(self, told, act)
 
     monkeypatch.setattr(engines.Beside, "compare", wrong)
     for seed in range(3, 7):

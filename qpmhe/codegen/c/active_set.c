@@ -17,7 +17,7 @@
 #define GUESSES 25
 #define PATIENCE 2
 #define FEW 10
-#define ROUNDS 20
+#define ROUNDS 50
 
 /* Rounds that leave more than this share of the last change only add rounding. */
 #define SHRINKING (real)0.5

@@ -1,11 +1,13 @@
 """The Python step beside the step in C: each step of both begins at the same memory.
 
-A difference is explained, in this order: by rounding, where an engine differs as much from itself
-when its memory and its data change in their last digits; by the tolerance of the Python step's QPs,
-where this step follows the one in C once it solves them to 1e-12; by the rounding of its Hessian,
-where it differs as much from itself when the QPs change in their last digits; by a cap or
-by a QP that a method has not solved, mostly since it has no feasible point. What is left is a
-fault. `docs/how-to/speed.md` lists these reasons.
+A difference is explained, in this order: by the tolerance of the sequence, where both have
+converged and J is the same up to it; by a fall, where J is 1e-11 of the candidate's, or the
+estimates differ by so much of the step from it; by rounding, where an engine differs as much from
+itself when its memory and its data change in their last digits; by the tolerance of QPs, where one
+step follows the other once it solves them to 1e-12; by the rounding of the Hessian, where the
+Python step differs as much from itself when the QPs change in their last digits; by a cap or by a
+QP that a method has not solved, mostly since it has no feasible point. What is left is a fault.
+`docs/how-to/speed.md` lists these reasons.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from qpmhe_solvers.options import SolverOptions
 from .judge import nudged
 
 CLOSE = 1e-6  # of two estimates in units, and of their J as a share
+CONVERGED = 1e-9  # the default of `tolerance`
+FALL = 1e-11
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
@@ -89,13 +93,20 @@ class Beside:
     def __init__(self, case, compiled):
         self.case, self.compiled = case, compiled
         self.python, self.exact, self.explained = case.estimator("python"), None, Counter()
-        self.nudging = self.memory = self.far = None
+        self.nudging = self.memory = self.tools = self.far = None
 
     def begin(self, compiled):
         """The next step of both begins here."""
         self.compiled = compiled
-        self.memory = compiled._engine._memory.copy()
+        self.memory, self.tools = compiled._engine._memory.copy(), compiled._engine._tools
         self._hand_over(self.python)
+
+    def _begin_again(self, *pythons):
+        """The step is to be done again, also one that has changed the usual conditions."""
+        engine = self.compiled._engine
+        engine._memory[...], engine._tools = self.memory, self.tools
+        for python in pythons:
+            self._hand_over(python)
 
     def _hand_over(self, python):
         engine = self.compiled._engine
@@ -105,7 +116,7 @@ class Beside:
             False,
         )
 
-    def compare(self, estimate, act, explain=True):
+    def compare(self, estimate, act):
         """The Python step's estimate, and a `Difference` or None.
 
         ``act(mhe, change)`` does what the compiled estimator has done, with changed numbers.
@@ -134,7 +145,7 @@ class Beside:
             better = "compiled" if estimate.cost < other.cost else "python"
         self.explained[kind, rows] += 1
         reason = "not examined"
-        if explain and self.explained[kind, rows] <= _MEASURED[rows]:
+        if self.explained[kind, rows] <= _MEASURED[rows]:
             reason = self._reason(estimate, other, kind, x, J, act)
         detail = (
             f"x {x:.1e}, J {J:.1e}, candidate {candidate:.1e}, by rounding {self.far}",
@@ -172,17 +183,22 @@ class Beside:
         return x, abs(one.cost - other.cost) / (abs(one.cost) + 1e-300)
 
     def _reason(self, estimate, other, kind, x, J, act):
+        if Status.CONVERGED in estimate.status & other.status and J <= CONVERGED:
+            return "tolerance of the sequence"
+        if kind != "candidate" and self._is_fall(estimate, other):
+            return "a fall of 12 digits"
         engine = self.compiled._engine
-        after, kept = engine._memory.copy(), self._kept() if kind == "memory" else None
+        after, tools = engine._memory.copy(), engine._tools
+        kept = self._kept() if kind == "memory" else None
         try:
             if self._is_rounding(estimate, other, kind, x, J, act):
                 return "rounding"
-            if self._is_tolerance(estimate, x, act, kept):
+            if self._is_tolerance(estimate, x, act, kept) or self._is_tolerance_in_c(kind, x, act):
                 return "tolerance of QPs"
             if self._is_hessian(x, act):
                 return "rounding of the Hessian"
         finally:
-            engine._memory[...] = after
+            engine._memory[...], engine._tools = after, tools
         solver = self.nudging.settings.backend
         if "max_solver_iterations" in self.case.options:
             return "cap"
@@ -190,11 +206,19 @@ class Beside:
             return "unsolved QP"
         return "open"
 
+    def _is_fall(self, estimate, other):
+        """Whether J or the estimate has left the candidate by all digits that a number has."""
+        if max(estimate.cost, other.cost) <= FALL * estimate.candidate_cost < np.inf:
+            return True
+        units, one = self.case.x_units, estimate.trajectory
+        moved = np.abs((one - estimate.candidate) / units)
+        return bool((np.abs((one - other.trajectory) / units) <= FALL * moved.max(axis=0)).all())
+
     def _is_rounding(self, estimate, other, kind, x, J, act):
         r, engine = np.random.default_rng(3), self.compiled._engine
         far, statuses, first, far_kept = np.zeros(2), set(), {}, 0.0
         for k in range(_TRIES):
-            engine._memory[...] = self.memory
+            self._begin_again()
             if k:  # the first one repeats the step
                 _nudge(r, engine._memory)
             self._hand_over(self.python)
@@ -220,8 +244,7 @@ class Beside:
         found, solver = [], self.nudging.settings.backend
         solver.unsolved = False
         for _ in range(_TRIES):
-            self.compiled._engine._memory[...] = self.memory
-            self._hand_over(self.nudging)
+            self._begin_again(self.nudging)
             found.append(act(self.nudging, _same))
         return x <= 10.0 * max(self._apart(found[0], one)[0] for one in found)
 
@@ -232,8 +255,7 @@ class Beside:
                 for tight in _TIGHT
             ]
         for python in self.exact:
-            self.compiled._engine._memory[...] = self.memory
-            self._hand_over(python)
+            self._begin_again(python)
             try:
                 again = act(python, _same)
             except QpmheError:  # a backend that cannot solve such QPs
@@ -244,4 +266,23 @@ class Beside:
             same = (again.status & ~STOPPED) == (estimate.status & ~STOPPED)
             if away <= max(1e-7, 0.02 * x) or (J <= 1e-9 and same):
                 return True
+        return False
+
+    def _is_tolerance_in_c(self, kind, x, act):
+        """Whether the step in C follows: what its active sets leave to the interior point."""
+        settings = self.tools.record["solver_tolerance"]
+        usual = settings.copy()
+        try:
+            for tolerance in (1e-9, 1e-12):
+                for python in (self.python, self.exact[0]):
+                    settings[...] = tolerance
+                    self._begin_again(python)
+                    again, other = act(self.compiled, _same), act(python, _same)
+                    away = self._apart(other, again)[0]
+                    if kind == "memory":
+                        away = self._far_from(self._kept(), python._engine._window)
+                    if away <= max(1e-7, 0.02 * x):
+                        return True
+        finally:
+            settings[...] = usual
         return False

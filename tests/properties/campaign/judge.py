@@ -273,7 +273,9 @@ class Judge:
             math.isfinite(estimate.candidate_cost) and not case.from_observer
             and case.G is None and not restored and of_candidate.J + slack < own.J
         ):
-            found.append(("own J above the candidate's", (own.J, of_candidate.J)))
+            moved_by = sum(rounding(case, one, window, mean, True) for one in (x, candidate))
+            if not MEASURED * moved_by >= own.J - of_candidate.J:
+                found.append(("own J above the candidate's", (own.J, of_candidate.J)))
         if moved:
             found += self._of_sets(estimate, window, own, of_candidate)
             found += self._of_noises(estimate, window, own)

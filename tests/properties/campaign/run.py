@@ -271,9 +271,9 @@ class Run:
         """Compare with the Python step, which does the same from the same memory."""
         if not self.beside or estimate is None:
             return
-        other, difference = self._called(f"{name} of the Python step", lambda: self.beside.compare(
-            estimate, act, name != "set"  # done again, it would free the settings that C points to
-        ))
+        other, difference = self._called(
+            f"{name} of the Python step", lambda: self.beside.compare(estimate, act)
+        )
         self.counts["compared"] += 1
         restored = Status.RESTORED in other.status
         if not 0.0 <= other.cost <= (other.restored_cost if restored else other.candidate_cost):
