@@ -106,6 +106,10 @@ def others() -> dict[str, tuple[qpmhe.System, qpmhe.Box, Sizes]]:
         "Lorenz": (qpmhe.System.from_ode(
             lorenz, lambda x: x[..., :2], dt=0.01, n=3, p=2, method="euler"),
             qpmhe.Box([-20.0, -28.0, 0.0], [20.0, 28.0, 50.0]), Sizes(0.01, 0.02)),
+        # Around the mass at rest, which is never at the wall or at the end point there.
+        "a chain of one mass": (qpmhe.models.chain_of_masses(masses=1).system, qpmhe.Box(
+            [0.2, -0.05, -0.23, -0.5, -0.5, -0.5], [0.3, 0.05, -0.13, 0.5, 0.5, 0.5]),
+            Sizes(box(*[3e-4] * 3, *[0.009] * 3), box(*[0.009] * 3))),
     }
 
 

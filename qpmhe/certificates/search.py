@@ -40,6 +40,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 # the former solves; how far off the time that a program is expected to take may be.
 _CHOICE, _VERIFICATION = 0.5, 0.6
 _PROGRAMS, _MISJUDGED = 20, 4.0
+_BETTER = 0.9  # of a measure, where another answer is better by more than the margins explain
 _NEARLY = 1.0 + 1e-12  # what rounding makes of a spectral radius
 
 
@@ -337,6 +338,8 @@ class Search:
                 if best is None:
                     raise
                 break
+            if turn == 0:
+                answer = self._better(answer, rate)
             if self.kind == "synthesis" and answer.form is not None:
                 # A better P for the gain, which was rounded.
                 assert answer.form.gain is not None
@@ -364,6 +367,17 @@ class Search:
             else f"no matrix that passes the verification was found for the rate {rate:.6g} "
             f"(solver status: {status})"
         )
+
+    def _better(self, answer: ConicSolution, rate: float) -> ConicSolution:
+        """Of all answers for a rate, one that is far better, though a smaller margin allows more.
+
+        Without much room, a solver may fail, and a program that is easier gives a larger limit.
+        """
+        known = min(
+            (one for one in self._answers if one.form is not None and one.form.rate == rate),
+            key=lambda one: one.objective, default=answer,
+        )
+        return known if known.objective < _BETTER * answer.objective else answer
 
     def _verified(self, form: Form, most_cells: int) -> Found | Cover:
         """What was shown, or the cover with the states where the inequality fails."""

@@ -13,6 +13,8 @@ from qpmhe import certificates
 from qpmhe.certificates import Evidence, NotCertifiedError, certify_detectability, certify_observer
 from qpmhe.certificates import deadline as deadline_module
 from qpmhe.certificates import search as search_module
+from qpmhe.certificates.observer_bound import ObserverBound
+from qpmhe.certificates.regions import bounded_region
 from qpmhe.certificates.sdp import SemidefiniteProgram
 from qpmhe.errors import ModelError, OptionError, ShapeError
 
@@ -307,3 +309,30 @@ def test_no_program_is_solved_that_has_no_solution(monkeypatch):
     certify_observer(linear(0.9, 1.0), qpmhe.Luenberger([[0.1]]), unit_box(1))
     assert solved
     assert min(solved) > 0.8 * (1.0 - 1e-9)
+
+
+def test_a_solver_that_fails_without_room_leaves_the_better_answer(monkeypatch):
+    """With the least margin, the program may break down, and the easier one's limit be far more."""
+    solve, region, limits = SemidefiniteProgram.solve, unit_box(2), []
+
+    def without_room(self, rate, margin, *rest):
+        forms = self._forms
+        self._forms = forms[1:] if margin < 1e-5 else forms
+        try:
+            return solve(self, rate, margin, *rest)
+        finally:
+            self._forms = forms
+
+    system = linear([[0.97, 0.2], [-0.2, 0.97]], [[1.0, 0.0]])
+    for share in (0.0, search_module._BETTER, None):
+        with monkeypatch.context() as patch:
+            if share is not None:
+                patch.setattr(SemidefiniteProgram, "solve", without_room)
+                patch.setattr(search_module, "_BETTER", share)
+            found = certify_observer(
+                system, qpmhe.Luenberger([[0.2], [0.0]]), region, sizes=(0.01, 0.02))
+        assert found.evidence is Evidence.PROVED
+        limits.append(ObserverBound(found, bounded_region(system, region), certificates.Sizes(
+            0.01, 0.02)).limit() * np.sqrt(np.linalg.inv(found.P).diagonal().max()))
+    assert limits[0] > 1.5 * limits[2]
+    assert limits[1] < 1.1 * limits[2]
