@@ -326,7 +326,7 @@ class _Bound:
         """Which rows depend on each component of v (size, p); all where that is not known."""
         if "v" not in self.parts:
             return np.zeros((self.size, p), np.bool_)
-        found = self._traced(points(USUAL, self._d, self._inputs, self._box))
+        found = self.trace or self._traced(points(USUAL, self._d, self._inputs, self._box))
         if found.function is None:
             return np.ones((self.size, p), np.bool_)
         touched: Mask = depends(found)[:, self.parts["v"]]
