@@ -106,8 +106,11 @@ def compile(
 
 def system_of(estimator: MovingHorizonEstimator) -> System:
     """The system of an estimator, its constraints in the units that they have there."""
-    system, observer, cost = estimator.system, estimator.observer, estimator.cost
-    return with_scaled_constraints(system, observer, cost, estimator.initial_state)
+    system, functions = estimator.system, estimator.scaled_constraints
+    if functions is None or functions.untraced or functions.fault(system.usual_points()):
+        observer, cost = estimator.observer, estimator.cost
+        return with_scaled_constraints(system, observer, cost, estimator.initial_state)
+    return system.with_constraints(functions)
 
 
 def engine_choice(estimator: MovingHorizonEstimator) -> tuple[str, str]:

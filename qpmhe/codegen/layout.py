@@ -466,6 +466,10 @@ def settings_record(
     if layout.covariance:
         own = record["covariances"]
         given += [(f"observer's {name}", own[name]) for name in own.dtype.names or ()]
+    if layout.constraints:
+        factor = record["constraints"]["factor"]
+        with np.errstate(divide="ignore"):
+            given.append(("unit of constraints", np.append(factor, 1 / factor)))
     for name, numbers in given:
         if not np.isfinite(numbers).all():
             raise OptionError(

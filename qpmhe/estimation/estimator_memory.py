@@ -15,6 +15,7 @@ from .._checks import vector
 from ..costs import Cost
 from ..errors import InvalidInputError
 from ..memory.snapshot import read, written
+from ..model.constraints import ConstraintFunctions
 from ..model.system import System
 from ..observers import Observer
 from ..terms.hold import WindowHold
@@ -117,6 +118,11 @@ class EstimatorMemory:
     def inputs(self) -> int:
         """Number of inputs in the ``u`` of `update`: the system's inputs without the parameters."""
         return self._inputs
+
+    @property
+    def scaled_constraints(self) -> ConstraintFunctions | None:
+        """The nonlinear constraints, traced and in the units that they had at construction."""
+        return self._own_system.constraints
 
     @property
     def has_changed(self) -> bool:

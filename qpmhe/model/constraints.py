@@ -37,6 +37,9 @@ _WANDERED = 30.0
 _MOVE = 2.0**-12
 # Points at which constraints are compared with another system's.
 _POINTS = 5
+# Rows with a scale beyond 2 to the power of this are multiplied, so that slopes can be squared; and
+# the largest power of two with an inverse.
+_EXPONENT, _MOST = 300, 1000
 
 
 @report_unknown_options
@@ -326,7 +329,7 @@ class _Bound:
         """Which rows depend on each component of v (size, p); all where that is not known."""
         if "v" not in self.parts:
             return np.zeros((self.size, p), np.bool_)
-        found = self._traced(points(USUAL, self._d, self._inputs, self._box))
+        found = self.trace or self._traced(points(USUAL, self._d, self._inputs, self._box))
         if found.function is None:
             return np.ones((self.size, p), np.bool_)
         touched: Mask = depends(found)[:, self.parts["v"]]
@@ -367,6 +370,9 @@ class ConstraintFunctions:
         chosen = [one.penalty or (np.zeros(one.size), np.zeros(one.size)) for one in constraints]
         self.linear: Array = np.concatenate([one[0] for one in chosen])
         self.quadratic: Array = np.concatenate([one[1] for one in chosen])
+        self._given = self.linear, self.quadratic
+        #: What rows are multiplied by, a power of two, where their scale is out of range.
+        self._factor: Array = np.ones(self.size)
         self.soft: Mask = np.repeat([one.penalty is not None for one in constraints], counts)
         self.on_state: Mask = np.repeat([one.on_state for one in self._bound], counts)
         self.parts = {name for one in self._bound for name in one.parts}
@@ -430,7 +436,7 @@ class ConstraintFunctions:
         """What else the step in C knows of them."""
         counts = [one.size for one in self._bound]
         return {
-            "scale": self.scale, "deviations": self._deviations,
+            "scale": self.scale, "factor": self._factor, "deviations": self._deviations,
             "group": np.repeat(np.arange(len(counts)), counts),
             "on_state": self.on_state.astype(np.intp),
             "touched": self._touched.astype(np.intp).ravel(),
@@ -496,7 +502,15 @@ class ConstraintFunctions:
             one.jacobian.check(s, u)
             typical = one.joined({"x": usual, "w": w, "v": v})
             found.append(one.scale(s, deviations, typical, u))
-        self.scale = np.concatenate(found)
+        scale = np.concatenate(found)
+        exponents = np.where(np.abs(np.frexp(scale)[1]) < _EXPONENT, 0, np.frexp(scale)[1])
+        self._factor = factor = np.ldexp(1.0, -exponents.clip(-_MOST, _MOST))
+        self.scale = scale * factor
+        linear, quadratic = self._given
+        with np.errstate(over="ignore"):
+            quadratic = quadratic / factor / factor
+        most = np.finfo(np.float64).max
+        self.linear, self.quadratic = linear / factor, np.minimum(quadratic, most)
 
     def counting(self, count: int, observed: Mask | None) -> Mask:
         """Which rows hold at each stage (K + 1, T): none on missing outputs.
@@ -523,6 +537,7 @@ class ConstraintFunctions:
         found = np.zeros((len(trajectory), self.size))
         for one, stages, place, s, u in self._along(trajectory, inputs, residuals):
             found[stages, place] = one.values(s, u)
+        found *= self._factor
         return found
 
     def linearised(
@@ -537,7 +552,7 @@ class ConstraintFunctions:
         own, following = np.zeros((count + 1, self.size, n)), np.zeros((count, self.size, n))
         slopes, through = self._slopes(minus_jacobian)
         for one, _, place, s, u in self._along(trajectory, inputs, residuals):
-            slope = one.derivatives(s, u)
+            slope = one.derivatives(s, u) * self._factor[place, None]
             if one.on_state:
                 own[:, place] = slope
                 continue
@@ -560,7 +575,7 @@ class ConstraintFunctions:
         own, below, following = (np.zeros((count + k, n, n)) for k in (1, 0, 0))
         slopes, through = self._slopes(minus_jacobian)
         for one, stages, place, s, u in self._along(trajectory, inputs, residuals):
-            bent = one.curvature(s, u, forces[stages, place])
+            bent = one.curvature(s, u, (forces * self._factor)[stages, place])
             if one.on_state:
                 own += bent
                 continue
@@ -577,7 +592,7 @@ class ConstraintFunctions:
 
     def described(self) -> Array:
         """Penalties and values at some points, one row each, to compare with another's."""
-        found = [self.soft.astype(np.float64), self.linear, self.quadratic]
+        found = [self.soft.astype(np.float64), *self._given]
         for k in range(_POINTS):
             values = [one.probed(k) for one in self._bound]
             found.append(np.concatenate(values))

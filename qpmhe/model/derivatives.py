@@ -188,7 +188,8 @@ class Jacobian:
             if finite.all():
                 break
             with suppress(Exception):  # it raises there, too: what is missing stays so
-                found = np.where(finite, found, given(place, u))
+                other = given(place, u)
+                found = np.where(finite | ~_finite_rows(other), found, other)
                 filled = _finite_rows(found).all(axis=-2) & ~finite.all(axis=-2)
                 self.nearby.used |= bool(filled.any())
         if np.isnan(found).all():  # with the error of the place itself

@@ -643,6 +643,14 @@ def _undefined(x):
     return np.log(x[1] + 0.5) + 0.1
 
 
+def constraints_of(size):
+    """A hard and a soft constraint, in units in which their slopes have this size."""
+    return _inputs(constraints=[
+        Constraint(lambda x: size * (0.15 - x[0] + x[1] ** 2)),
+        Constraint(lambda x, v: size * (x[0] * x[1] - 0.02 + 0.1 * v[0]), linear=3.0 / size),
+    ])
+
+
 def _held(hold=0.2, bounds=None, **options):
     """Two unknown parameters, which are seen only while the input acts."""
     system = qpmhe.from_casadi(
@@ -858,6 +866,7 @@ FEATURES = {
         "constraints that fail": (lambda: _inputs(constraints=[
             Constraint(lambda x: 0.3 - np.sqrt(x[0] - 0.2), linear=2.0), Constraint(_undefined),
         ]),),
+        "constraints of 1e200": (lambda: constraints_of(1e200), MANY),
         "constraints, restored": (lambda: _inputs(
             constraints=[Constraint(lambda w: 0.2 - w[0] + w[1] ** 2)]
         ), gaps, RESTORE),

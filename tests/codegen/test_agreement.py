@@ -179,3 +179,30 @@ def test_searches_for_feasible_points_end(infeasible, more):
             most = max(most, found.nearest_points / allowed)
     assert most >= 1.0  # else this test says nothing
     assert (most > 1.0) == (more > 0)
+
+
+@pytest.mark.parametrize("cap", [1, 2, 4])
+@pytest.mark.parametrize("name", ["constraints and soft sets", "soft disturbances and noises"])
+def test_the_promise_with_capped_iterations(name, cap):
+    """Caps count iterations of each engine's own solver: estimates differ, the promise holds.
+
+    J of the compiled step's trajectory is evaluated once more by the Python step's problem.
+    """
+    one, stopped = case(name), 0
+    reference, compiled = (
+        one.estimator(engine, max_solver_iterations=cap) for engine in ("python", "compiled")
+    )
+    for sample in one.samples:
+        found = compiled.update(**sample)
+        expected = reference.update(**sample)
+        for each in (found, expected):
+            assert each.cost <= each.candidate_cost
+            assert each.improved == (each.cost < each.candidate_cost)
+        problem = compiled._engine.solved().problem
+        if not found.dropped:  # a trajectory outside of sets has no finite J there
+            again = problem.evaluate(found.trajectory.copy(), roll_out=False)
+            assert again.cost == pytest.approx(found.cost, rel=1e-9)
+        assert problem.candidate.cost == pytest.approx(found.candidate_cost, rel=1e-9)
+        stopped += Status.SOLVER_STOPPED in found.status
+        assert found.candidate_cost == pytest.approx(expected.candidate_cost, rel=1e-9)
+    assert stopped

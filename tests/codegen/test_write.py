@@ -10,14 +10,17 @@ import pytest
 import qpmhe
 from qpmhe import codegen
 from qpmhe.errors import InvalidInputError, OptionError, QpmheError
+from qpmhe.model import constraints
 
 from .cases import case
 from .test_written import STRICT
 
 
-def linear(n=3, **options):
+def linear(n=3, constraints=None, **options):
     """An estimator of any size."""
-    system = qpmhe.from_casadi(lambda x: 0.9 * x, lambda x: x[0], n=n, compiled=False)
+    system = qpmhe.from_casadi(
+        lambda x: 0.9 * x, lambda x: x[0], n=n, compiled=False, constraints=constraints
+    )
     cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=[[1.0]])
     return qpmhe.MovingHorizonEstimator(
         system, qpmhe.Luenberger(np.full(n, 0.1)), cost,
@@ -34,6 +37,26 @@ def test_sources_with_other_weights_and_options_differ_in_the_data_only(tmp_path
     assert texts[0][0] == texts[1][0]
     assert ".max_qps = 1," in texts[0][1]
     assert ".max_qps = 2147483647," in texts[1][1]
+
+
+def test_constraints_are_traced_again_only_where_they_have_changed(monkeypatch):
+    traces, trace = [], constraints.traced
+    monkeypatch.setattr(
+        constraints, "traced", lambda *args, **options: traces.append(1) or trace(*args, **options)
+    )
+    limit = [1.0]
+    mhe = linear(constraints=[
+        qpmhe.Constraint(lambda x: x[0] ** 2 - limit[0]), qpmhe.Constraint(lambda v: v - 3.0),
+    ])
+    assert len(traces) == 2
+    functions = codegen.system_of(mhe).constraints
+    values, numbers = functions.expression()(np.zeros(7), 0.0), functions.numbers()
+    assert len(traces) == 2
+    assert values[0] == -1.0
+    assert numbers["touched"].tolist() == [0, 1]
+    limit[0] = 2.0
+    assert codegen.system_of(mhe).constraints.expression()(np.zeros(7), 0.0)[0] == -2.0
+    assert len(traces) == 4
 
 
 @pytest.mark.slow

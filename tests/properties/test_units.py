@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from qpmhe import Status
+from tests.codegen.cases import constraints_of
+from tests.codegen.test_agreement import agree
 
 from .problems import Problem, Units
 
@@ -118,3 +120,14 @@ def test_powers_of_ten_change_no_estimate(seed, kind):
                     value, expected, rtol=accuracy, atol=accuracy * size,
                     err_msg=f"{name} at {one.time}",
                 )
+
+
+@pytest.mark.parametrize("size", [1e-160, 1e200, 1e280])
+def test_constraints_in_units_whose_squares_are_no_numbers(size):
+    """Where slopes cannot be squared, the estimates are those of a usual unit."""
+    usual, other = (constraints_of(one) for one in (1.0, size))
+    expected, found = (one.estimator("python", max_qps=3) for one in (usual, other))
+    for sample in usual.samples:
+        estimate = found.update(**sample)
+        assert Status.SOLVER_STOPPED not in estimate.status
+        agree(expected.update(**sample), estimate, 1e-13)

@@ -52,6 +52,7 @@ static void mhe_set_values(mhe_estimator *e, mhe_trial *trial)
         mhe_joint(e, i, trial, joint);
         mhe_call_g(joint, mhe_stage_of_state(e, i)->u, values);
         for (int r = 0; r < MHE_G_ROWS; r++) {
+            values[r] *= e->settings->constraints.factor[r];
             if (!isfinite(values[r])) values[r] = INFINITY;
             if (!mhe_counts(e, i, r)) values[r] = 0;
         }
@@ -106,7 +107,7 @@ static void mhe_linearize_constraints(mhe_estimator *e, mhe_workspace *k, const 
         for (int j = 0; j < MHE_G_ROWS * NX; j++) own[j] = next[j] = 0;
         for (int q = 0; q < MHE_G_NONZEROS; q++) {
             const int r = mhe_g_row[q], c = mhe_g_column[q];
-            const real slope = slopes[q];
+            const real slope = slopes[q] * s->constraints.factor[r];
             if (is_last && !s->constraints.on_state[r]) continue;
             if (c < NX) {
                 own[r * NX + c] += slope;
@@ -286,7 +287,7 @@ static void mhe_bend_group(mhe_estimator *e, mhe_workspace *k, int i, const mhe_
             for (int q = 0; q < MHE_G_NONZEROS; q++) {
                 const int r = mhe_g_row[q], c = mhe_g_column[q];
                 if (r < first || r >= end || !(push[r] > 0)) continue;
-                M[a * count + place[c]] += (real)sign * push[r] * slopes[q];
+                M[a * count + place[c]] += (real)sign * push[r] * s->constraints.factor[r] * slopes[q];
             }
         }
     for (int a = 0; a < count; a++)
