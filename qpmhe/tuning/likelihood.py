@@ -133,7 +133,8 @@ class _Filter:
         )
         self._threshold = threshold if weights.threshold is None else weights.threshold
         self._clip = _bounds(system)
-        self._sweeps: dict[int, tuple[Any, Any]] = {}
+        self._ahead: dict[int, Any] = {}
+        self._back: dict[int, Any] = {}
         self._step: Any = None
         model = self._system.symbolic
         if model is not None and model.is_implicit:  # a step is no expression
@@ -160,11 +161,17 @@ class _Filter:
 
     # In CasADi
 
-    def _sweep(self, samples: int) -> tuple[Any, Any]:
-        """The filter over so many samples, and its adjoint from the last one to the first."""
-        if samples not in self._sweeps:
+    def _sweep(self, samples: int) -> Any:
+        """The filter over so many samples."""
+        if samples not in self._ahead:
+            self._ahead[samples] = self._step.mapaccum(
+                "forward", samples, [0, 1], [0, 1], {"base": 10})
+        return self._ahead[samples]
+
+    def _sweep_back(self, samples: int) -> Any:
+        """Its adjoint, from the last sample to the first; not made where only values are needed."""
+        if samples not in self._back:
             ca, step = import_casadi(), self._step
-            forward = step.mapaccum("forward", samples, [0, 1], [0, 1], {"base": 10})
             back = step.reverse(1)
             symbols = [ca.SX.sym(step.name_in(i), step.sparsity_in(i)) for i in range(step.n_in())]
             z, P, *known = symbols
@@ -175,9 +182,9 @@ class _Filter:
                 "back", [*seeds[:2], z, P, *known, seeds[2]],
                 [ca.densify(found[0]), ca.densify(found[1]), *map(ca.densify, found[2:])],
             )
-            backward = made.mapaccum("backward", samples, [0, 1], [0, 1], {"base": 10})
-            self._sweeps[samples] = forward, backward
-        return self._sweeps[samples]
+            self._back[samples] = made.mapaccum(
+                "backward", samples, [0, 1], [0, 1], {"base": 10})
+        return self._back[samples]
 
     def _given(self, weights: Weights, one: Data) -> list[Any]:
         """What the step takes besides z and P, sample beside sample."""
@@ -191,7 +198,7 @@ class _Filter:
 
     def _forward(self, weights: Weights, one: Data) -> tuple[Array, Array, Array]:
         """Z (n, T) and P (n, n T) after each sample, and costs (T,)."""
-        z, covariance, cost = map(np.asarray, self._sweep(len(one))[0](
+        z, covariance, cost = map(np.asarray, self._sweep(len(one))(
             one.start, weights.prior, *self._given(weights, one)
         ))
         return z, covariance, cost[0]
@@ -211,7 +218,7 @@ class _Filter:
             blocks = covariance.reshape(n, len(one), n)
             begun = np.concatenate((weights.prior[:, None], blocks[:, :-1]), axis=1)
             given = self._given(weights, one)
-            found = list(map(np.asarray, self._sweep(len(one))[1](
+            found = list(map(np.asarray, self._sweep_back(len(one))(
                 np.zeros(n), np.zeros((n, n)),
                 np.hstack((one.start[:, None], z[:, :-1]))[:, ::-1],
                 begun[:, ::-1].reshape(n, -1), *(each[:, ::-1] for each in given[:4]), *given[4:],
