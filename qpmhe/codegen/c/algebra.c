@@ -9,9 +9,6 @@ static real mhe_dot(int n, const real *a, const real *b)
     return sum;
 }
 
-/* The larger one; b where a is NaN. Unlike fmax, it is no call. */
-static real mhe_max(real a, real b) { return a > b ? a : b; }
-
 static int mhe_all_finite(int n, const real *a)
 {
     return isfinite(mhe_dot(n, a, a));

@@ -74,7 +74,7 @@ static real mhe_algebraic_share(const mhe_reduced *r, const real *z, const real 
         for (int j = 0; j < NZ; j++) size += (real)fabs(r->inverse[i * NZ + j]) * terms[j];
         const real share = step[i] != 0 ? (real)fabs(step[i]) / size : 0;
         if (!isfinite(share)) return NAN;
-        length = (real)fmax(length, share);
+        length = mhe_max(share, length);
     }
     return length;
 }

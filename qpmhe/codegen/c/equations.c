@@ -22,7 +22,7 @@ static int mhe_straight(real curved, real factor, real before, real length)
 static real mhe_shorter(real curved, real factor, real before)
 {
     const real predicted = (real)$curved * factor * before / curved;
-    return factor * (predicted < (real)$most ? (real)fmax(predicted, $least) : (real)$most);
+    return factor * (predicted < (real)$most ? mhe_max(predicted, $least) : (real)$most);
 }
 
 /* The largest share that a correction has of some sizes. */
@@ -32,7 +32,7 @@ static real mhe_share(int size, const real *step, const real *sizes)
     for (int i = 0; i < size; i++) {
         const real share = step[i] != 0 ? (real)fabs(step[i]) / sizes[i] : 0;
         if (!isfinite(share)) return NAN;
-        length = (real)fmax(length, share);
+        length = mhe_max(share, length);
     }
     return length;
 }

@@ -57,7 +57,7 @@ static void mhe_stage_sizes(const real *x, real h, const real *W, const real *st
     for (int a = 0; a < NX; a++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++)
-            most = (real)fmax(most, fabs(W[i * NW + a] + step[i * NX + a]));
+            most = mhe_max((real)fabs(W[i * NW + a] + step[i * NX + a]), most);
         states[a] = (real)fabs(x[a]) + most;
     }
     for (int a = 0; a < NX; a++) {
@@ -65,7 +65,7 @@ static void mhe_stage_sizes(const real *x, real h, const real *W, const real *st
         for (int b = 0; b < NX; b++) {
             real most = 0;
             for (int i = 0; i < MHE_STAGES; i++)
-                most = (real)fmax(most, fabs(r[i].jacobian[a * NX + b]));
+                most = mhe_max((real)fabs(r[i].jacobian[a * NX + b]), most);
             sizes[a] += h * most * states[b];
         }
     }
@@ -81,12 +81,12 @@ static real mhe_stage_moves(const mhe_reduced *r, const real *W, const real *siz
         for (int a = 0; a < NX; a++) {
             const real moved = (real)fabs(step[i * NX + a]);
             if (!isfinite(moved)) return NAN;
-            if (moved > 0) length = (real)fmax(length, moved / sizes[a]);
+            if (moved > 0) length = mhe_max(moved / sizes[a], length);
             moves[i * NW + a] = step[i * NX + a];
         }
         const real share = mhe_move_algebraic(r + i, W + i * NW, sizes, moves + i * NW);
         if (!isfinite(share)) return NAN;
-        length = (real)fmax(length, share);
+        length = mhe_max(share, length);
     }
     return length;
 }
@@ -132,10 +132,13 @@ static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, 
         const real length = mhe_stage_moves(r, W, sizes, step, moves);
         if (!isfinite(length)) return 0;
         const int done = mhe_converged(length, last);
-        for (int i = 0; i < MHE_STAGES * NW; i++)
-            scale[i] = (real)(fabs(W[i]) + fabs(moves[i]) + (i % NW < NX ? fabs(w[i % NW]) : 0));
-        const real before = mhe_share(MHE_STAGES * NW, moves, scale);
-        real factor = 1;
+        real factor = 1, before = NAN;
+        if (damped) {
+            for (int i = 0; i < MHE_STAGES * NW; i++)
+                scale[i] =
+                    (real)(fabs(W[i]) + fabs(moves[i]) + (i % NW < NX ? fabs(w[i % NW]) : 0));
+            before = mhe_share(MHE_STAGES * NW, moves, scale);
+        }
         int good = 0;
         for (int halving = 0; halving < $halvings && !good; halving++) {
             real curved = NAN;
