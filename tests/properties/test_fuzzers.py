@@ -181,11 +181,11 @@ def test_estimators_of_the_campaign_have_no_faults(engine, seed):
     assert counts["steps"] >= 40
 
 
-# Estimators in which the engines have differed, and samples that show it.
+# Estimators in which the engines have differed, and how many samples show it; None for all.
 MENDED = {
     21000036: 48,  # second corrections of soft rows
     12000043: 40,  # soft rows beside hard ones and a vague prior
-    21000089: 12, 12000042: 25,  # rows whose forces settle slowly
+    21000089: None,  # rows whose forces settle slowly
 }
 
 
@@ -195,7 +195,8 @@ MENDED = {
 def test_engines_that_differed_agree(seed, samples):
     counts, faults, words = run(seed, "compiled", samples=samples)
     assert faults == [], words
-    assert counts["compared"] >= samples
+    assert not any("tolerance of QPs" in name for name in counts), counts
+    assert counts["compared"] >= (samples or 60)
 
 
 @pytest.mark.parametrize(("event", "seed"), [
