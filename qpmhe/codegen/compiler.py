@@ -122,8 +122,9 @@ def compiled_library(
     if not fault:
         raise CompilationError(f"{' '.join(compiler)} failed: {message}")
     raise WrongCodeError(
-        f"the code that {' '.join(compiler)} makes does not pass its check at any level of "
-        f"optimisation ({fault}); take engine='python', or set CC to another compiler."
+        f"compiled by {' '.join(compiler)}, the step does not pass its check at any level of "
+        f"optimisation ({fault}): the compiler is at fault, or rounding decides in this estimator. "
+        "Take engine='python', or set CC to another compiler."
     )
 
 
