@@ -131,27 +131,79 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         + '#pragma GCC diagnostic ignored "-Wconversion"\n' * single + "#endif",
         "#define casadi_real mhe_real", code,
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif\n",
-        *calls, *_model_parts(model),
+        *calls, *_model_parts(model), *_algebraic_set(model),
     ))
 
 
 def _constraint_calls(ca: Any, generator: Any, model: CasadiModel) -> list[str]:
-    """C functions of (x, w, v), one below the other, and u to the nonlinear constraints."""
-    function = model.constraints
-    s, u = ca.SX.sym("s", function.numel_in(0)), ca.SX.sym("u", function.numel_in(1))
-    value = function(s, u)
-    slopes = ca.jacobian(value, s)
+    """C functions of (x, w, v), one below the other, and u to the nonlinear constraints.
+
+    Where some are functions of z, too, z is below: see `_algebraic_set`.
+    """
+    s, u, value, slopes = _constraint_slopes(model)
+    joined = "joined_" * _has_algebraic(model)
     nonzeros = ca.sparsity_cast(slopes, ca.Sparsity.dense(slopes.nnz(), 1))
     calls = []
     for which, results in (("g", [value]), ("g_jacobian", [value, nonzeros])):
         named = ca.Function(f"mhe_casadi_{which}", [s, u], results)
         generator.add(named)
-        calls.append(_call(f"mhe_call_{which}", named.name(), named))
-    tables = zip(("row", "column"), slopes.sparsity().get_triplet(), strict=True)
-    return [*calls, f"#define MHE_G_NONZEROS {slopes.nnz()}\n", *(
-        f"static const int mhe_g_{name}[] = {{{', '.join(map(str, table)) or '0'}}};\n"
-        for name, table in tables
+        calls.append(_call(f"mhe_call_{joined}{which}", named.name(), named))
+    if joined:
+        return calls
+    return [*calls, *_tables("g", *slopes.sparsity().get_triplet())]
+
+
+def _tables(name: str, rows: list[int], columns: list[int]) -> list[str]:
+    """The places of nonzeros in C."""
+    return [f"#define MHE_{name.upper()}_NONZEROS {len(rows)}\n", *(
+        f"static const int mhe_{name}_{word}[] = {{{', '.join(map(str, table)) or '0'}}};\n"
+        for word, table in (("row", rows), ("column", columns))
     )]
+
+
+def _constraint_slopes(model: CasadiModel) -> tuple[Any, Any, Any, Any]:
+    """Arguments, values and derivatives of the nonlinear constraints."""
+    ca, function = import_casadi(), model.constraints
+    s, u = ca.SX.sym("s", function.numel_in(0)), ca.SX.sym("u", function.numel_in(1))
+    value = function(s, u)
+    return s, u, value, ca.jacobian(value, s)
+
+
+def _has_algebraic(model: CasadiModel) -> bool:
+    """Whether nonlinear constraints are functions of z."""
+    return model.constraints is not None and (
+        model.constraints.numel_in(0) > 2 * model.n + model.p
+    )
+
+
+def _algebraic_set(model: CasadiModel) -> list[str]:
+    """The part of C by which z follows x in nonlinear constraints, where they are functions of z.
+
+    Rows that are functions of z are functions of nothing else.
+    """
+    if not _has_algebraic(model):
+        return []
+    joint = 2 * model.n + model.p
+    rows, columns = _constraint_slopes(model)[3].sparsity().get_triplet()
+    direct = sum(column < joint for column in columns)
+    places = {row: k for k, row in enumerate(dict.fromkeys(rows[direct:]))}
+    listed = {
+        "place": [places[row] for row in rows[direct:]],
+        "column": [column - joint for column in columns[direct:]],
+    }
+    return [
+        *_tables(
+            "g", [*rows[:direct], *(row for row in places for _ in range(model.n))],
+            [*columns[:direct], *list(range(model.n)) * len(places)],
+        ),
+        *(
+            f"static const int mhe_z_{name}[] = {{{', '.join(map(str, table))}}};\n"
+            for name, table in listed.items()
+        ),
+        _filled("algebraic_set", {
+            "joint": joint, "direct": direct, "chained": len(rows) - direct,
+        }),
+    ]
 
 
 def _own_losses(model: CasadiModel) -> str:

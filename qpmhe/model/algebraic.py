@@ -137,6 +137,19 @@ class AlgebraicStates:
             at, values, J, last = at[left], values[left], slopes[left], length[left]
 
 
+def of_rows(
+    function: Batched, solver: AlgebraicStates, x: Array, u: Array, shape: tuple[int, ...]
+) -> Array:
+    """A function of w at x (..., n); NaN, without a call, where z has no solution."""
+    states = x.reshape(-1, x.shape[-1])
+    inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[-1])).reshape(len(states), u.shape[-1])
+    w = solver.complete(states, inputs)
+    found, good = np.full((len(w), *shape), np.nan), np.isfinite(w).all(axis=1)
+    if good.any():
+        found[good] = function(w[good], inputs[good])
+    return found.reshape(*x.shape[:-1], *shape)
+
+
 def converged(length: Array, last: Array) -> Mask:
     """Whether Newton's method is at its end, behind corrections of these shares (K,).
 

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .algebraic import AlgebraicStates
+from .algebraic import AlgebraicStates, of_rows
 from .constraints import Constraint
 from .evaluation import Evaluator, VirtualMachine
+from .expressions import import_casadi
 from .sets import ConvexSet, SoftSet
 
 if TYPE_CHECKING:
     from .system import System
 
 Array = NDArray[np.float64]
+_NOTHING: Array = np.zeros(0)
 
 
 class AlgebraicSet:
@@ -60,8 +62,24 @@ class AlgebraicSet:
         if self._m:
             function = self._of_both
         made = Constraint(function, len(self.limit), **self.penalties)
-        made.no_expression = "it solves the algebraic equations: write it as a function of x and u"
+        made.algebraic = self
         return made
+
+    def expression(self, z: Any) -> Any:
+        """The inequalities' left sides of CasADi symbols z."""
+        ca = import_casadi()
+        return ca.mtimes(ca.sparsify(ca.DM(self.matrix)), z) - ca.DM(self.limit)
+
+    def slopes(self, x: Array, u: Array = _NOTHING) -> Array:
+        """Their derivatives by x (..., n), (..., rows, n): NaN where z has no solution."""
+        solver = self._solver()
+
+        def chained(w: Array, u: Array) -> Array:
+            of_states = np.zeros((*self.matrix.shape[:1], x.shape[-1]))
+            slope = np.concatenate((of_states, self.matrix), axis=1)
+            return solver.chained(slope, w, u)
+
+        return of_rows(chained, solver, x, u, (len(self.limit), x.shape[-1]))
 
     def _of_state(self, x: Array) -> Array:
         return self._of_both(x, np.empty(0))

@@ -8,7 +8,7 @@ from contextlib import suppress
 from copy import copy
 from functools import cached_property
 from itertools import pairwise, product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,11 +19,14 @@ from qpmhe_solvers.values import integer, shown
 from ..errors import ModelError, SetError, ShapeError
 from .derivatives import Jacobian
 from .expressions import import_casadi
-from .functions import BatchedFunction, raised
+from .functions import BatchedFunction, Trusted, raised
 from .points import ALL, FEW, USUAL, Points, points
 from .sets import Box, ConvexSet, penalties
 from .traces import depends, evaluated_alone, of_both
 from .tracing import Traced, difference, traced
+
+if TYPE_CHECKING:
+    from .algebraic_set import AlgebraicSet
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -82,8 +85,8 @@ class Constraint:
     >>> preferred = qpmhe.Constraint(lambda x, u: x[0] - u[0], linear=10.0)
     """
 
-    #: Why g is no expression of its arguments; blank where it may be one.
-    no_expression: str = ""
+    #: The set of z that g makes an inequality of x and u; None where g is written by users.
+    algebraic: AlgebraicSet | None = None
 
     def __init__(
         self, g: Callable[..., Any], size: int = 1, *, linear: ArrayLike | None = None,
@@ -154,7 +157,7 @@ class _Bound:
             raise ModelError(
                 f"{name} takes u, but the system has no inputs; leave u out, or pass m."
             )
-        self._no_expression = constraint.no_expression
+        self.algebraic = constraint.algebraic
         self.on_state = self._names == ("x",)
         self.parts: dict[str, slice] = {}
         self._d = 0
@@ -177,7 +180,8 @@ class _Bound:
             )
         except ModelError as error:
             raise ModelError(f"{error} A constraint's size is the number of its rows.") from error
-        self.jacobian = Jacobian(self.function, None, m, probes, self._box)
+        given = None if self.algebraic is None else Trusted(self.algebraic.slopes)
+        self.jacobian = Jacobian(self.function, given, m, probes, self._box)
         self._deviations: Array = np.empty(0)  # none yet
         self._user = self.function, self.jacobian
         #: The expression of g that is evaluated in its place; None where it is called as written,
@@ -230,8 +234,8 @@ class _Bound:
 
     def _traced(self, where: Points) -> Traced:
         """The expression of g, if it has one that gives the same."""
-        if self._no_expression:
-            return Traced(None, self._no_expression)
+        if self.algebraic is not None:
+            return Traced(None, "it solves the algebraic equations")
         found = traced(of_both(self._user[0]), (self._d, self._inputs), where, name="g")
         if found.function is not None and found.function.numel_out(0) != self.size:
             return Traced(None, f"it returns shape {found.shape} of symbols")
@@ -418,16 +422,24 @@ class ConstraintFunctions:
         """Which one has no expression, and why; blank where all have one."""
         return next(
             (f"{one.function.name} has no C form ({one.untraced})" for one in self._bound
-             if one.trace is None), ""
+             if one.trace is None and one.algebraic is None), ""
         )
 
     def expression(self) -> Any:
-        """All of them as a casadi.Function of (x, w, v), one below the other, and u."""
+        """All of them as a casadi.Function of (x, w, v), one below the other, and u.
+
+        Where there are sets of z, z is below.
+        """
         ca = import_casadi()
         n, r, p = self._n, self._r, self._p
-        s, u, values = ca.SX.sym("s", n + r + p), ca.SX.sym("u", self._m), []
-        parts = {"x": s[:n], "w": s[n : n + r], "v": s[n + r :]}
+        sets = [one.algebraic for one in self._bound if one.algebraic is not None]
+        k = sets[0].matrix.shape[1] if sets else 0
+        s, u, values = ca.SX.sym("s", n + r + p + k), ca.SX.sym("u", self._m), []
+        parts = {"x": s[:n], "w": s[n : n + r], "v": s[n + r : n + r + p]}
         for one in self._bound:
+            if one.algebraic is not None:
+                values.append(one.algebraic.expression(s[n + r + p :]))
+                continue
             assert one.trace is not None
             values.append(one.trace.function(ca.vertcat(*(parts[k] for k in one.parts)), u))
         return ca.Function("constraints", [s, u], [ca.densify(ca.vertcat(*values))])

@@ -133,8 +133,7 @@ class ContinuousTime:
             Where z is looked for, in its units; it picks one of several solutions. Its magnitudes
             are those of z for derivatives by differences.
         algebraic_set : Box or Polytope, optional
-            A set of z at every sample, hard or soft: nonlinear constraints of x and u, which only
-            the Python step has.
+            A set of z at every sample, hard or soft: nonlinear constraints of x and u.
         method : {"radau", "midpoint", "auto"}
             As for `from_ode`; ``"auto"`` chooses between substeps of ``"radau"``.
         steps : int

@@ -16,7 +16,7 @@ from qpmhe_solvers.values import shown
 from .._checks import dimension, numbers, positive, vector
 from ..errors import InvalidInputError, ModelError, QpmheError, ShapeError
 from .accuracy import TOLERANCE, TRIED, Choice, choice
-from .algebraic import AlgebraicStates
+from .algebraic import AlgebraicStates, of_rows
 from .algebraic_set import AlgebraicSet
 from .constraints import checked_constraints
 from .derivatives import Jacobian
@@ -157,13 +157,13 @@ def made_from_dae(
     step, slope = of_any_shape(implicit(how), solver.complete)
 
     def output(x: Array, u: Array = _NOTHING) -> Array:
-        return _of_rows(lambda w, u: functions["h"].batch(w, u), solver, x, u, (p,))
+        return of_rows(lambda w, u: functions["h"].batch(w, u), solver, x, u, (p,))
 
     def output_slope(x: Array, u: Array = _NOTHING) -> Array:
         def chained(w: Array, u: Array) -> Array:
             return solver.chained(slope_of_h.batch(w, u), w, u)
 
-        return _of_rows(chained, solver, x, u, (p, n))
+        return of_rows(chained, solver, x, u, (p, n))
 
     def timed(_: System) -> System:
         return cls.made(
@@ -323,16 +323,3 @@ def _stacked(*functions: BatchedFunction) -> Trusted:
         return np.concatenate([one.batch(w, u) for one in functions], axis=-1)
 
     return Trusted(evaluate)
-
-
-def _of_rows(
-    function: Function, solver: AlgebraicStates, x: Array, u: Array, shape: tuple[int, ...]
-) -> Array:
-    """A function of w at x (..., n); NaN, without a call, where z has no solution."""
-    states = x.reshape(-1, x.shape[-1])
-    inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[-1])).reshape(len(states), u.shape[-1])
-    w = solver.complete(states, inputs)
-    found, good = np.full((len(w), *shape), np.nan), np.isfinite(w).all(axis=1)
-    if good.any():
-        found[good] = function(w[good], inputs[good])
-    return found.reshape(*x.shape[:-1], *shape)

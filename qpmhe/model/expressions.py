@@ -35,7 +35,7 @@ class CasadiModel:
     ``output_residual`` and ``state_residual`` are the user's functions of (a, b) for differences,
     where there are any; ``losses`` those of one number q to rho(q) and rho'(q), for prior, w and v;
     ``correction`` an observer's function of (z, v); ``constraints`` one of ((x, w, v), u) to the
-    values of all nonlinear constraints.
+    values of all nonlinear constraints, or of ((x, w, v, z), u) where some are functions of z.
     """
 
     f: Any
