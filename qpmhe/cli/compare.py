@@ -171,9 +171,12 @@ def _run(what: Study, store: Path, out: Path, **options: Any) -> None:
     cells = frame[frame["key"].isin({cell.key for cell in what.cells()})]
     failed = cells[cells["outcome"] == "failed"]
     if 0 < len(failed) < len(cells):
+        reasons = failed["reason"].value_counts()
+        count = f", {reasons.iloc[0]} for this reason" if len(reasons) > 1 else ""
         console.print(
-            f"[yellow]{len(failed)} of {len(cells)} cells failed; the report gives the reasons.[/]",
-            highlight=False,
+            f"{len(failed)} of {len(cells)} cells failed{count}: {reasons.index[0]}\n"
+            "The report gives all reasons.",
+            style="yellow", highlight=False, markup=False, soft_wrap=True,
         )
     show_report(console, store, out)
     _show_kept(console, options["keep_failing"])
