@@ -22,7 +22,7 @@ from ..diagnosis.findings import listed
 from ..errors import OptionError
 from ..observers import Observer
 from ..plots.style import STYLES, panels
-from .contest import Found, root_mean_squares
+from .contest import Found
 from .innovations import innovations_of
 from .judge import Blocks, ObserverScore
 from .search import NORMAL, limit
@@ -287,18 +287,13 @@ class Tuning:
         )
         found = {"negative log likelihood per sample": (before, after)}
         first, second = (
-            root_mean_squares(self._score.errors(weights), self._blocks, self._compared)
+            self._blocks.sizes(self._score.errors(weights), self._score.labels)
             for weights in (structure.first, structure.weights(self._judged_theta))
         )
         for label, one in first.items():
             name = f"error of {label}" if self._score.truth else f"{label}, {ahead} ahead"
             found[name] = one, second.get(label, np.nan)
         return found
-
-    @property
-    def _compared(self) -> Sequence[str]:
-        """The names of what the score compares."""
-        return self._labels["prior" if self._score.truth else "noise"]
 
     def horizons(
         self, horizons: Sequence[int] = (2, 5, 10, 20, 40),
@@ -381,16 +376,17 @@ class Tuning:
         return [*tables, self._table_of_observers()] if self.observers else tables
 
     def _table_of_observers(self) -> tuple[str, list[str], list[tuple[str, ...]]]:
-        labels = [one for one in self._compared if any(one in row.errors for row in self.observers)]
+        named = {one for row in self.observers for one in row.errors}
+        labels = [one for one in self._score.labels if one in named][:_COLUMNS]
         kind = "error" if self._score.truth else f"{self._score.ahead} ahead"
         rows = [
             (row.title + " *" * (row is self._row), *(
-                (f"{row.score:.4g}", *(f"{row.errors[one]:.3g}" for one in labels[:_COLUMNS]),
-                 f"{1e6 * row.seconds:.3g}")
-                if not row.failure else ("failed", *[""] * len(labels[:_COLUMNS]), ""))
+                ("failed", *[""] * len(labels), "") if row.failure else
+                (f"{row.score:.4g}", *(f"{row.errors[one]:.3g}" for one in labels),
+                 f"{1e6 * row.seconds:.3g}"))
             ) for row in self.observers
         ]
-        headings = ["", "score", *(f"{one}, {kind}" for one in labels[:_COLUMNS]), "us a step"]
+        headings = ["", "score", *(f"{one}, {kind}" for one in labels), "us a step"]
         return f"Estimators on {self._blocks.name}", headings, rows
 
     def _texts(self) -> list[str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..observers import ExtendedKalman, Observer
 from .judge import Blocks, ObserverScore, judge
 from .likelihood import Likelihood
 from .score import Score
-from .search import SearchProgress, refine
+from .search import SearchProgress, TuningCheckpointError, polish, refine, search_all
 
 # Per cent by which scores may differ that are the same for any purpose.
 _ALIKE = 1.0
@@ -40,13 +41,13 @@ class Kind:
         """The one that a name stands for."""
         return cls(source.name, lambda problem: made(source, problem), limit)
 
-    def about(self, score: Score, likely: Found) -> Kind:
+    def about(self, likely: Found) -> Kind:
         """A constant gain is made about the mean of the records, where nothing else is given."""
         if self.name != "steady":
             return self
         at, u = (
             [float(f"{one:.{_DIGITS}g}") for one in part.tolist()]
-            for part in score.typical(likely.likelihood.structure.weights(likely.theta))
+            for part in likely.score.typical(likely.likelihood.structure.weights(likely.theta))
         )
         return Kind.named(_source(f"steady(at={at}{f', u={u}' * bool(u)})"))
 
@@ -59,8 +60,8 @@ class Found:
     theta: Array
     hessian: Array
     score: Score
+    best: Array
     refined: Array | None = None
-    best: Array = None  # type: ignore[assignment]
     judgement: str = "by the likelihood alone."
     row: ObserverScore | None = None
 
@@ -102,80 +103,96 @@ def _source(name: Any) -> ModelSource:
     return find(name, kind="observer", known=KNOWN)
 
 
-def settle(
-    found: Found, objective: str, blocks: Blocks, kept: SearchProgress,
-    advance: Callable[[str], None],
-) -> Found:
-    """Lower the estimator's own error, unless the likelihood alone is wanted, and judge."""
-    if objective == "likelihood":
-        return replace(found, best=found.theta)
-    likelihood, theta, score = found.likelihood, found.theta, found.score
-    refined = refine(score, likelihood, theta, kept, advance)
-    best, judgement = judge(blocks, score, likelihood.structure, theta, refined)
-    return replace(found, refined=refined, best=best, judgement=judgement)
+@dataclass(eq=False)
+class Searches:
+    """The searches for the weights of estimators on the same data, and how long they take."""
 
+    likelihoods: dict[float | None, Likelihood]
+    score: Score
+    objective: str
+    blocks: Blocks
+    beginnings: list[Array]
+    jobs: int
+    kept: SearchProgress
+    advance: Callable[[str], None]
+    seconds: dict[str, float] = field(default_factory=dict)
+    _likely: dict[float | None, Found] = field(default_factory=dict)
 
-def contest(
-    kinds: Sequence[Kind], most_qps: int, likely: Callable[[float | None], Found],
-    settled: Callable[[str, Found], Found], blocks: Blocks, labels: Sequence[str],
-) -> tuple[Found, list[ObserverScore]]:
-    """Tune each observer, alone and with QPs, and rank them on the blocks that judge.
+    def likely(self, limit: float | None, part: str = "") -> Found:
+        """Maximise the likelihood of a filter with this limit of its innovations, once."""
+        if limit not in self._likely:
+            since, self.kept.part, one = perf_counter(), part, self.likelihoods[limit]
+            theta = search_all(one, self.beginnings, self.kept, self.jobs, self.advance)
+            theta, hessian = polish(one, theta)
+            self._likely[limit] = Found(one, theta, hessian, self.score, theta)
+            self._spend("likelihood", since)
+        return self._likely[limit]
 
-    The simplest one, by its number of QPs and then by its place in the list, whose score is within
-    one standard error or 1 % of the least is taken.
-    """
-    entries = list(_entries(kinds, most_qps, likely, settled, blocks, labels))
-    usable = [one for one in entries if not one[0].failure]
-    if not usable:
-        reasons = "; ".join(f"{row.title}: {row.failure}" for row, _, _ in entries)
-        raise ModelError(f"no observer can be tuned on these records: {reasons}")
-    _, _, least = min(usable, key=lambda one: one[0].score)
-    usable.sort(key=lambda one: one[0].max_qps)
-    row, found, _ = next(one for one in usable if _is_close(one[2], least, blocks))
-    rows = sorted((one[0] for one in entries), key=lambda one: (bool(one.failure), one.score))
-    return replace(found, row=row), rows
+    def settled(self, found: Found, part: str = "") -> Found:
+        """Lower the estimator's own error, unless the likelihood alone is wanted, and judge."""
+        if self.objective == "likelihood":
+            return found
+        since, self.kept.part = perf_counter(), part
+        likelihood, theta, score = found.likelihood, found.theta, found.score
+        refined = refine(
+            score, likelihood, theta, self.kept, lambda text: self.advance(part + text))
+        best, judgement = judge(self.blocks, score, likelihood.structure, theta, refined)
+        self._spend("estimator", since)
+        return replace(found, refined=refined, best=best, judgement=judgement)
 
+    def contest(
+        self, kinds: Sequence[Kind], most_qps: int
+    ) -> tuple[Found, list[ObserverScore]]:
+        """Tune each observer, alone and with QPs, and rank them on the blocks that judge.
 
-def _is_close(samples: list[Array], least: list[Array], blocks: Blocks) -> bool:
-    gain, error, _ = blocks.gain(samples, least)
-    return samples is least or gain <= max(error, _ALIKE)
+        The simplest one, by its number of QPs and then by its place in the list, whose score is
+        within one standard error or 1 % of the least is taken.
+        """
+        entries = list(self._entries(kinds, most_qps))
+        usable = [one for one in entries if not one[0].failure]
+        if not usable:
+            reasons = "; ".join(f"{row.title}: {row.failure}" for row, _, _ in entries)
+            raise ModelError(f"no observer can be tuned on these records: {reasons}")
+        _, _, least = min(usable, key=lambda one: one[0].score)
+        usable.sort(key=lambda one: one[0].max_qps)
+        row, found, _ = next(one for one in usable if self._is_close(one[2], least))
+        rows = sorted((one[0] for one in entries), key=lambda one: (bool(one.failure), one.score))
+        return replace(found, row=row), rows
 
+    def _spend(self, search: str, since: float) -> None:
+        self.seconds[search] = self.seconds.get(search, 0.0) + perf_counter() - since
 
-def _entries(
-    kinds: Sequence[Kind], most_qps: int, likely: Callable[[float | None], Found],
-    settled: Callable[[str, Found], Found], blocks: Blocks, labels: Sequence[str],
-) -> Iterator[tuple[ObserverScore, Any, Any]]:
-    for kind in kinds:
-        begun = likely(kind.limit)
-        for qps in range(most_qps + 1):
-            row = ObserverScore(kind.name, qps)
-            try:
-                kind = kind.about(begun.score, begun)
-                row = ObserverScore(kind.name, qps)
-                found = settled(row.title, replace(begun, score=begun.score.of(kind.make, qps)))
-                weights = begun.likelihood.structure.weights(found.best)
-                samples = found.score.samples(weights)
-                row = replace(
-                    row, score=blocks.mean(samples), seconds=found.score.seconds,
-                    errors=root_mean_squares(found.score.errors(weights), blocks, labels),
-                )
-                if not np.isfinite(row.score):
-                    row = replace(row, failure="its estimates diverge")
-                yield row, found, samples
-            except (QpmheError, np.linalg.LinAlgError, FloatingPointError) as error:
-                yield replace(row, failure=str(error)), None, None
+    def _is_close(self, samples: list[Array], least: list[Array]) -> bool:
+        gain, error, _ = self.blocks.gain(samples, least)
+        return samples is least or gain <= max(error, _ALIKE)
 
-
-def root_mean_squares(
-    errors: list[Array], blocks: Blocks, labels: Sequence[str]
-) -> dict[str, float]:
-    """The root mean square of each component's errors on the blocks that judge, where there are."""
-    every = blocks.chosen(errors)
-    there = np.isfinite(every)
-    with np.errstate(invalid="ignore"):
-        squares = np.where(there, every, 0.0) ** 2
-        sizes = np.sqrt(squares.sum(axis=0) / there.sum(axis=0)).tolist()
-    return {one: size for one, size in zip(labels, sizes, strict=True) if np.isfinite(size)}
+    def _entries(
+        self, kinds: Sequence[Kind], most_qps: int
+    ) -> Iterator[tuple[ObserverScore, Any, Any]]:
+        for kind in kinds:
+            name = kind.name
+            for qps in range(most_qps + 1):
+                title = f"MHE, {qps} QP{'s' * (qps > 1)} on {name}" if qps else name
+                row = ObserverScore(name, qps, title)
+                try:
+                    begun = self.likely(kind.limit, f"limit {kind.limit}, ")
+                    kind = kind.about(begun)
+                    row = replace(row, observer=kind.name)
+                    score = self.score.of(kind.make, qps)
+                    found = self.settled(replace(begun, score=score), f"{title}, ")
+                    errors = score.errors(begun.likelihood.structure.weights(found.best))
+                    samples = score.scaled(errors)
+                    row = replace(
+                        row, score=self.blocks.mean(samples), seconds=score.seconds,
+                        errors=self.blocks.sizes(errors, score.labels),
+                    )
+                    if not np.isfinite(row.score):
+                        row = replace(row, failure="its estimates diverge")
+                    yield row, found, samples
+                except TuningCheckpointError:
+                    raise
+                except (QpmheError, np.linalg.LinAlgError, FloatingPointError) as error:
+                    yield replace(row, failure=str(error)), None, None
 
 
 def plain(kind: Callable[..., Observer] = ExtendedKalman) -> Callable[[Problem], Observer]:

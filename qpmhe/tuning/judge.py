@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +26,8 @@ class ObserverScore:
         The observer's name, with its arguments.
     max_qps : int
         QPs per sample; 0 is the observer alone.
+    title : str
+        The estimator in words, with the observer's name as it was given.
     score : float
         The held-out score, as a share of the score of an extended Kalman filter with the start
         weights; NaN where the estimator fails.
@@ -39,16 +42,11 @@ class ObserverScore:
 
     observer: str
     max_qps: int
+    title: str
     score: float = np.nan
     errors: dict[str, float] = field(default_factory=dict)
     seconds: float = np.nan
     failure: str = ""
-
-    @property
-    def title(self) -> str:
-        """The estimator in words."""
-        qps = f"MHE, {self.max_qps} QP{'s' * (self.max_qps > 1)} on " if self.max_qps else ""
-        return qps + self.observer.partition("(")[0]
 
 
 class Blocks:
@@ -81,6 +79,15 @@ class Blocks:
     def chosen(self, samples: list[Array]) -> Array:
         """The samples that judge, of all records."""
         return np.concatenate([one[mask] for one, mask in zip(samples, self.masks, strict=True)])
+
+    def sizes(self, errors: list[Array], labels: Sequence[str]) -> dict[str, float]:
+        """The root mean square of each component's errors that judge, where there are any."""
+        every = self.chosen(errors)
+        there = np.isfinite(every)
+        with np.errstate(invalid="ignore"):
+            squares = np.where(there, every, 0.0) ** 2
+            sizes = np.sqrt(squares.sum(axis=0) / there.sum(axis=0)).tolist()
+        return {one: size for one, size in zip(labels, sizes, strict=True) if np.isfinite(size)}
 
     def gain(self, old: list[Array], new: list[Array]) -> tuple[float, float, int]:
         """By how many per cent a score is better, its standard error, and how many blocks judge."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
 from functools import cached_property
@@ -40,14 +40,14 @@ class Score:
     def __init__(
         self, data: list[Data], make: Callable[[dict[str, float]], System],
         kind: Callable[[Problem], Observer], start: Weights, *, ahead: int, truth: bool,
-        begins: bool, options: dict[str, Any],
+        begins: bool, labels: Sequence[str], options: dict[str, Any],
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
         self._compiled = False
         #: Seconds that a step took, the median of the last run.
         self.seconds = np.nan
-        #: Steps ahead, and whether the truth is compared with.
-        self.ahead, self.truth = ahead, truth
+        #: Steps ahead, whether the truth is compared with, and the names of what is compared.
+        self.ahead, self.truth, self.labels = ahead, truth, labels
         self._robust, self._options, self._start = start.threshold is not None, options, start
         # While the initial error lasts, the score depends on all weights against the prior: where
         # that is given, Q and R would make up for it. So the first block does not tune, if there
@@ -91,8 +91,12 @@ class Score:
 
     def samples(self, weights: Weights) -> list[Array]:
         """The score of each sample of each record (T,), NaN where there is nothing to compare."""
+        return self.scaled(self.errors(weights))
+
+    def scaled(self, each: list[Array]) -> list[Array]:
+        """The scores of samples with these errors."""
         found = []
-        for errors in self.errors(weights):
+        for errors in each:
             scaled = np.abs(errors / self.scale)
             terms = scaled * scaled
             if self._robust:

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from time import perf_counter
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -22,12 +21,12 @@ from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
 from ..model.system import System
 from ..observers import ExtendedKalman, Observer
 from .answer import Tuning
-from .contest import Found, Kind, contest, kinds_of, plain, settle
+from .contest import Kind, Searches, kinds_of, plain
 from .data import Data, check_enough, checked_data, constant_inputs, hold_out
 from .judge import Blocks
 from .likelihood import Likelihood
 from .score import Score
-from .search import SearchProgress, identity_of, polish, refit, search_all
+from .search import SearchProgress, identity_of, refit
 from .structures import Structure, checked_start
 from .weights import ARRIVALS
 
@@ -169,7 +168,6 @@ def tune(
     >>> low < 0.1 < high
     True
     """
-    began = perf_counter()
     choice("objective", objective, _OBJECTIVES)
     choice("arrival", arrival, ARRIVALS)
     for name, value in (
@@ -199,48 +197,33 @@ def tune(
         starts = 2 if objective == "likelihood" else 1
     likelihoods = {kind.limit: Likelihood(plan, data, make, remade, kind.limit) for kind in kinds}
     at_start = _likelihood_at_start(likelihoods[kinds[0].limit])
+    truth = objective == "truth"
     score = Score(
-        data, make, plain() if observers else kinds[0].make, start, ahead=ahead,
-        truth=objective == "truth",
-        begins=any(name.startswith("prior ") for name in plan.names), options=options,
+        data, make, plain() if observers else kinds[0].make, start, ahead=ahead, truth=truth,
+        begins=any(name.startswith("prior ") for name in plan.names),
+        labels=labels["prior" if truth else "noise"], options=options,
     )
-    if objective != "likelihood":
-        if sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
-            score.compile()
+    if objective != "likelihood" and sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
+        score.compile()
+    if objective != "likelihood" or observers:
         _ = score.scale  # what is wrong with the options shows before the search
     kept = SearchProgress(kept_in, identity_of(likelihoods[kinds[0].limit], at_start, (
         objective, ahead, seed, starts, sorted(options.items(), key=str),
         *(one.name for one in kinds if observers),
     )))
-    beginnings, blocks = _beginnings(plan, starts, seed), Blocks(data)
-    searched: dict[float | None, Found] = {}
-    spent = {"likelihood": 0.0}
+    blocks = Blocks(data)
     with _interruptible(), _shown(progress) as advance:
-        def likely(limit: float | None) -> Found:
-            if limit not in searched:
-                since, kept.part = perf_counter(), f"limit {limit}, " if observers else ""
-                theta = search_all(likelihoods[limit], beginnings, kept, jobs, advance)
-                searched[limit] = Found(
-                    likelihoods[limit], *polish(likelihoods[limit], theta), score)
-                spent["likelihood"] += perf_counter() - since
-            return searched[limit]
-
-        def settled(name: str, found: Found) -> Found:
-            kept.part = name and f"{name}, "
-            return settle(found, objective, blocks, kept, lambda text: advance(kept.part + text))
-
+        searches = Searches(
+            likelihoods, score, objective, blocks, _beginnings(plan, starts, seed), jobs, kept,
+            advance,
+        )
         if observers:
-            best, rows = contest(
-                kinds, dimension("max_qps", options["max_qps"], 0), likely, settled, blocks,
-                labels["prior" if score.truth else "noise"],
-            )
+            best, rows = searches.contest(kinds, dimension("max_qps", options["max_qps"], 0))
         else:
-            best, rows = settled("", likely(kinds[0].limit)), []
-        if best.refined is not None:
-            spent["estimator"] = perf_counter() - began - spent["likelihood"]
+            best, rows = searches.settled(searches.likely(kinds[0].limit)), []
         advance("all blocks")
         again = refit(best.likelihood, best.theta, best.hessian)
-        tuning = Tuning(best, blocks, again, spent, labels, constant, rows)
+        tuning = Tuning(best, blocks, again, searches.seconds, labels, constant, rows)
     kept.remove()
     return tuning
 

@@ -431,6 +431,37 @@ def test_an_observer_that_fails_is_last_and_says_why():
         tuned([simulated(steps=200)], system, observers=["steady"], max_qps=0)
 
 
+def test_one_function_with_other_arguments_is_searched_anew_and_a_failing_search_is_a_row(
+    monkeypatch,
+):
+    known, real = [], contest.search_all
+
+    def refined(score, likelihood, theta, kept, advance):
+        known.append(kept.known("estimator")[2])
+        kept.note("estimator", theta, 0.0, True)
+        return theta
+
+    def searched(likelihood, *rest):
+        if likelihood.recipe[-1] is not None:
+            raise ModelError("the search found no weights")
+        return real(likelihood, *rest)
+
+    monkeypatch.setattr(contest, "refine", refined)
+    monkeypatch.setattr(contest, "search_all", searched)
+    names = ["steady(at=[0, 0], u=[0])", "steady(at=[1, 0], u=[0])"]
+    tuning = tuned([simulated(steps=200)], observers=[*names, "gated"], max_qps=0,
+                   structure="scalar", objective="prediction")
+    assert known == [False, False]
+    assert [row.title for row in tuning.observers] == [*names, "gated"]
+    assert tuning.observers[-1].failure == "the search found no weights"
+
+
+def test_a_checkpoint_that_cannot_be_written_is_no_failure_of_an_observer(tmp_path):
+    with pytest.raises(TuningCheckpointError, match=r"^cannot write"):
+        tuned([simulated(steps=200)], observers=["ekf"], max_qps=0, structure="scalar",
+              checkpoint=tmp_path / "missing" / "search.json")
+
+
 def test_the_initial_state_is_the_records_or_the_systems_where_none_is_given():
     system, _, _, scenario = qpmhe.models.van_der_pol()
     record, given = scenario.simulate(0, 60), {
@@ -482,7 +513,7 @@ def test_an_interrupt_that_casadi_turns_into_another_error(monkeypatch):
     # A process that a shell started in the background ignores the signal.
     outside = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        monkeypatch.setattr(tuning_module, "search_all", interrupted)
+        monkeypatch.setattr(contest, "search_all", interrupted)
         with pytest.raises(KeyboardInterrupt):
             tuned()
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -529,6 +560,8 @@ BAD = {
         "observers": [f"{__name__}:of_a_gain"]}),
     "endless QPs": (InvalidInputError, "max_qps is None", {"observers": ["ekf"], "max_qps": None}),
     "option": (QpmheError, "no option", {"objective": "prediction", "horizn": 3}),
+    "option of all": (QpmheError, "^MovingHorizonEstimator has no option", {
+        "observers": ["ekf"], "horizn": 3}),
 }  # fmt: skip
 
 
