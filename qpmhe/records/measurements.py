@@ -447,13 +447,12 @@ class FieldReader:
     """
 
     def __init__(
-        self, decimal: str = "auto", missing: Sequence[str] = (), time_format: str | None = None
+        self, decimal: str = "auto", missing: Sequence[str | float] = (),
+        time_format: str | None = None,
     ) -> None:
         self._mark = "" if decimal == "auto" else decimal
         self._format = time_format
         words = [str(word).strip().lower() for word in missing]
-        if not all(words):
-            raise OptionError("--missing is blank; expected a word. Blank fields are missing.")
         self._missing = _MISSING.union(words)
         # -999 is also written -999.0.
         self._numbers = set()

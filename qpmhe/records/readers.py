@@ -10,16 +10,26 @@ import stat
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from numbers import Real
 from pathlib import Path
 from typing import Any, Self
 
 from qpmhe_solvers.errors import report_unknown_options
+from qpmhe_solvers.values import shown
 
-from .._checks import choice, count, positive
+from .._checks import choice, count, flag, positive
 from ..errors import OptionError
 from .channels import Channels, ChannelTable
 from .formats import read_bag, read_hdf5, read_mat, read_mdf
-from .tables import CsvTable, JsonTable, LineTable, ParquetTable, RecordError, Table
+from .tables import (
+    SEPARATORS,
+    CsvTable,
+    JsonTable,
+    LineTable,
+    ParquetTable,
+    RecordError,
+    Table,
+)
 
 #: By the end of a file's name: a function of the file, and which options it takes besides: the
 #: name of the time, and whether the log's times are wanted. A folder is a ROS 2 bag.
@@ -57,8 +67,12 @@ class ReadingOptions:
 
     Parameters
     ----------
-    separator, decimal, encoding : str, optional
-        How a CSV file is written.
+    separator : str, optional
+        Of a CSV file: one character, or its name. If left out, the header shows it.
+    decimal : {"auto", ".", ","}
+        Decimal mark of a CSV file; "auto" is the first one in it.
+    encoding : str
+        Of a CSV file.
     missing : str or sequence of str
         Words (or numbers) that stand for a missing value, besides the usual ones.
     skip_lines : int
@@ -78,12 +92,17 @@ class ReadingOptions:
     format : {"auto", "csv", "jsonl"}
         Lines on standard input: CSV, or a JSON object each. In JSON, a column that is named may be
         missing in any line, the first one included; it is missing there.
+
+    Raises
+    ------
+    OptionError
+        If an option has another form. It names the option as the command line does.
     """
 
     separator: str | None = None
     decimal: str = "auto"
     encoding: str = "utf-8"
-    missing: Sequence[str] = ()
+    missing: Sequence[str | float] = ()
     skip_lines: int = 0
     skip_repeated: bool = False
     time_format: str | None = None
@@ -92,12 +111,43 @@ class ReadingOptions:
     format: str = "auto"
 
     def __post_init__(self) -> None:
+        mark: Any = SEPARATORS.get(str(self.separator), self.separator)
+        if mark is not None and (
+            not isinstance(mark, str) or len(mark) != 1 or mark in '"\r\n'
+        ):
+            raise OptionError(
+                f"--separator is {shown(mark)}; expected one character, or one of "
+                f"{', '.join(SEPARATORS)}."
+            )
+        if not (self.time_format is None or isinstance(self.time_format, str)):
+            raise OptionError(
+                f"--time-format is {shown(self.time_format)}; expected a string, such as "
+                "'%d/%m/%Y'."
+            )
+        try:
+            is_usable = b"1,\n".decode(self.encoding) == "1,\n"  # lines are split before decoding
+        except (LookupError, TypeError, ValueError):
+            is_usable = False
+        if not is_usable:
+            raise OptionError(
+                f"--encoding is {shown(self.encoding)}; expected one that contains ASCII, such as "
+                "utf-8, latin-1 or cp1252."
+            )
+        choice("--decimal", self.decimal, ("auto", ".", ","))
         choice("--format", self.format, FORMATS)
         count("--skip-lines", self.skip_lines, 0)
+        flag("--skip-repeated", self.skip_repeated)
+        flag("--log-time", self.log_time)
         if self.same_time is not None:
             positive("--same-time", self.same_time)
-        if isinstance(self.missing, str):
-            object.__setattr__(self, "missing", (self.missing,))
+        words: Any = self.missing
+        words = words if isinstance(words, (list, tuple)) else (words,)
+        if not all(isinstance(one, str | Real) and str(one).strip() for one in words):
+            raise OptionError(
+                f"--missing is {shown(self.missing)}; expected words, or numbers. Blank fields are "
+                "missing in any case."
+            )
+        object.__setattr__(self, "missing", tuple(map(str, words)))
 
     @classmethod
     def taken_from(cls, options: dict[str, Any]) -> Self:

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qpmhe.errors import OptionError
 from qpmhe.estimation.steps import Steps
-from qpmhe.records import RecordError
+from qpmhe.records import ReadingOptions, RecordError
 
 from .oscillator import discrete, lines
 from .tools import CONTINUOUS, DISCRETE, estimate, get, put, rows, shell
@@ -117,6 +118,20 @@ def test_gzip_and_parquet_by_whatever_name(here):
     code, out, error = shell(f"qpmhe estimate {CONTINUOUS} - < record.dat")
     assert (code, out) == (2, "")
     assert "it is a Parquet file" in error
+
+
+@pytest.mark.parametrize(("name", "values"), [
+    ("separator", (5, "", ";;", '"')), ("decimal", (5, "x", None)), ("encoding", (None, "", "\0")),
+    ("missing", (None, [None], [b"x"], " ", {"x": 1})), ("skip_lines", (-1, 1.5, None)),
+    ("skip_repeated", ("no", None)), ("log_time", ("no", 1)), ("time_format", (5,)),
+    ("same_time", (0.0, "x")), ("format", ("xml", None)),
+])  # fmt: skip
+def test_reading_options_of_another_form_are_refused_by_name(name, values):
+    for value in values:
+        option = name.replace("_", "-")
+        with pytest.raises(OptionError, match=rf"^--{option} is .*; expected "):
+            ReadingOptions(**{name: value})
+    assert ReadingOptions(missing=-9).missing == ("-9",)
 
 
 def test_ways_of_writing_a_record_make_no_difference(here):
