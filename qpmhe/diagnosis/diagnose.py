@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .._checks import positive
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..estimation.run import Run, RunSource
+from ..estimation.time_index import unit_name
 from .examination import LEAST_SAMPLES, Examination
 from .findings import Finding, Names
 
@@ -246,5 +247,5 @@ def _names(
         times *= scale
     if not (time_unit is None or isinstance(time_unit, str)):
         raise OptionError(f"time_unit is {time_unit!r}; expected a string, such as 'h'.")
-    unit = "samples" if step is None else time_unit or str(source.time_unit)
+    unit = "samples" if step is None else time_unit or unit_name(source.time_unit)
     return Names(found[0], found[1], found[2], times, unit)

@@ -93,6 +93,8 @@ def paired_record(
         If a shape is wrong, times go backwards or repeat, a measurement has no inputs, or steps
         are none of this system.
     """
+    if not (isinstance(time_unit, str) or hasattr(time_unit, "total_seconds")):
+        raise _no_unit(time_unit)
     ys = record(names[0], measurements, system.p)
     us = None if inputs is None else record(names[1], inputs, width)
     times, others = _index(measurements), _index(inputs)
@@ -290,8 +292,17 @@ def unit_seconds(time_unit: Any) -> float:
     except (ValueError, TypeError, AttributeError):
         seconds = np.nan
     if not seconds > 0.0:
-        raise InvalidInputError(
-            f"time_unit is {shown(time_unit)}; expected a unit of pandas, such as 's', 'min' or "
-            "'h', or a positive pandas.Timedelta."
-        )
+        raise _no_unit(time_unit)
     return seconds
+
+
+def unit_name(time_unit: Any) -> str:
+    """A unit of time in a label."""
+    return time_unit if isinstance(time_unit, str) else f"{time_unit.total_seconds():g} s"
+
+
+def _no_unit(time_unit: Any) -> InvalidInputError:
+    return InvalidInputError(
+        f"time_unit is {shown(time_unit)}; expected a unit of pandas, such as 's', 'min' or 'h', "
+        "or a positive pandas.Timedelta."
+    )

@@ -19,7 +19,7 @@ from qpmhe_solvers.values import finite, shown
 
 from .._checks import positive
 from ..errors import InvalidInputError, OptionError, ShapeError
-from ..estimation.time_index import unit_seconds
+from ..estimation.time_index import unit_name, unit_seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -130,7 +130,7 @@ def date_axis(run: Run, dt: float | None, panel: Any) -> None:
 
 def time_words(dt: float | None, unit: Any = "s") -> str:
     """The label of an axis of times."""
-    return f"time t ({'samples' if dt is None else unit})"
+    return f"time t ({'samples' if dt is None else unit_name(unit)})"
 
 
 def label_decades(axis: Any) -> None:

@@ -144,6 +144,10 @@ def test_time_is_in_the_unit_of_the_record():
     pandas = pytest.importorskip("pandas")
     y = SCENARIO.simulate(0, 12).measurements
     assert plots.costs(estimator().run(y, time_unit="min")).get_xlabel() == "time t (min)"
+    hours = estimator().run(y, time_unit=pandas.Timedelta("1h"))
+    assert plots.costs(hours).get_xlabel() == "time t (3600 s)"
+    with pytest.raises(InvalidInputError, match="time_unit is 5; expected a unit"):
+        estimator().run(y, time_unit=5)
     minutes = 100.0 + SCENARIO.dt * np.arange(12)
     table = pandas.DataFrame(y, index=pandas.to_timedelta(minutes, unit="min"))
     panel = plots.states(estimator().run(table, time_unit="min"))[-1]
