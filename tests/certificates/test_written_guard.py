@@ -189,7 +189,7 @@ def test_a_projected_observer_and_inputs(projects, tmp_path):
         qpmhe.Status.OBSERVER_PROJECTED in mhe.update(y, u).status for y, u in rows[1:]
     ])
     assert projected.any()
-    # In another metric, here or in settings that are not those that were written, it ends the bound.
+    # In another metric, the observer's or that of changed settings, it ends the bound.
     first = int(projected.argmax())
     other = run(np.concatenate(rows), "diagonal").reshape(-1, 8) if projects else found
     assert (other[:first, 7] == 0).all()
@@ -261,7 +261,7 @@ def test_what_cannot_be_written_is_refused(bound, tmp_path):  # noqa: F811
     ):
         with pytest.raises(error, match=words):
             qpmhe.codegen.write(mhe, tmp_path, **given)
-    with pytest.raises(InvalidInputError, match="guard is <class .*expected a qpmhe.certificates"):
+    with pytest.raises(InvalidInputError, match=r"guard is <class .*expected a qpmhe"):
         qpmhe.codegen.write(mhe, tmp_path, guard=Monitor)
     with pytest.raises(InvalidInputError, match="estimator is of type str"):
         watch.c_form("mhe")
