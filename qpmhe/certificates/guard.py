@@ -81,7 +81,8 @@ class Guard:
             bound.metric, self._covariance, bound.gain, bound.slopes, region.lower, region.upper,
             region.states, self._states, bound.projects, np.array([each.radius for each in tubes]),
             np.array([each.box for each in tubes]), np.array([each.radius for each in balls]),
-            f"{Sizes(*given)}; {initial}",
+            f"{Sizes(*given)}; {initial}, "
+            f"|e|_P <= {tube.radius:.4g} with P = mhe_guard_metric",
         )
 
     def __call__(self, estimate: Array, observer: Array, tube: Tube) -> Guarded:

@@ -416,12 +416,18 @@ class Monitor:
         Raises
         ------
         InvalidInputError
-            If it has no guard, or has seen samples.
+            If it has no guard, has seen samples or has lost the bound, or this is no estimator.
         CertificateError, MismatchError
             If nothing is proved for a guard of this estimator.
         """
-        if self._guard is None or self.unguarded or self.steps or self._time:
-            why = self.unguarded or "it has seen samples, and a written guard begins with the first"
+        if not isinstance(estimator, MovingHorizonEstimator):
+            raise InvalidInputError(
+                f"estimator is of type {type(estimator).__name__}; expected the "
+                "MovingHorizonEstimator that is to be written."
+            )
+        off = self.unguarded or self.reason
+        if off or self.steps or self._time:
+            why = off or "it has seen samples, and a written guard begins with the first"
             raise InvalidInputError(
                 f"guard is a Monitor that cannot be written: {why}. Make one with guard=True of "
                 "the estimator before its first measurement."
@@ -462,6 +468,8 @@ class Monitor:
             reason, unguarded = str(state["reason"]), str(state["unguarded"])
             moved = int(state["moved"])
             metric = np.array(state["metric"], np.float64).reshape(mine.shape)
+            if lost is None and not (radius >= 0.0 and (box >= 0.0).all()):
+                raise ValueError(f"its bounds are {radius} and {box.tolist()}, not lost")
             if not np.array_equal(metric, mine):  # another search found another P
                 radius *= largest_ratio(mine, metric)
         except (KeyError, TypeError, ValueError) as error:

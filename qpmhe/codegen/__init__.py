@@ -133,7 +133,7 @@ def write(
     if real not in ("double", "float"):
         raise OptionError(f"real is {real!r}; expected 'double' or 'float'.")
     flag("fmu", fmu)
-    if guard is not None and not hasattr(guard, "c_form"):
+    if guard is not None and not callable(getattr(type(guard), "c_form", None)):
         raise InvalidInputError(
             f"guard is {shown(guard)}; expected a qpmhe.certificates.Monitor with guard=True."
         )

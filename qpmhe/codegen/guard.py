@@ -31,12 +31,12 @@ _MEMBERS = """
  *     mhe_guard_check(&guard, &estimator, &estimate);        after each mhe_update
  *
  * While guard.off is 0, |x_j - guard.state[j]| <= guard.error[j], at most twice the bound that was
- * proved in advance, if disturbances, noises and e = x0 - z0 are within what was stated:
- * $assumed. */
+ * proved in advance, if x is in the region of the proof, and disturbances, noises and e = x0 - z0
+ * are within what was stated: $assumed. */
 enum { MHE_GUARD_STATE = 1, MHE_GUARD_FILTERED = 2 };
 enum {
     MHE_GUARD_OTHER_SAMPLE = 1,   /* a sample was left out, or estimated again */
-    MHE_GUARD_EVENT = 2,          /* a missing measurement, another step, or by the status */
+    MHE_GUARD_EVENT = 2,          /* no measurement of an output, another step, or by the status */
     MHE_GUARD_OTHER_OBSERVER = 3, /* it was changed since, or has another gain */
     MHE_GUARD_OUTSIDE = 4,        /* the observer or the input is outside of the region */
     MHE_GUARD_EMPTY = 5           /* no state is in the set: something was larger than stated */

@@ -98,7 +98,7 @@ def _order(qp: QP, source: Index) -> _Order | None:
     column, offset = np.divmod(source, 2 * n)
     row = column + offset
     limit = math.sqrt(_GAIN) * 2 * n
-    if source.size > limit * qp.size:
+    if not 0 < source.size <= limit * qp.size or row.max() >= qp.size:  # the last: no entry of H
         return None
     from scipy.sparse import csr_matrix  # late: as LAPACK
     from scipy.sparse.csgraph import reverse_cuthill_mckee

@@ -28,8 +28,10 @@ static mhe_guard g;
 int main(int count, char **names)
 {
     double in[3 * MHE_NX + 1], found[MHE_NX + 1], y[MHE_NY], u[MHE_NU + 1], more[2];
-    (void)names;
-    if (count > 1) { /* the map alone: an estimate, z, radius and box */
+    static const uint8_t none[MHE_NY];
+    static mhe_settings settings;
+    const int map = count > 1 && names[1][0] == 'm';
+    if (map) { /* the map alone: an estimate, z, radius and box */
         while (fread(in, sizeof in, 1, stdin) == 1) {
             mhe_tube tube;
             tube.radius = in[2 * MHE_NX];
@@ -40,11 +42,15 @@ int main(int count, char **names)
         return 0;
     }
     if (fread(in, sizeof(double) * MHE_NX, 1, stdin) != 1) return 2;
-    mhe_reset(&e, &mhe_default_settings, in);
+    settings = mhe_default_settings;
+    if (count > 1) settings.project = 2;
+    mhe_reset(&e, &settings, in);
     mhe_guard_start(&g, &e);
     while (fread(y, sizeof y, 1, stdin) == 1) {
         if (MHE_NU && fread(u, sizeof *u * MHE_NU, 1, stdin) != 1) return 2;
-        mhe_update(&e, &k, y, u, &out);
+        mhe_sample sample = {0};
+        sample.y = y, sample.u = u, sample.sampled = isinf(y[0]) ? none : 0;
+        mhe_update_special(&e, &k, &sample, &out);
         mhe_guard_check(&g, &e, &out);
         more[0] = g.moved, more[1] = g.off;
         fwrite(g.state, sizeof g.state, 1, stdout);
@@ -142,6 +148,10 @@ def test_a_run_is_guarded_by_the_bounds_in_advance(bound, written):  # noqa: F81
     assert (found[10:, 6] == 0).all()
     assert (found[10:, 7] == 2).all()
     assert np.isnan(found[10:, 4:6]).all()
+    measured[10] = [np.inf]  # not sampled
+    found = written(np.concatenate((start, np.ravel(measured)))).reshape(-1, 8)
+    assert (found[:10, 7] == 0).all()
+    assert (found[10:, 7] == 2).all()
     measured[10] = [9.0]  # the observer leaves the region one sample later, and no state is left
     found = written(np.concatenate((start, np.ravel(measured)))).reshape(-1, 8)
     assert found[9, 7] == 0
@@ -179,10 +189,12 @@ def test_a_projected_observer_and_inputs(projects, tmp_path):
         qpmhe.Status.OBSERVER_PROJECTED in mhe.update(y, u).status for y, u in rows[1:]
     ])
     assert projected.any()
+    # In another metric, the observer's or that of changed settings, it ends the bound.
+    first = int(projected.argmax())
+    other = run(np.concatenate(rows), "diagonal").reshape(-1, 8) if projects else found
+    assert (other[:first, 7] == 0).all()
+    assert (other[first:, 7] == 2).all()
     if not projects:
-        first = int(projected.argmax())
-        assert (found[:first, 7] == 0).all()
-        assert (found[first:, 7] == 2).all()
         return
     assert (found[:, 7] == 0).all()
     assert (found[:, 6] > 0).any()
@@ -249,6 +261,16 @@ def test_what_cannot_be_written_is_refused(bound, tmp_path):  # noqa: F811
     ):
         with pytest.raises(error, match=words):
             qpmhe.codegen.write(mhe, tmp_path, **given)
+    with pytest.raises(InvalidInputError, match=r"guard is <class .*expected a qpmhe"):
+        qpmhe.codegen.write(mhe, tmp_path, guard=Monitor)
+    with pytest.raises(InvalidInputError, match="estimator is of type str"):
+        watch.c_form("mhe")
+    lost = Monitor(bound, mhe, initial_error=START, guard=True)
+    lost.load_state_dict(watch.state_dict() | {"lost": 0, "reason": "it left the region"})
+    with pytest.raises(InvalidInputError, match="it left the region"):
+        lost.c_form(mhe)
+    with pytest.raises(InvalidInputError, match="bounds are nan"):
+        lost.load_state_dict(watch.state_dict() | {"radius": np.nan})
     with pytest.raises(CertificateError, match="restart=True"):
         watch.c_form(estimator(bound, restart=True))
     other = qpmhe.MovingHorizonEstimator(

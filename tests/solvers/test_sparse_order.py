@@ -126,3 +126,8 @@ def test_a_matrix_without_a_factor_fails(value):
     solved(solver, qp)
     qp.band[1, 7, 0] = value
     assert solver.solve(qp).status is SolveStatus.FAILED
+    qp.band[...] = value  # no entry at all, or each, also beyond H
+    for one in (solver, BandedSolver(SolverOptions())):
+        solution = one.solve(qp)
+        assert solution.status is SolveStatus.FAILED
+        assert solution.message.startswith("the factorisation failed")

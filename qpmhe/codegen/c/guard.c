@@ -113,15 +113,17 @@ static int mhe_guard_move(const real *estimate, const real *z, const mhe_tube *t
 /* Why the bound does not follow at the newest sample; 0 where it does. */
 static int mhe_guard_ends(const mhe_guard *g, const mhe_estimator *e, const mhe_estimate *estimate)
 {
-    const int ends = MHE_MISSING | MHE_MODEL_FAILED | MHE_METRIC_SINGULAR | MHE_RESTARTED;
+    const int ends = MHE_MODEL_FAILED | MHE_METRIC_SINGULAR | MHE_RESTARTED;
+    const mhe_settings *s = e->settings, *own = &mhe_default_settings;
+    const int keeps = $projects && s->project == own->project && !memcmp(s->metric, own->metric, sizeof s->metric);
     const mhe_stage *stage = e->stages + (e->first + e->length - 1) % MHE_HORIZON;
     if (e->time != g->time + 1 || estimate->time != g->time || e->length < 1)
         return MHE_GUARD_OTHER_SAMPLE;
-    if (estimate->status & ends) return MHE_GUARD_EVENT;
-    if (estimate->status & MHE_OBSERVER_PROJECTED && !$projects) return MHE_GUARD_EVENT;
+    if (estimate->status & ends || !stage->is_complete) return MHE_GUARD_EVENT;
+    if (estimate->status & MHE_OBSERVER_PROJECTED && !keeps) return MHE_GUARD_EVENT;
     for (int j = 0; j < NX; j++)
         if (stage->z[j] != g->observer_state[j]) return MHE_GUARD_OTHER_OBSERVER;
-    if (!(stage->u[NU] == e->settings->sample_time)) return MHE_GUARD_EVENT;
+    if (!(stage->u[NU] == s->sample_time)) return MHE_GUARD_EVENT;
     for (int j = 0; j < NU; j++)
         if (!(mhe_guard_lower[NX + j] <= stage->u[j] && stage->u[j] <= mhe_guard_upper[NX + j]))
             return MHE_GUARD_OUTSIDE;
