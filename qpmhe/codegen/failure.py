@@ -29,8 +29,8 @@ FAILED_TRIAL = (Status.NO_DECREASE | Status.CAP_REACHED).value
 class Failure:
     """The message of a step in C that has failed: that of the Python step from the same memory.
 
-    C has no words. The Python step is taken when somebody asks for them, so that no step in C takes
-    longer; until then an estimate holds a copy of the memory.
+    C has no words. The Python step is taken when somebody asks for them. Until then, an estimate
+    holds a copy of the memory: that is all that a failed step in C does besides.
 
     Parameters
     ----------
