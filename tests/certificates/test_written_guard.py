@@ -14,7 +14,7 @@ from qpmhe.codegen.guard import GuardForm
 from qpmhe.errors import InvalidInputError, OptionError
 
 from .helpers import box
-from .test_guard import GAIN, START, A, V, W, bound, estimator, plant  # noqa: F401
+from .test_guard import GAIN, START, A, V, W, certified, estimator, plant
 
 CC = shutil.which("cc")
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror", "-Wshadow", "-Wconversion")
@@ -65,7 +65,7 @@ int main(int count, char **names)
 ROUGH = qpmhe.QuadraticCost(prior=1e-2 * np.eye(2), disturbance=1e4 * np.eye(2), noise=1e4)
 
 
-def made(bound, mhe, folder):  # noqa: F811
+def made(bound, mhe, folder):
     """Runs the written guard of an estimator: with a word as the map alone, else along samples."""
     qpmhe.codegen.write(mhe, folder, guard=Monitor(bound, mhe, initial_error=START, guard=True))
     (folder / "main.c").write_text(DRIVER)
@@ -80,15 +80,20 @@ def made(bound, mhe, folder):  # noqa: F811
     return run
 
 
+@pytest.fixture(name="bound")
+def fixture_bound():
+    return certified()
+
+
 @pytest.fixture(scope="module")
-def written(bound, tmp_path_factory):  # noqa: F811
-    return made(bound, estimator(bound, cost=ROUGH), tmp_path_factory.mktemp("written"))
+def written(tmp_path_factory):
+    return made(certified(), estimator(certified(), cost=ROUGH), tmp_path_factory.mktemp("written"))
 
 
 pytestmark = pytest.mark.skipif(CC is None, reason="there is no C compiler")
 
 
-def test_the_map_is_that_of_python(bound, written):  # noqa: F811
+def test_the_map_is_that_of_python(bound, written):
     """Where ball, box and the slanted side are active, of estimates near, far and not finite."""
     guard, rng, kinds = Guard(bound, plant()), np.random.default_rng(0), set()
     rows, expected = [], []
@@ -118,7 +123,7 @@ def test_the_map_is_that_of_python(bound, written):  # noqa: F811
     assert (1.0, True) in kinds
 
 
-def test_a_run_is_guarded_by_the_bounds_in_advance(bound, written):  # noqa: F811
+def test_a_run_is_guarded_by_the_bounds_in_advance(bound, written):
     """The bounds along a run are narrower; both hold, and the guard ends with a missing sample."""
     system, guard, rng = plant(), Guard(bound, plant()), np.random.default_rng(1)
     form = guard.c_form(bound.sizes, bound.begun(START))
@@ -204,7 +209,7 @@ def test_a_projected_observer_and_inputs(projects, tmp_path):
 
 
 @pytest.mark.parametrize("first", [1e-6, 0.05, 2.0])
-def test_the_last_bounds_hold_at_all_later_samples(bound, first):  # noqa: F811
+def test_the_last_bounds_hold_at_all_later_samples(bound, first):
     begun, given = bound.begun(first), (bound.sizes.disturbance, bound.sizes.noise)
     entering, added = bound.entering(*given), bound.added(*given)
     for projected in (False, True):
@@ -219,7 +224,7 @@ def test_the_last_bounds_hold_at_all_later_samples(bound, first):  # noqa: F811
         assert found[-1].radius <= 1.02 * max(tube.radius, bound.limit())
 
 
-def test_an_fmu_has_the_guarded_estimates(bound, tmp_path):  # noqa: F811
+def test_an_fmu_has_the_guarded_estimates(bound, tmp_path):
     pytest.importorskip("fmpy")
     from ..codegen.test_fmu import Unit
 
@@ -250,7 +255,7 @@ def test_an_fmu_has_the_guarded_estimates(bound, tmp_path):  # noqa: F811
     assert unit.integer("guard_off") == 0
 
 
-def test_what_cannot_be_written_is_refused(bound, tmp_path):  # noqa: F811
+def test_what_cannot_be_written_is_refused(bound, tmp_path):
     mhe = estimator(bound)
     plain, watch = (Monitor(bound, mhe, initial_error=START, guard=on) for on in (False, True))
     assert isinstance(watch.c_form(mhe), GuardForm)
