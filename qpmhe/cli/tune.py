@@ -57,7 +57,8 @@ def tune(
         str | None,
         typer.Option(metavar="LIST", help="Observers to compare, separated by commas: ekf, gated, "
                      "ukf, steady, file.py:function, or all for the first four; each is tuned "
-                     "alone and with 1 and 2 QPs; the simplest one about as good as the best is taken."),
+                     "alone and with 1 and 2 QPs, and the simplest about as good as the best is "
+                     "taken."),
     ] = None,
     initial_state: options.InitialState = None,
     held_out: Annotated[float, typer.Option(help="Share of the blocks held out to judge the "
