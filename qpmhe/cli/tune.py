@@ -57,7 +57,8 @@ def tune(
         str | None,
         typer.Option(metavar="LIST", help="Observers to compare, separated by commas: ekf, gated, "
                      "ukf, steady, file.py:function, or all for the first four; each is tuned "
-                     "alone and with 1 and 2 QPs, and the best is written."),
+                     "alone and with 1 and 2 QPs, and the simplest about as good as the best is "
+                     "taken."),
     ] = None,
     initial_state: options.InitialState = None,
     held_out: Annotated[float, typer.Option(help="Share of the blocks held out to judge the "
@@ -102,8 +103,7 @@ def tune(
     try:
         with named_as_options(
             "held_out", "initial_state", "structure", "objective", "threshold", "horizon",
-            "observers",
-            "starts", "seed", "jobs",
+            "observers", "starts", "seed", "jobs",
         ):
             tuning = run(
                 _maker(source) if started else mhe.system, records,

@@ -14,8 +14,8 @@ _POINTS = 40
 _ZERO, _NOTHING = 1e-10, 0.01
 # So many steps for each state show all that the data can show.
 _STEPS = 4
-# Directions that decay this much more than others leave no information to compare.
-_SINGULAR = 1e8
+# A covariance with this condition number has no inverse of any accuracy, and nothing is compared.
+_SINGULAR = 1e13
 
 
 def apparent_information(
@@ -57,18 +57,16 @@ def apparent_information(
     if width == 0:
         return None
     bases = vectors[:, :, :width]
-    most = np.eye(width)
+    # A root of the covariance that belongs to the prior's information, moved by the model.
+    root = np.eye(width)
     for k in range(1, len(starts)):
         through = units @ bases[k - 1]
         for a in filtered.transitions[starts[k - 1] : starts[k]]:
             through = a @ through
-        moves = bases[k].T @ inverse_units @ through
-        if not np.linalg.cond(moves) < _SINGULAR:
-            return None
-        back = np.linalg.inv(moves)
-        most = back.T @ most @ back
+        root = bases[k].T @ inverse_units @ through @ root
     scaled = inverse_units @ filtered.covariances[starts[-1]] @ inverse_units.T
+    if not (np.isfinite(scaled).all() and np.linalg.cond(scaled) < _SINGULAR):
+        return None
     claimed = bases[-1].T @ np.linalg.solve(scaled, bases[-1])
-    root = np.linalg.inv(np.linalg.cholesky(most))
-    growth, directions = np.linalg.eigh(root @ claimed @ root.T)
-    return float(growth[-1]), bases[-1] @ root.T @ directions[:, -1]
+    growth, directions = np.linalg.eigh(root.T @ claimed @ root)
+    return float(growth[-1]), bases[-1] @ root @ directions[:, -1]

@@ -389,9 +389,9 @@ class Examination:
                 f"{_direction(direction, self.names.states)} is not seen by the data, and the "
                 "filter's information on it comes from its points of linearisation only: its "
                 f"standard deviation there is too small by a factor of {number(np.sqrt(growth))} "
-                "at least, as are those of the estimates.",
-                "Do not believe these there; add a measurement that shows it, or state it "
-                "relative to what is measured.", "warning",
+                "at least, and so are those of the estimates.",
+                "Do not believe these standard deviations; add a measurement that shows this "
+                "direction, or choose states relative to what is measured.", "warning",
             )
 
     def _worse(self) -> Iterator[Finding]:

@@ -18,7 +18,7 @@ from ..baselines import Problem
 from ..baselines.observers import KNOWN, made
 from ..costs import Cost, Huber, ObserverPrior, QuadraticCost, RobustCost
 from ..errors import InvalidInputError, ModelError, OptionError, QpmheError
-from ..model.system import System
+from ..model.system import System, checked_system
 from ..models.loading import ModelSource, find
 from ..observers import ExtendedKalman, Observer
 
@@ -70,9 +70,20 @@ class Weights:
     def observer(
         self, kind: Callable[..., Observer] | None = None, *, system: System | None = None
     ) -> Observer:
-        """The observer: kind(prior=..., disturbance=..., noise=...), or the one that was chosen.
+        """The observer that was chosen, or kind(prior=..., disturbance=..., noise=...).
 
-        The latter needs the system where it has a name. An `OptionError` says so.
+        Parameters
+        ----------
+        kind : callable, optional
+            `qpmhe.ExtendedKalman` if neither it nor ``observer_name`` is given.
+        system : System, optional
+            The model, for which an observer with a name is made. A function of the user gets it in
+            a `qpmhe.baselines.Problem` with an initial state of 0 and without parameters.
+
+        Raises
+        ------
+        OptionError, ModelError, ShapeError
+            If the system is needed and not given, or does not fit; if the observer cannot be made.
         """
         if kind is None and self.observer_name is not None:
             if system is None:
@@ -80,7 +91,7 @@ class Weights:
                     f"the weights are of the observer {self.observer_name!r}, which is made for a "
                     "system; give observer(system=system), or another kind."
                 )
-            problem = self.problem(system, np.zeros(system.n))
+            problem = self.problem(system, np.zeros(checked_system(system).n))
             chosen: Observer = made(find_observer(self.observer_name), problem)
             return chosen
         return (kind or ExtendedKalman)(

@@ -53,16 +53,22 @@ def test_turning_about_the_only_beacon_seems_to_be_seen_and_a_second_one_shows_i
     assert judged(*simulated(beacons)) is None
 
 
-@pytest.mark.parametrize("factor", [1.0, 1e6])
-def test_a_linear_filter_invents_nothing_in_any_unit(factor):
+@pytest.mark.parametrize(("factor", "vague", "turned"), [
+    (1.0, 1.0, True), (1e6, 1.0, False), (1.0, 1e5, True), (1.0, 1e10, False)])
+def test_a_linear_filter_invents_nothing_in_any_unit(factor, vague, turned):
     """Of two integrators and a state that decays, the output shows the difference of two."""
-    a, generator = np.diag([1.0, 1.0, 0.7]), np.random.default_rng(0)
-    system = qpmhe.System(
-        lambda x: x @ a.T, lambda x: (x[..., :1] - x[..., 1:2]) / factor, n=3, p=1)
-    y, prior = generator.standard_normal((80, 1)), np.diag([1.0, 4.0, 9.0]) * factor**2
-    growth, direction = judged(
-        system, y, np.zeros((80, 0)), np.zeros(3), np.eye(1), 1e-3 * prior, prior)
-    assert growth <= 1.0 + 1e-6
+    generator = np.random.default_rng(0)
+    axes = np.linalg.qr(generator.standard_normal((3, 3)))[0] if turned else np.eye(3)
+    a, c = axes @ np.diag([1.0, 1.0, 0.7]) @ axes.T, np.array([[1.0, -1.0, 0.0]]) @ axes.T
+    system = qpmhe.System(lambda x: x @ a.T, lambda x: x @ c.T / factor, n=3, p=1)
+    y, known = generator.standard_normal((80, 1)), np.diag([1.0, 4.0, 9.0]) * factor**2
+    found = judged(system, y, np.zeros((80, 0)), np.zeros(3), np.eye(1), 1e-3 * known,
+                   vague**2 * known)
+    if vague > 1e9:  # no digits are left
+        assert found is None
+        return
+    growth, direction = found
+    assert 0.9 < growth <= 1.0 + 1e-3
     assert np.isfinite(direction).all()
 
 

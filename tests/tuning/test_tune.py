@@ -409,6 +409,8 @@ def test_the_unscented_filter_wins_where_the_tangent_says_nothing(tmp_path):
     assert (weights.observer_name, weights.max_qps) == ("ukf", 0)
     with pytest.raises(OptionError, match=r"observer\(system=system\)"):
         weights.observer()
+    with pytest.raises(ModelError, match="system is 'plant'"):
+        weights.observer(system="plant")
     assert isinstance(found.observer(), qpmhe.UnscentedKalman)
     states = [
         qpmhe.MovingHorizonEstimator(
