@@ -130,6 +130,11 @@ def from_casadi(
         "compiled": compiled, **options,
     }
 
+    remedy = (
+        "It is CasADi's: look within {name} for a custom derivative, or for a rootfinder that "
+        "hides its failure: newton and fast_newton return the guess where the residual is NaN."
+    )
+
     def made(timed: bool) -> System:
         maker = (
             machine(model, timed) if library is None
@@ -139,7 +144,7 @@ def from_casadi(
         one = {name: Trusted(partial(evaluator.one, name)) for name in NAMES}
         origin = Origin(
             kernel=evaluator, jacobians="casadi", integrated=integrated(model), symbolic=model,
-            is_timed=timed,
+            is_timed=timed, remedy=remedy,
         )
         if not timed:
             origin = replace(

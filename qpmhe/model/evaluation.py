@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -113,17 +112,15 @@ def fixed_call(
     for i, array in enumerate(results):
         buffer.set_res(i, array.data)
     kept = function, buffer, arguments, results  # `run` has no more than addresses
-    prints = fallible and any(  # a solver, for one
-        one.class_name() not in _SILENT for one in functions_within(function)
-    )
+    if fallible and any(one.class_name() not in _SILENT for one in functions_within(function)):
+        run = quiet()(run)  # of a solver, for one
 
     def call() -> bool:
         if not fallible:
             run()
             return bool(kept)
         try:
-            with quiet() if prints else nullcontext():
-                run()
+            run()
         except RuntimeError:  # of a solver or a callback within the function
             return False
         code: int = buffer.ret()

@@ -242,6 +242,18 @@ def test_a_solver_that_fails_prints_nothing(kind, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("kind", ["newton", "fast_newton"])
+def test_an_error_names_a_rootfinder_whose_residual_is_no_number(kind):
+    """It returns its guess, with a derivative that is finite and wrong."""
+    x, z, q = ca.MX.sym("x", 2), ca.SX.sym("z"), ca.SX.sym("q")
+    root = ca.rootfinder("root", kind, {"x": z, "p": q, "g": ca.log(z - 10) - q})
+    h = ca.Function("h", [x], [root(0.3, x[0]) + 0 * x[1]])
+    system = from_casadi(ca.Function("f", [x], [0.9 * x]), h, compiled=False)
+    with pytest.raises(ModelError, match=r"h_jacobian.* within h .*fast_newton") as caught:
+        estimator(system)
+    assert "leave it out" not in str(caught.value)
+
+
 def test_other_threads_print_while_one_is_quiet(capsys):
     before = sys.stderr
     with quiet():
