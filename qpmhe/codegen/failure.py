@@ -27,10 +27,11 @@ FAILED_TRIAL = (Status.NO_DECREASE | Status.CAP_REACHED).value
 
 
 class Failure:
-    """The message of a step in C that has failed: that of the Python step from the same memory.
+    """The message of a failed step in C, which the Python step writes.
 
-    C has no words. The Python step is taken when somebody asks for them. Until then, an estimate
-    holds a copy of the memory: that is all that a failed step in C does besides.
+    The step in C returns flags and no text. When somebody reads the message, the Python step runs
+    from the memory that the step in C began with, and its message is returned. A failed step in C
+    costs no more than the copy of that memory, which its estimate keeps.
 
     Parameters
     ----------

@@ -26,9 +26,11 @@ def apparent_information(
     Along a trajectory of the model itself, :math:`x(t+1) = f(x(t), u(t))`, what no output shows is
     the null space of :math:`\sum_k \Phi_k^\top C_k^\top R^{-1} C_k \Phi_k`. A filter linearises at
     a new point after each measurement, so that its null spaces do not fit together and the sum
-    over the record sees all directions. In a null space that stays through the record, with the
-    basis B(t), the information :math:`B^\top P^{-1} B` cannot exceed that of the prior, moved by
-    the model. The factor is its largest growth at the end of the record.
+    over the record sees all directions. Let the columns of B(t) be a basis of a null space that
+    lasts through the whole record. No measurement informs about these directions, so the
+    information :math:`B^\top P^{-1} B` of a right filter is at most the prior's information after
+    the model has propagated it from the first sample to t. The factor is the largest ratio of the
+    two, over all directions of the null space, at the last sample.
 
     Returns
     -------

@@ -24,7 +24,7 @@ _CAPS = (1, 2, 5)
 _OTHER = 1e-9
 # A limit that is missed by more is ignored: the numbers of these QPs are of order one.
 _MISSED = 1e-2
-# So many faults of a check are told.
+# The report lists at most this many faults of each check.
 _TOLD = 3
 # What is often behind a capability that is declared, and not there.
 _HINTS = {

@@ -32,12 +32,14 @@ class _Order(NamedTuple):
 class SparseOrder:
     r"""H as a narrower band, with all stages of one state beside each other.
 
-    By stages, the band of H is 2 n wide, however sparse the blocks are. Where the union of their
-    patterns is that of a graph of n states with bandwidth b (reverse Cuthill-McKee [1]_), K stages
-    of a state are a block, and the band is about (b + 1) K wide: the work of a factorisation,
-    :math:`K n (2 n)^2`, becomes :math:`K n ((b + 1) K)^2`.
+    In the order by stages, the band of H is 2 n wide, however sparse its blocks are. This class
+    takes the union of the blocks' patterns as a graph of the n states, and numbers the states by
+    the reverse Cuthill-McKee method [1]_, which gives the graph a small bandwidth b. The K unknowns
+    of one state, one of each stage, then stand beside each other, and the band of H is about
+    (b + 1) K wide. The work of a factorisation falls from :math:`K n (2 n)^2` to
+    :math:`K n ((b + 1) K)^2`.
 
-    It keeps the pattern from QP to QP, and looks whether an entry outside of it is not zero.
+    The order is kept from QP to QP. It is made anew where an entry outside of its pattern is not 0.
 
     References
     ----------
