@@ -19,7 +19,7 @@ from ..model.system import System
 from ..observers import Observer
 from .estimate import Estimate, Status
 from .settings import Settings
-from .time_index import read_index, stored_index
+from .time_index import elapsed_times, read_index, stored_index, unit_name
 
 if TYPE_CHECKING:
     import pandas
@@ -130,6 +130,8 @@ class Run:
     engine : str
         The engine that ran the steps: ``python``, ``compiled``, or ``compiled, then python`` if the
         model changed after it was compiled.
+    elapsed, time_unit, labels : optional
+        What these attributes are where there is no source that knows them.
 
     Attributes
     ----------
@@ -140,6 +142,13 @@ class Run:
         estimates, or unpickled.
     index : pandas.DatetimeIndex, pandas.TimedeltaIndex or None
         Times of x(0), ..., x(T), where the measurements had an index of times.
+    elapsed : (T + 1,) array or None
+        Times of x(0), ..., x(T) in `time_unit`: durations of the index, or since its first date;
+        without index the sum of the steps; None where the model's steps have no length.
+    time_unit : str
+        The model's unit of time; ``s`` unless `MovingHorizonEstimator.run` got another one.
+    labels : list of str or None
+        Names of the states, with units, where the model knows them.
     """
 
     source: RunSource | None = None
@@ -166,6 +175,9 @@ class Run:
         smoothed_covariances: Array | None = None,
         rejected_sensors: NDArray[np.bool_] | None = None,
         engine: str = "python",
+        elapsed: Array | None = None,
+        time_unit: str = "s",
+        labels: Sequence[str] | None = None,
     ) -> None:
         self.states, self.filtered = states, filtered
         self.costs, self.candidate_costs = costs, candidate_costs
@@ -177,6 +189,7 @@ class Run:
         if rejected_sensors is None:
             rejected_sensors = np.zeros((flags.size, 0), np.bool_)
         self.rejected_sensors = rejected_sensors
+        self._elapsed, self._time_unit, self._labels = elapsed, time_unit, labels
 
     @classmethod
     def of(
@@ -224,9 +237,44 @@ class Run:
         known = {value: Status(value) for value in np.unique(self.flags).tolist()}
         return [known[value] for value in self.flags.tolist()]
 
+    @property
+    def elapsed(self) -> Array | None:
+        """Times of x(0), ..., x(T) in `time_unit`; None where the steps have no length."""
+        if self.source is None and self._elapsed is not None:
+            return self._elapsed
+        if self.index is not None:
+            unit = self._time_unit if self.source is None else self.source.time_unit
+            return elapsed_times(self.index, unit)
+        if self.source is None:
+            return None
+        if self.source.steps is not None:
+            return np.concatenate(([0.0], np.cumsum(self.source.steps)))
+        dt = self.source.system.dt
+        return None if dt is None else dt * np.arange(len(self) + 1.0)
+
+    @property
+    def time_unit(self) -> str:
+        """The model's unit of time."""
+        return self._time_unit if self.source is None else unit_name(self.source.time_unit)
+
+    @property
+    def labels(self) -> list[str] | None:
+        """Names of the states, with units, where the model knows them."""
+        if self.source is None:
+            return None if self._labels is None else list(self._labels)
+        signals = self.source.system.signals
+        if signals is None or len(signals.states) != self.states.shape[1]:
+            return None
+        return [f"{one.name} ({one.unit})" if one.unit else one.name for one in signals.states]
+
+    def _clock(self) -> dict[str, Any]:
+        """What its source knows of times and names, to be kept without it."""
+        return {"elapsed": self.elapsed, "time_unit": self.time_unit, "labels": self.labels}
+
     def __getstate__(self) -> dict[str, Any]:
         # The functions of a system often cannot be pickled.
-        return {name: value for name, value in vars(self).items() if name != "source"}
+        kept = {name: value for name, value in vars(self).items() if name != "source"}
+        return kept | {f"_{name}": value for name, value in self._clock().items()}
 
     def __len__(self) -> int:
         return self.flags.size
@@ -248,6 +296,9 @@ class Run:
         if self.has_costs:
             found["mean J"] = f"{self.costs.mean():.6g}"
             found["mean J of the candidate"] = f"{self.candidate_costs.mean():.6g}"
+        if len(self) and self.elapsed is not None:
+            first, last = self.elapsed[[0, -2]]
+            found["samples from"] = f"{first:.6g} to {last:.6g} {self.time_unit}"
         if len(self):
             found["median step"] = f"{1e6 * np.median(self.times):.3g} us"
         return found
@@ -264,9 +315,10 @@ class Run:
         Returns
         -------
         pandas.DataFrame
-            Indexed by the time of the state: t = 0, ..., T, or `index`. ``x1``, ``x2``, ... is the
-            estimate of x(t) from the measurements before t, ``std1``, ... its standard deviations,
-            if covariances were requested; ``filtered1``, ... is the estimate of x(t) that has used
+            Indexed by the time of the state: t = 0, ..., T, or `index`. ``time`` is `elapsed`, if
+            known, in the unit ``frame.attrs["time_unit"]``. ``x1``, ``x2``, ... is the estimate of
+            x(t) from the measurements before t, ``std1``, ... its standard deviations, if
+            covariances were requested; ``filtered1``, ... is the estimate of x(t) that has used
             y(t); ``smoothed1``, ... and ``smoothed_std1``, ... are those of `smoothed`. ``J``,
             ``J_candidate``, ``status``, ``qps``, ``solver_iterations``, ``seconds`` and
             ``solver_seconds`` are of the update with y(t). The last row has no update yet.
@@ -286,7 +338,8 @@ class Run:
             blocks["smoothed"] = self.smoothed
         if self.smoothed_covariances is not None:
             blocks["smoothed_std"] = deviations(self.smoothed_covariances)
-        columns: dict[str, Any] = {
+        columns: dict[str, Any] = {} if self.elapsed is None else {"time": self.elapsed}
+        columns |= {
             f"{name}{i + 1}": values[:, i]
             for name, values in blocks.items() for i in range(values.shape[1])
         }
@@ -301,7 +354,11 @@ class Run:
         table = pandas.DataFrame(columns, index=every).join(
             pandas.DataFrame(steps, index=every[:-1])
         )
-        return table if self.index is None else table.set_axis(self.index)
+        if self.index is not None:
+            table = table.set_axis(self.index)
+        if self.elapsed is not None:
+            table.attrs["time_unit"] = self.time_unit
+        return table
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write all arrays to a NumPy archive, which `qpmhe.load_run` reads; without pickle.
@@ -312,8 +369,10 @@ class Run:
             The file, usually ``.npz``; an existing file is replaced.
         """
         arrays: dict[str, Any] = {
-            name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)
+            name: value for name, value in vars(self).items()
+            if isinstance(value, np.ndarray) and not name.startswith("_")
         }
+        arrays |= {name: np.array(one) for name, one in self._clock().items() if one is not None}
         arrays |= stored_index(self.index)
         with open(path, "wb") as file:
             np.savez_compressed(file, engine=np.array(self.engine), **arrays)
@@ -336,9 +395,13 @@ class Run:
             with np.load(path, allow_pickle=False) as file:
                 arrays = dict(file)
             index = read_index(arrays)
-            run = cls(**arrays | {"engine": str(arrays["engine"])})
+            texts = {name: str(arrays[name]) for name in ("engine", "time_unit") if name in arrays}
+            if "labels" in arrays:
+                texts["labels"] = arrays["labels"].tolist()
+            run = cls(**arrays | texts)
             lengths = {len(arrays[name]) for name in _PER_STEP}
-            if lengths != {len(run)} or len(run.states) != len(run) + 1:
+            stages = {len(arrays[name]) for name in ("states", "elapsed") if name in arrays}
+            if lengths != {len(run)} or stages != {len(run) + 1}:
                 raise ShapeError("its arrays are not of the same steps")
         except (
             OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile

@@ -296,6 +296,12 @@ def unit_seconds(time_unit: Any) -> float:
     return seconds
 
 
+def elapsed_times(index: Any, time_unit: Any) -> Array:
+    """The times of an index in this unit: durations, or since the first date."""
+    durations = index - index[0] if hasattr(index, "tz") and len(index) else index
+    return np.asarray(durations.total_seconds(), np.float64) / unit_seconds(time_unit)
+
+
 def unit_name(time_unit: Any) -> str:
     """A unit of time in a label."""
     return time_unit if isinstance(time_unit, str) else f"{time_unit.total_seconds():g} s"

@@ -19,7 +19,6 @@ from qpmhe_solvers.values import finite, shown
 
 from .._checks import positive
 from ..errors import InvalidInputError, OptionError, ShapeError
-from ..estimation.time_index import unit_name, unit_seconds
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,22 +92,14 @@ def run_times(
 
     The days of Matplotlib where the run has dates, for `date_axis`.
     """
-    source, index = run.source, _dates(run, dt)
-    unit = "s" if source is None else source.time_unit
+    index = _dates(run, dt)
     if index is not None:
         dates: Any = import_module("matplotlib.dates")
         return np.asarray(dates.date2num(index), np.float64), time_label or ""
-    if dt is None and run.index is not None:
-        elapsed: Any = run.index
-        times = elapsed.total_seconds().to_numpy(np.float64) / unit_seconds(unit)
-        return times, time_label or time_words(1.0, unit)
-    if dt is None and source is not None:
-        dt = source.system.dt
-        if source.steps is not None:
-            times = np.concatenate(([0.0], np.cumsum(source.steps)))
-            return times, time_label or time_words(1.0, unit)
+    if dt is None and run.elapsed is not None:
+        return run.elapsed, time_label or time_words(1.0, run.time_unit)
     return (1.0 if dt is None else positive("dt", dt)) * np.arange(len(run) + 1.0), (
-        time_label or time_words(dt, unit)
+        time_label or time_words(dt, run.time_unit)
     )
 
 
@@ -128,9 +119,9 @@ def date_axis(run: Run, dt: float | None, panel: Any) -> None:
         panel.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator, tz=index.tz))
 
 
-def time_words(dt: float | None, unit: Any = "s") -> str:
+def time_words(dt: float | None, unit: str = "s") -> str:
     """The label of an axis of times."""
-    return f"time t ({'samples' if dt is None else unit_name(unit)})"
+    return f"time t ({'samples' if dt is None else unit})"
 
 
 def label_decades(axis: Any) -> None:

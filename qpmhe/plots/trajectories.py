@@ -270,11 +270,7 @@ def window(
 
 def run_labels(run: Run) -> list[str]:
     """The names of a run's states with units, where the model knows them; else x1, x2, ..."""
-    n = run.states.shape[1]
-    signals = None if run.source is None else run.source.system.signals
-    if signals is not None and len(signals.states) == n:
-        return [f"{one.name} ({one.unit})" if one.unit else one.name for one in signals.states]
-    return _names(None, n)
+    return run.labels or _names(None, run.states.shape[1])
 
 
 def _names(labels: Sequence[str] | None, n: int) -> list[str]:

@@ -1,10 +1,13 @@
 """Records from pandas: an index of times is the time axis; all else is paired by position."""
 
+import pickle
+
 import numpy as np
 import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, ShapeError
+from qpmhe.model.signals import Signal, Signals
 from qpmhe.tuning import TuningRecord
 from qpmhe.tuning.data import checked_data
 
@@ -157,12 +160,63 @@ def test_a_table_holds_each_state_at_its_own_time(tmp_path):
         assert min((-1, 0, 1), key=lambda shift, name=start: error(shift, name)) == 0
     plain = estimator(discrete()).run(y.to_numpy(), u.to_numpy()).to_frame()
     assert plain.index.tolist() == list(range(T + 1))
-    for index in (*INDEXES.values(), INDEXES["zone"].tz_convert(None)):
-        run.index = index
+    for times in (*INDEXES.values(), INDEXES["zone"].tz_convert(None)):
+        run.index = index = times.append(times[-1:] + (times[1] - times[0]))
         run.save(tmp_path / "run.npz")
         read = qpmhe.load_run(tmp_path / "run.npz").index
         assert read.equals(index)
         assert getattr(read, "tz", None) == getattr(index, "tz", None)
+
+
+@pytest.mark.parametrize("kind", ["dates", "durations", "steps", "plain"])
+def test_a_run_keeps_its_unit_of_time_and_its_names_without_its_source(kind, tmp_path):
+    y, u = record(INDEXES.get(kind, pd.RangeIndex(T)))
+    unit, dt = "h", 1.0 / 6.0 if kind == "dates" else 0.02
+    system = of_ode(dt).with_origin(
+        signals=Signals((Signal("pressure", "bar"), Signal("level"))))
+    expected = dt * np.arange(T + 1)
+    if kind == "durations":
+        unit, expected = "s", 2.0 + expected
+    elif kind != "dates":
+        unit = pd.Timedelta("1h")
+    run = estimator(system).run(y, u, time_unit=unit)
+    if kind == "steps":
+        lengths = np.linspace(0.01, 0.03, T)
+        run.source = run.source._replace(steps=lengths)
+        expected = np.append(0.0, np.cumsum(lengths))
+    run.save(tmp_path / "run.npz")
+    name = unit if isinstance(unit, str) else "3600 s"
+    for one in (run, qpmhe.load_run(tmp_path / "run.npz"), pickle.loads(pickle.dumps(run))):
+        np.testing.assert_allclose(one.elapsed, expected, rtol=1e-12)
+        assert (one.time_unit, one.labels) == (name, ["pressure (bar)", "level"])
+        table = one.to_frame()
+        np.testing.assert_array_equal(table["time"], one.elapsed)
+        assert table.attrs["time_unit"] == name
+        assert one.facts()["samples from"] == (
+            f"{expected[0]:.6g} to {expected[-2]:.6g} {name}")
+        axes = qpmhe.plots.states(one)
+        assert [panel.get_ylabel() for panel in axes] == one.labels
+        assert axes[-1].get_xlabel() == ("" if kind == "dates" else f"time t ({name})")
+        if kind != "dates":
+            np.testing.assert_array_equal(axes[0].lines[0].get_xdata(), one.elapsed)
+
+
+def test_a_run_of_an_older_file_counts_samples(tmp_path):
+    y, u = record(pd.RangeIndex(T))
+    run, path = estimator(of_ode(0.02)).run(y, u), tmp_path / "run.npz"
+    run.save(path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    assert {"elapsed", "time_unit"} < arrays.keys()
+    np.savez(path, **arrays | {"elapsed": arrays["elapsed"][:-1]})
+    with pytest.raises(InvalidInputError, match="not of the same steps"):
+        qpmhe.load_run(path)
+    np.savez(path, **{name: one for name, one in arrays.items()
+                      if name not in ("elapsed", "time_unit", "labels")})
+    old = qpmhe.load_run(path)
+    assert (old.elapsed, old.time_unit, old.labels) == (None, "s", None)
+    assert "time" not in old.to_frame()
+    assert qpmhe.plots.costs(old).get_xlabel() == "time t (samples)"
 
 
 def test_what_does_not_match_is_refused_by_name():
