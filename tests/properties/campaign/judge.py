@@ -78,22 +78,22 @@ def functions(case, x, u):
         )
 
 
-def _loss(loss, s, weight, error):
-    """The loss of a residual, and by how much an error of it moves the loss."""
-    per_component = loss is not None and loss.per_component
-    if per_component:
-        weight = np.diag(weight)
-        q, dq = weight * s * s, weight * (2.0 * np.abs(s) * error + error * error)
+def _losses(loss, s, weights, error):
+    """The loss of each residual, and by how much an error of it moves the loss."""
+    size = np.abs(s)
+    if loss is not None and loss.per_component:
+        weights = np.diagonal(weights, axis1=-2, axis2=-1)
+        q, dq = weights * s * s, weights * (2.0 * size + error) * error
     else:
-        size, magnitude = np.abs(s), np.abs(weight)
-        q = np.maximum(s @ weight @ s, 0.0)
-        dq = (2.0 * size + error) @ magnitude @ error
-        dq += 4.0 * len(s) * EPS * (size @ magnitude @ size)
+        magnitudes = np.abs(weights)
+        q = np.maximum(np.einsum("ki,kij,kj->k", s, weights, s), 0.0)
+        dq = np.einsum("ki,kij,kj->k", 2.0 * size + error, magnitudes, error)
+        dq += 4.0 * s.shape[1] * EPS * np.einsum("ki,kij,kj->k", size, magnitudes, size)
     if loss is None:
-        return float(q), float(dq)
+        return q, dq
     value = loss(q)
     moved = np.abs(loss(q + dq) - value) + np.abs(value - loss(np.maximum(q - dq, 0.0)))
-    return float(np.sum(value)), float(np.sum(moved))
+    return value.reshape(len(s), -1).sum(axis=1), moved.reshape(len(s), -1).sum(axis=1)
 
 
 def _seen_weight(weight, seen):
@@ -124,20 +124,20 @@ def _judged(case, x, window, mean, with_prior):
         D = metric(case)
         back = np.linalg.pinv(case.G / D[:, None])
         w, w_error = (d / D) @ back.T, (w_error / D) @ np.abs(back).T
-    J = slack = 0.0
-    for i, sample in enumerate(window):
-        share = case.discount ** (count - 1 - i)
-        weight = _seen_weight(sample.noise, seen[i])
-        for name, s, of, error in (
-            ("w", w[i], sample.disturbance, w_error[i]), ("v", v[i], weight, v_error[i]),
-        ):
-            value, moved = _loss(case.losses[name], s, of, error)
-            J, slack = J + share * value, slack + share * moved
+    shares, J, slack = case.discount ** np.arange(count - 1.0, -1.0, -1.0), 0.0, 0.0
+    disturbance = np.array([one.disturbance for one in window])
+    noise = np.array([
+        _seen_weight(one.noise, there) for one, there in zip(window, seen, strict=True)
+    ])
+    for name, s, of, error in (("w", w, disturbance, w_error), ("v", v, noise, v_error)):
+        value, moved = _losses(case.losses[name], s, of, error)
+        J, slack = J + float(shares @ value), slack + float(shares @ moved)
     if with_prior:
         error = 4.0 * EPS * (np.abs(x[0]) + np.abs(mean))
         offset = wrapped(x[0] - mean, case.x_angles)
-        value, moved = _loss(case.losses["p"], offset, case.prior_weight, error)
-        J, slack = J + case.discount**count * value, slack + case.discount**count * moved
+        value, moved = _losses(case.losses["p"], offset[None], case.prior_weight[None], error[None])
+        share = case.discount**count
+        J, slack = J + share * float(value[0]), slack + share * float(moved[0])
     value, moved = _penalties(case, x, w, v, seen)
     return Judged(J + value, slack + moved + 1e-10 * abs(J), w, np.where(seen, v, np.nan),
                   ahead, d)
@@ -151,21 +151,21 @@ def metric(case):
 def _penalties(case, x, w, v, seen):
     """Of soft sets and of a soft constraint."""
     total, slack, count = 0.0, 0.0, len(w)
-    shares = [case.discount ** max(count - 1 - i, 0) for i in range(count + 1)]
+    shares = case.discount ** np.maximum(count - 1.0 - np.arange(count + 1.0), 0.0)
     for name, (one, lines, squares) in case.soft.items():
-        for i, point in enumerate({"x": x, "w": w, "v": v}[name]):
-            if len(one.matrix):
-                value, size = one.matrix @ point, np.abs(one.matrix) @ np.abs(point)
-                missed = np.maximum(one.row_lower - value, value - one.row_upper)
-                if name == "v":
-                    missed[(one.matrix != 0.0) @ ~seen[i]] = 0.0
-            else:
-                missed, size = np.maximum(one.lower - point, point - one.upper), np.abs(point)
-                if name == "v":
-                    missed[~seen[i]] = 0.0
-            missed = np.maximum(missed, 0.0)
-            total += shares[i] * float(lines @ missed + squares @ missed**2)
-            slack += shares[i] * 1e-11 * float((lines + 2.0 * squares * missed) @ size)
+        points = {"x": x, "w": w, "v": v}[name]
+        if len(one.matrix):
+            value, size = points @ one.matrix.T, np.abs(points) @ np.abs(one.matrix).T
+            missed = np.maximum(one.row_lower - value, value - one.row_upper)
+        else:
+            missed, size = np.maximum(one.lower - points, points - one.upper), np.abs(points)
+        if name == "v":
+            unknown = (~seen).astype(int) @ (one.matrix.T != 0.0) > 0 if len(one.matrix) else ~seen
+            missed = np.where(unknown, 0.0, missed)
+        missed = np.maximum(missed, 0.0)
+        share = shares[: len(points), None]
+        total += float(np.sum(share * (lines * missed + squares * missed**2)))
+        slack += 1e-11 * float(np.sum(share * (lines + 2.0 * squares * missed) * size))
     if case.constraint and not case.constraint[2]:
         for share, point in zip(shares, x, strict=True):
             missed = max(0.0, float(case.constraint[0](point)))
@@ -211,7 +211,7 @@ def _allowed(one, covariance, size):
     if len(one.matrix):
         deviation = np.sqrt(np.einsum("ij,jk,ik->i", one.matrix, covariance, one.matrix))
         parts += [(deviation, size @ np.abs(one.matrix).T)] * 2
-    return np.concatenate([FEASIBLE * a + 1e-13 * b for a, b in parts])
+    return np.concatenate([FEASIBLE * a + 1e-13 * b for a, b in parts], axis=-1)
 
 
 class Judge:
@@ -354,6 +354,10 @@ class Judge:
         case, found, x = self.case, [], estimate.trajectory
         dropped = Status.ROWS_DROPPED in estimate.status
         largest = np.abs(x / case.x_units).max()
+        seen = np.array([one.seen for one in window])
+        y = np.where(seen, [one.y for one in window], 0.0)
+        if case.G is not None:
+            back = np.linalg.pinv(case.G / metric(case)[:, None])
         for name, points, before, covariance in (
             ("x", x, estimate.candidate, case.P), ("w", own.w, of_candidate.w, None),
             ("v", own.v, of_candidate.v, None),
@@ -362,34 +366,39 @@ class Judge:
                 continue
             if covariance is None:
                 covariance = np.linalg.inv(self.iQ if name == "w" else self.iR)
-            for i, point in enumerate(points):
-                sample = window[min(i, len(window) - 1)]
-                one, seen = sample.sets[name], sample.seen if name == "v" else None
-                missed = rows(one, point, seen)
+            sets = [window[min(i, len(window) - 1)].sets[name] for i in range(len(points))]
+            for one in {id(one): one for one in sets}.values():
+                at = np.array([i for i, other in enumerate(sets) if other is one])
+                there = seen[at] if name == "v" else None
                 if name == "x":
-                    size = np.abs(point)
+                    size = np.abs(x[at])
                 elif name == "v":
-                    size = np.abs(np.where(sample.seen, sample.y, 0.0)) + largest * case.y_units
+                    size = np.abs(y[at]) + largest * case.y_units
                 else:
-                    size = np.abs(x[i + 1]) + np.abs(own.ahead[i]) + largest * case.x_units
+                    size = np.abs(x[at + 1]) + np.abs(own.ahead[at]) + largest * case.x_units
                     if case.G is not None:
-                        back = np.linalg.pinv(case.G / metric(case)[:, None])
-                        size = 100.0 * np.abs(back) @ (size / metric(case))
-                allowed = _allowed(one, covariance, size)
-                if name == "w" and (missed > allowed).any():
-                    allowed += self._rounding_of_rows(one, x[i : i + 2], sample, missed)
+                        size = 100.0 * (size / metric(case)) @ np.abs(back).T
+                missed, kept = rows(one, points[at], there), rows(one, before[at], there) <= 0.0
                 self.count("rows", missed.size)
-                over = missed > allowed
+                over = missed > _allowed(one, covariance, size)
                 # Where the model failed, the candidate's residuals are unknown to the estimator.
-                known = not estimate.status & LOST
-                broken = over & (rows(one, before[i], seen) <= 0.0) & known
-                if broken.any() or (over.any() and not dropped):
-                    j = int(np.argmax(broken if broken.any() else over))
-                    which = " that the candidate keeps" if broken.any() else ""
-                    found.append((
-                        f"a row of {name} is missed{which}",
-                        (i, j, missed[j], allowed[j], estimate.status),
-                    ))
+                kept &= not estimate.status & LOST
+                wrong = over & kept if dropped else over
+                for k in np.flatnonzero(wrong.any(axis=1)):
+                    i, allowed = int(at[k]), _allowed(one, covariance, size[k])
+                    if name == "w":
+                        allowed += self._rounding_of_rows(
+                            one, x[i : i + 2], window[i], missed[k]
+                        )
+                    over = missed[k] > allowed
+                    broken = over & kept[k]
+                    if broken.any() or (over.any() and not dropped):
+                        j = int(np.argmax(broken if broken.any() else over))
+                        which = " that the candidate keeps" if broken.any() else ""
+                        found.append((
+                            f"a row of {name} is missed{which}",
+                            (i, j, missed[k][j], allowed[j], estimate.status),
+                        ))
         return found + self._of_constraint(estimate, window, own, of_candidate)
 
     def _rounding_of_rows(self, one, pair, sample, missed):
@@ -407,20 +416,19 @@ class Judge:
     def _of_constraint(self, estimate, window, own, of_candidate):
         if not self.case.constraint or not self.case.constraint[2]:
             return []
-        g, of_v, _ = self.case.constraint
-        for i in range(len(window) + (not of_v)):
-            if of_v and not window[i].seen[0]:
-                continue
-            now, before = (
-                float(g(x[i], own_v[i]) if of_v else g(x[i])) for x, own_v in (
-                    (estimate.trajectory, own.v), (estimate.candidate, of_candidate.v),
-                )
-            )
-            allowed = 1e-6 * (1.0 + abs(before)) + FEASIBLE * self.case.row_scale
-            kept = before <= 0.0
-            if now > allowed and (kept or Status.ROWS_DROPPED not in estimate.status):
-                which = " that the candidate keeps" if kept else ""
-                return [(f"a constraint is missed{which}", (i, now, before, estimate.status))]
+        (g, of_v, _), count = self.case.constraint, len(window)
+        now, before = (
+            g(x[:count].T, of.v.T) if of_v else g(x.T)
+            for x, of in ((estimate.trajectory, own), (estimate.candidate, of_candidate))
+        )
+        allowed = 1e-6 * (1.0 + np.abs(before)) + FEASIBLE * self.case.row_scale
+        kept = before <= 0.0
+        # Noises where nothing was measured are NaN, which misses nothing.
+        missed = (now > allowed) & (kept | (Status.ROWS_DROPPED not in estimate.status))
+        for i in np.flatnonzero(missed):
+            which = " that the candidate keeps" if kept[i] else ""
+            return [(f"a constraint is missed{which}",
+                     (int(i), now[i], before[i], estimate.status))]
         return []
 
     def _of_observer(self, estimate, window):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import json
+import time
 import traceback
 from collections import Counter
 
@@ -17,6 +18,9 @@ from .cases import SETS, Case
 from .engines import Beside
 from .judge import Judge, Sample, functions
 
+# An estimator goes on until it has used so many seconds of the processor: fast ones take more
+# samples. Where it ends changes none of its steps.
+_SECONDS, _LONGEST = 2.5, 1000
 # A fault of each kind is told once for each estimator, and no more than so many end it.
 _MOST = 20
 
@@ -56,9 +60,12 @@ class Run:
             else:
                 self.beside = Beside(case, self.mhe)
                 self.counts["libraries"] += 1
-        self.twin = case.estimator() if engine == "python" and r.random() < 0.25 else None
+        self.twin = case.estimator() if engine == "python" and r.random() < 0.15 else None
         self.judge = Judge(case)
-        self.length = samples or int(r.integers(60, 200))
+        length = int(r.integers(60, 200))
+        self.shortest = self.longest = samples or length
+        if not samples and engine == "python":
+            self.shortest, self.longest = case.options["horizon"] + 5, _LONGEST
         self.hostile = r.random() < 0.15
         self.smoothed = case.options.get("arrival") == "smoothed"
         self.exact = "time_budget" not in case.options
@@ -81,8 +88,11 @@ class Run:
 
     def go(self):
         """Take all samples; the steps' number."""
+        began = time.process_time()
         try:
-            for _ in range(self.length):
+            for taken in range(self.longest):
+                if taken >= self.shortest and time.process_time() - began > _SECONDS:
+                    break
                 self._sample()
                 if len(self.faults) > _MOST:
                     break
