@@ -64,6 +64,8 @@ class NativeSolver(Solver):
         self._package: Any = import_module(self.package)  # late: solvers are optional
         self._shifts = 0
         self._workspaces: dict[Hashable, _Workspace] = {}
+        # Of workspaces that were left out: infeasible QPs come in series.
+        self._layouts: dict[Hashable, QPLayout] = {}
         self._known: dict[Hashable, tuple[Hashable, Voids | None]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -130,6 +132,10 @@ class NativeSolver(Solver):
             if len(self._workspaces) == self.kept:
                 del self._workspaces[next(iter(self._workspaces))]  # the longest unused
             self._workspaces[key] = workspace
+        else:
+            if len(self._layouts) == self.kept:
+                del self._layouts[next(iter(self._layouts))]
+            self._layouts[key[:2]] = layout
         bounds = rows = None
         if answer.duals is not None:
             bounds, rows = answer.duals[: layout.size], answer.duals[layout.size :]
@@ -137,7 +143,7 @@ class NativeSolver(Solver):
             answer.x, answer.solved, answer.iterations, bounds, rows, answer.message
         )
 
-    def _taken(self, qp: QP) -> tuple[Hashable, _Workspace, Voids | None]:
+    def _taken(self, qp: QP) -> tuple[tuple[Hashable, ...], _Workspace, Voids | None]:
         """The workspace for a QP, taken off the shelf, its key, and the QP's void rows."""
         pattern = (
             qp.sizes, np.isfinite(qp.limits).tobytes(), (qp.all_lower == qp.all_upper).tobytes()
@@ -150,7 +156,10 @@ class NativeSolver(Solver):
         key = qp.sizes, kind, qp.key if self._keeps else 0
         workspace = self._workspaces.pop(key, None)
         if workspace is None:
-            workspace = _Workspace(QPLayout(self.style, self.structure(qp), *qp.sizes))
+            layout = self._layouts.pop(key[:2], None)
+            if layout is None:
+                layout = QPLayout(self.style, self.structure(qp), *qp.sizes)
+            workspace = _Workspace(layout)
         if known is None:
             if len(self._known) == _KNOWN:
                 del self._known[next(iter(self._known))]

@@ -8,7 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from qpmhe_solvers import SolverOptions, SolveStatus, create
+from qpmhe_solvers import SolverOptions, SolveStatus, create, native
 from qpmhe_solvers.layout import QPStyle
 from qpmhe_solvers.native import NativeAnswer, NativeSolver
 from qpmhe_solvers.sample_qps import contradiction, sample
@@ -79,6 +79,24 @@ def test_a_structure_is_set_up_once_and_few_are_kept(name, monkeypatch, capfd):
         qp.lower.flat[[j for j in range(7) if k >> j & 1]] = -np.inf
         assert solver.solve(qp).status is SOLVED
     assert (len(solver._known), len(solver._workspaces)) == (64, 4)
+
+
+@natives
+def test_a_series_of_infeasible_qps_is_laid_out_once(name, monkeypatch):
+    made, usual = [], native.QPLayout
+    monkeypatch.setattr(native, "QPLayout", lambda *given: made.append(1) or usual(*given))
+    solver, fresh, qp = create(name), create(name), sample(6, 2, 1, bounds="all", sides="two")
+    low, high = qp.row_lower.copy(), qp.row_upper.copy()
+    for k in (1000, 1001, 1002, 0):  # bounds of 1 exclude such rows
+        qp.row_lower[...], qp.row_upper[...] = low + k, high + k
+        before = len(made)
+        found = solver.solve(qp)
+        assert len(made) - before == (k == 1000)
+        fresh._layouts.clear()
+        wanted = fresh.solve(qp)
+        assert (found.status, found.iterations) == (wanted.status, wanted.iterations)
+        assert (found.status is SOLVED) == (k == 0)
+        assert found.d is wanted.d is None or np.array_equal(found.d, wanted.d)
 
 
 @natives
