@@ -35,7 +35,8 @@ from .content import Content
 from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
 from .events import CONTRADICTION, REINITIALIZED, check_model, first_event
-from .evidence import Evidence, MismatchError, at_most, json_ready
+from .evidence import Evidence, MismatchError, json_ready
+from .headline import condition, headline
 from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region
 from .norms import SLACKS, initial_length
@@ -48,7 +49,6 @@ from .sizes import (
     Size,
     Sizes,
     extent_of,
-    intervals,
     lengths_of,
     weighted_lengths,
 )
@@ -62,6 +62,7 @@ _MOST_SIGNS = 10
 # How much of the time is for the contraction, of the rest for the components' step, and of what
 # that leaves for the region itself.
 _CONTRACTION, _ROWS, _INVARIANCE = 0.8, 0.5, 0.6
+
 
 class Tube(NamedTuple):
     """Bounds at one time: |x - z|_P <= radius, and |x_i - z_i| <= box[i]."""
@@ -290,7 +291,7 @@ class ObserverBound:
         radius = self.advanced(tube.radius, entering)
         box: Array = self.components(radius)
         if self.rowwise is not None and not projected:
-            within = np.minimum(tube.box, self._widths * OUTWARD)
+            within = np.minimum(tube.box, self.widths * OUTWARD)
             step = self.rowwise.step(within, tube.radius, observer, u)
             box = np.minimum(box, (step + added) * OUTWARD)
         return Tube(min(radius, self._across(box)), box)
@@ -333,7 +334,7 @@ class ObserverBound:
         makes of it, and so at most what any number of steps make of a larger one.
         """
         radius = self.limit()
-        tube = Tube(radius, np.minimum(self.components(radius), self._widths * OUTWARD))
+        tube = Tube(radius, np.minimum(self.components(radius), self.widths * OUTWARD))
         return self._iterated(tube, _MOST_STEPS)[0] if self.unprojected else tube
 
     def _iterated(self, tube: Tube, most: int, until: Array | None = None) -> tuple[Tube, int]:
@@ -504,7 +505,8 @@ class ObserverBound:
         return np.asarray(np.any(lower > upper, axis=-1))
 
     @property
-    def _widths(self) -> Array:
+    def widths(self) -> Array:
+        """The region's widths, (n,)."""
         n = self.region.n
         return self.region.upper[:n] - self.region.lower[:n]
 
@@ -515,7 +517,7 @@ class ObserverBound:
         From an initial error within the limit where the bound `begins_within` it. None where the
         limit is 0, or it takes too many steps.
         """
-        radius, limit = self.initial(Box(-self._widths, self._widths)), self.limit()
+        radius, limit = self.initial(Box(-self.widths, self.widths)), self.limit()
         if not limit > 0.0:
             return None
         rows = self.rowwise is not None and self.unprojected
@@ -527,7 +529,7 @@ class ObserverBound:
         if not rows:
             return samples
         # Then the components, which follow the radius.
-        box = np.minimum(self.components(radius), self._widths * OUTWARD)
+        box = np.minimum(self.components(radius), self.widths * OUTWARD)
         until = (1.0 + _SETTLED) * self.settled.box
         reached, after = self._iterated(Tube(radius, box), _MOST_STEPS, until)
         return samples + after if (reached.box <= until).all() else None
@@ -535,66 +537,12 @@ class ObserverBound:
     @property
     def headline(self) -> str:
         """The bounds on the observer and on estimates, in the states' units, in one line."""
-        limit, after = self.settled.box, self.settling_samples
-        each = ", ".join(f"|x{i + 1} - z{i + 1}| <= {at_most(b, 3)}" for i, b in enumerate(limit))
-        when = f" and at most 10 % more from sample {after} on" if after else ""
-        wide = " x ".join(f"{width:.3g}" for width in self._widths)
-        return (
-            f"{each} in the limit{when} ({self._shown}{self._while}), on a region {wide} "
-            f"wide{self._nothing(limit)}; {self._of_estimates}"
-        )
-
-    def _nothing(self, limit: Array) -> str:
-        """Of which states bounds say nothing, in words; blank if they say something of all."""
-        vacuous = ", ".join(f"x{i + 1}" for i in np.flatnonzero(limit >= self._widths))
-        return f": it says nothing about {vacuous}" if vacuous else ""
-
-    @property
-    def _while(self) -> str:
-        """What must hold besides, in words; blank if nothing must."""
-        if self.begins_within:
-            return ", from an initial error within the limit on"
-        stays = self.invariance is not None and self.invariance.holds
-        return "" if stays else ", while x stays in the region"
-
-    @property
-    def _shown(self) -> str:
-        """The evidence, and for what."""
-        if not self.stability.compared:
-            return str(self.evidence)
-        return (
-            f"{self.evidence} for the traced model, which agreed with f at "
-            f"{self.stability.compared} points"
-        )
-
-    @property
-    def _of_estimates(self) -> str:
-        """What follows for an estimate x_hat, in words."""
-        offset = "|x_hat - z| + b"
-        if self.evidence is not Evidence.PROVED or self.sizes.deviations:
-            return f"x_hat is within {offset} along a run"
-        limit = 2.0 * self.settled.box
-        twice = ", ".join(at_most(b, 3) for b in limit)
-        return (
-            f"guarded, x_hat is within min(2 b, {offset}) along a run, and in advance within 2 b = "
-            f"{twice}{self._nothing(limit)}"
-        )
+        return headline(self)
 
     @property
     def condition(self) -> str:
         """Whether state and observer stay in the region, in words."""
-        if self.inner is not None:
-            n, place = self.region.n, self.inner.region
-            start = intervals("x", place.lower[:n], place.upper[:n])
-            return (
-                f"x and z stay in the region (proved) from {start} on, if the initial error is at "
-                "most the limit"
-            )
-        found = "x stays in the region (proved)"
-        if self.invariance is None or not self.invariance.holds:
-            why = "" if self.invariance is None else f": {self.invariance}"
-            found = f"it is not proved that x stays in the region{why}"
-        return f"{found}; z is checked at each sample"
+        return condition(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything in types that JSON knows."""

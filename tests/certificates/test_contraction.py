@@ -272,6 +272,31 @@ def test_solvers_that_lie_or_raise_prove_nothing(monkeypatch, lie, dimension):
     assert all(0.0 < each <= 2.0 for each in limits)
 
 
+def test_a_solver_that_breaks_down_is_asked_again_with_other_settings(monkeypatch):
+    cvxpy = pytest.importorskip("cvxpy")
+    solve, system = cvxpy.Problem.solve, linear([[0.97, 0.2], [-0.2, 0.97]], [[1.0, 0.0]])
+
+    def certified():
+        return certify_observer(
+            system, qpmhe.Luenberger([[0.2], [0.0]]), unit_box(2), rho=0.99, sizes=(0.01, 0.02))
+
+    expected, kinds = certified(), []
+
+    def breaking(problem, *, solver, time_limit, **settings):
+        kinds.append(settings)
+        assert 0.0 < time_limit <= 30.0
+        if not settings:
+            raise cvxpy.SolverError("insufficient progress")
+        return solve(problem, solver=solver, time_limit=time_limit, **settings)
+
+    monkeypatch.setattr(cvxpy.Problem, "solve", breaking)
+    found = certified()
+    assert found.evidence is Evidence.PROVED
+    assert not kinds[0]
+    assert kinds[1]
+    np.testing.assert_allclose(found.P, expected.P, rtol=1e-4)
+
+
 def test_proofs_end_with_the_time(monkeypatch):
     now = count()  # a second goes by whenever the clock is looked at
     clock = SimpleNamespace(monotonic=lambda: float(next(now)))
