@@ -19,6 +19,8 @@ from .tables import TIMES, RecordError, first_line
 
 # Longer arrays, such as images, are no signals.
 _LONGEST = 64
+# What is read at once: bytes of an MDF file, and messages of a bag.
+_FRAGMENT, _MESSAGES = 2**22, 2**14
 _Path = tuple[str | int, ...]
 
 
@@ -32,6 +34,7 @@ def read_mdf(file: str) -> Channels:
                 "off, or of another kind.", file,
             )
     mdf = _attempt(file, "MDF", Exception, lambda: asammdf.MDF(file))
+    mdf.configure(read_fragment_size=_FRAGMENT)  # 256 MB unless told otherwise
     groups = [getattr(each.channel_group, "acq_name", "") or f"group {k + 1}"
               for k, each in enumerate(mdf.groups)]
     places = [
@@ -249,30 +252,47 @@ def read_bag(file: str, log_time: bool = False) -> Channels:
         paths: dict[int, list[int]] = {}
         for one in chosen:
             paths.setdefault(found[one][0].id, []).append(one)
-        times: dict[int, list[int]] = {key: [] for key in paths}
-        values: dict[int, list[Any]] = {one: [] for one in chosen}
+        times = {key: _Pieces(np.int64) for key in paths}
+        values = {one: _Pieces() for one in chosen}
         wanted = [each for each in reader.connections if each.id in paths]
 
         def collect() -> None:
             for connection, logged, raw in reader.messages(wanted) if wanted else ():
                 message, key = reader.deserialize(raw, connection.msgtype), connection.id
-                times[key].append(_stamp(message) if stamped[key] else logged)
+                times[key].add(_stamp(message) if stamped[key] else logged)
                 for one in paths[key]:
-                    values[one].append(_at(message, found[one][1]))
+                    values[one].add(_at(message, found[one][1]))
 
         _attempt(file, kind, Exception, collect)
         notes.append(f"times of {file}: " + ", ".join(
             f"{texts[topic]} of {topic}" for topic in dict.fromkeys(c.topic for c in wanted)
         ) + ".")
         return [
-            _signal(file, names[one], np.array(times[found[one][0].id], np.int64),
-                    np.array(values[one])) for one in chosen
+            _signal(file, names[one], times[found[one][0].id].whole(), values[one].whole())
+            for one in chosen
         ]
 
     return Channels(
         _distinct(names, [f"connection {c.id}" for c, _ in found]), [""] * len(names), load,
         reader.close, dates=True, notes=notes,
     )
+
+
+class _Pieces:
+    """Values one after another: the newest in a list, which takes many times the memory."""
+
+    def __init__(self, kind: Any = None) -> None:
+        self._kind, self._packed, self._newest = kind, list[NDArray[Any]](), list[Any]()
+
+    def add(self, value: Any) -> None:
+        self._newest.append(value)
+        if len(self._newest) == _MESSAGES:
+            self._packed.append(np.array(self._newest, self._kind))
+            self._newest.clear()
+
+    def whole(self) -> NDArray[Any]:
+        newest = [np.array(self._newest, self._kind)] if self._newest or not self._packed else []
+        return np.concatenate([*self._packed, *newest])
 
 
 def _stamp(message: Any) -> int:

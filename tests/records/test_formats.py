@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.records import RecordError, read
+from qpmhe.records import RecordError, formats, read
 from qpmhe.records.arrays import read_record
 from qpmhe.records.channels import merged
 from qpmhe.records.record_model import load_record_model
@@ -99,7 +99,9 @@ def refused(name, *words, read=read, **options):
     return message
 
 
-def test_mdf_has_what_asammdf_reads(here):
+@pytest.mark.parametrize("fragment", [formats._FRAGMENT, 96])
+def test_mdf_has_what_asammdf_reads(here, monkeypatch, fragment):
+    monkeypatch.setattr(formats, "_FRAGMENT", fragment)
     mf4("record.mf4", [
         (T1, {"speed": FAST, "gear": np.arange(40, dtype=np.uint8)}), (T2, {"temp": SLOW}),
         (T2 + 0.01, {"speed": SLOW}), (T2, {"text": np.array([b"a", b"bc"] * 10)}),
@@ -197,7 +199,8 @@ def test_hdf5_has_what_h5py_reads(here):
 
 
 @pytest.mark.parametrize("kind", ["SQLITE3", "MCAP"])
-def test_bags_have_what_was_written(here, kind):
+def test_bags_have_what_was_written(here, kind, monkeypatch):
+    monkeypatch.setattr(formats, "_MESSAGES", {"SQLITE3": 7, "MCAP": 10}[kind])
     stamps = EPOCH + np.arange(20) * 10**8 + 123
     logged = stamps + 1000
     path = bag("run", kind, [("/pose", logged, stamps, SLOW), ("/speed", logged, None, -SLOW),
