@@ -10,7 +10,7 @@ from .adapters.control import from_control
 from .adapters.fmu import from_fmu
 from .adapters.iosystem import to_iosystem
 from .adapters.jax import from_jax
-from .adapters.learnt import from_sklearn, from_torch
+from .adapters.learnt import from_onnx, from_sklearn, from_torch
 from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
 from .codegen import Compiled, compile
@@ -169,6 +169,7 @@ __all__ = [
     "from_control",
     "from_fmu",
     "from_jax",
+    "from_onnx",
     "from_sklearn",
     "from_sympy",
     "from_torch",

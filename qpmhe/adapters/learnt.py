@@ -1,4 +1,4 @@
-"""Networks of PyTorch and scikit-learn as functions of NumPy, for models that are partly learnt."""
+"""Networks of other libraries as functions of NumPy arrays, for models that are partly learnt."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.values import shown
 
-from .._checks import flag, numbers
+from .._checks import flag, need, numbers
 from ..errors import ModelError, ShapeError
 from ..model.symbols import Symbol, SymbolArray
 
@@ -372,3 +373,109 @@ def _sklearn_layers(model: Any) -> Iterator[Layer]:
 def _check_fitted(model: Any, attribute: str) -> None:
     if not hasattr(model, attribute):
         raise ModelError(f"the {type(model).__name__} is not fitted; call its fit first.")
+
+
+# ONNX
+
+_OF_ONNX = {
+    "Identity": "identity", "Dropout": "identity", "Tanh": "tanh", "Sigmoid": "sigmoid",
+    "Relu": "relu", "Gelu": "gelu",
+}
+
+
+def from_onnx(model: Any) -> LearntFunction:
+    """Make a function of NumPy arrays from a network in ONNX.
+
+    It is no system, but what f or h calls beside the equations that are known.
+
+    Parameters
+    ----------
+    model : str, Path or onnx.ModelProto
+        A file, or what ``onnx.load`` returns. Its operators are a chain of ``Gemm``, ``MatMul``,
+        ``LayerNormalization`` of the last axis, ``Tanh``, ``Sigmoid``, ``Relu``, ``Gelu``,
+        ``Identity``, ``Dropout`` outside of training, and ``Add``, ``Sub``, ``Mul`` and ``Div``
+        with a constant, such as those of a scaler. Weights are in single or double precision.
+
+    Returns
+    -------
+    LearntFunction
+
+    Raises
+    ------
+    ModelError
+        If it is none of these, or cannot be read. The message names the operator.
+    InvalidInputError
+        If onnx is not installed.
+    """
+    onnx = need("onnx", "a network in ONNX", "onnx")
+    if isinstance(model, (str, PathLike)):
+        try:
+            model = onnx.load(model)
+        except Exception as error:  # of the file, of Protocol Buffers, of weights in other files
+            raise ModelError(f"{model} cannot be read as ONNX ({error}).") from error
+    if not isinstance(model, onnx.ModelProto):
+        raise ModelError(f"model is a {type(model).__name__}; expected a file or onnx.ModelProto.")
+    graph, layers = model.graph, []
+    tensors = {one.name: one for one in graph.initializer}
+    inputs = [one for one in graph.input if one.name not in tensors]
+    if len(inputs) != 1:
+        raise ModelError(f"the network has {len(inputs)} inputs; expected one.")
+    newest = [inputs[0].name]
+    width = ([one.dim_value for one in inputs[0].type.tensor_type.shape.dim] or [0])[-1]
+    for node in graph.node:
+        given = {one.name: onnx.helper.get_attribute_value(one) for one in node.attribute}
+        if node.op_type == "Constant" and "value" in given:
+            tensors[node.output[0]] = given["value"]
+            continue
+        constants = [_onnx_values(onnx, tensors[one]) for one in node.input if one in tensors]
+        layer, is_behind = None, any(one in tensors for one in node.input[:1])
+        if [one for one in node.input if one and one not in tensors] == newest:
+            layer = _onnx_layer(node.op_type, given, constants, is_behind, width)
+        if layer is None or node.domain not in ("", "ai.onnx"):
+            raise ModelError(
+                f"{node.name or node.output[0]} is a {node.op_type}, which has no form in NumPy "
+                "here with its inputs and attributes; expected a chain of Gemm, MatMul, Layer"
+                f"Normalization, {', '.join(_OF_ONNX)}, and Add, Sub, Mul, Div with constants."
+            )
+        width = layer.matrix.shape[0] if isinstance(layer, _Affine) else width
+        layers.append(layer)
+        newest = list(node.output[:1])
+    if newest != [one.name for one in graph.output]:
+        raise ModelError("the network's output is not the value of its last operator.")
+    return LearntFunction(graph.name or "network", layers)
+
+
+def _onnx_layer(
+    name: str, given: dict[str, Any], constants: list[Array], is_behind: bool, width: int
+) -> Layer | None:
+    """The layer of an operator of a value of this width and constants, which may stand first."""
+    if name in _OF_ONNX and len(constants) <= (name == "Dropout"):  # its ratio
+        by_tanh = given.get("approximate") == b"tanh"
+        return _Activation(name, _OF_ONNX[name] + " by tanh" * by_tanh)
+    if not constants or (is_behind and name not in ("Add", "Mul")):
+        return None
+    one, *rest = constants
+    if name in ("Gemm", "MatMul") and one.ndim == 2 and not given.get("transA", 0):
+        matrix = given.get("alpha", 1.0) * (one if given.get("transB", 0) else one.T)
+        offset = given.get("beta", 1.0) * rest[0].reshape(-1) if rest else np.zeros(1)
+        if offset.size not in (1, len(matrix)):
+            return None
+        return _Affine(name, matrix, np.broadcast_to(offset, len(matrix)).copy())
+    if name == "LayerNormalization" and given.get("axis", -1) == -1 and one.ndim == 1:
+        eps = given.get("epsilon", float(np.float32(1e-5)))  # attributes are in single precision
+        return _Normalized(name, eps, one, (rest or [0.0 * one])[0])
+    if name in ("Add", "Sub", "Mul", "Div") and one.size == max(one.shape, default=1) and not rest:
+        # Dropping its axes of one does not change the last axis of a sum or product.
+        values = np.full(width or 1, one) if one.size == 1 else one.reshape(-1)
+        shift, scale = (values, np.ones_like(values))[:: 1 if name in ("Add", "Sub") else -1]
+        return _Scaled(name, shift * (name in ("Add", "Sub")), scale, name in ("Add", "Mul"))
+    return None
+
+
+def _onnx_values(onnx: Any, tensor: Any) -> Array:
+    kind = onnx.TensorProto.DataType.Name(tensor.data_type)
+    if kind not in ("FLOAT", "DOUBLE"):
+        raise ModelError(
+            f"the weights {tensor.name} have the type {kind}; expected FLOAT or DOUBLE."
+        )
+    return numbers(tensor.name, onnx.numpy_helper.to_array(tensor))

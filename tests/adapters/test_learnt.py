@@ -1,4 +1,4 @@
-"""Networks of scikit-learn and PyTorch as functions: the libraries' own values and derivatives."""
+"""Networks of other libraries as functions: the libraries' own values and derivatives."""
 
 import pickle
 
@@ -136,6 +136,99 @@ def test_relu_has_no_slope_at_zero():
     system = qpmhe.System(net, lambda x: x, n=1, p=1)
     slopes = [system.f_jacobian(np.array([x])).item() for x in (-1.0, 0.0, 1.0)]
     assert slopes == [0.0, 0.0, 1.0]
+
+
+def onnx_model(nodes, constants=None, inputs=("x",), width=3, output=None):
+    """A graph: (operator, operands, value, attributes), and its constants by name."""
+    onnx = pytest.importorskip("onnx")
+    from onnx import helper, numpy_helper
+
+    made = [helper.make_node(kind, list(operands), [value], **given)
+            for kind, operands, value, given in nodes]
+    tensor = onnx.TensorProto.DOUBLE
+    graph = helper.make_graph(
+        made, "net", [helper.make_tensor_value_info(one, tensor, [None, width]) for one in inputs],
+        [helper.make_tensor_value_info(output or nodes[-1][2], tensor, None)],
+        [numpy_helper.from_array(np.asarray(one), name)
+         for name, one in (constants or {}).items()],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)])
+
+
+def all_of_onnx(gelu):
+    """Every operator that is taken; weights transposed or not, constants on either side."""
+    draw = DRAW.standard_normal
+    constants = {
+        "mean": draw(3), "deviation": DRAW.uniform(0.5, 2.0, (1, 3)), "w1": draw((3, 12)),
+        "b1": draw((1, 12)), "w2": draw((12, 12)), "b2": draw(12), "gain": draw(12), "b3": draw(12),
+        "w3": draw((2, 12)), "half": np.array(0.5), "ratio": np.array(0.3), "top": draw(2),
+    }
+    by_tanh = {"approximate": "tanh"} if gelu == "Gelu" else {}
+    nodes = [
+        ("Sub", ("x", "mean"), "a", {}), ("Div", ("a", "deviation"), "b", {}),
+        ("Gemm", ("b", "w1", "b1"), "c", {"alpha": 0.7, "beta": 1.3}), ("Tanh", ("c",), "d", {}),
+        ("LayerNormalization", ("d", "gain", "b3"), "e", {"epsilon": 1e-3}),
+        ("MatMul", ("e", "w2"), "f", {}), ("Add", ("b2", "f"), "g", {}), (gelu, ("g",), "h", {}),
+        ("Mul", ("half", "h"), "i", {}), (gelu, ("i",), "j", by_tanh),
+        ("Identity", ("j",), "k", {}), ("Sub", ("k", "half"), "l", {}), ("Relu", ("l",), "m", {}),
+        ("Constant", (), "value", {"value": numpy_tensor(draw((12, 12)))}),
+        ("MatMul", ("m", "value"), "n", {}), ("Sigmoid", ("n",), "o", {}),
+        ("LayerNormalization", ("o", "gain"), "p", {}), ("Dropout", ("p", "ratio"), "q", {}),
+        ("Gemm", ("q", "w3", "half"), "r", {"transB": 1}), ("Mul", ("r", "top"), "y", {}),
+    ]
+    return onnx_model(nodes, constants)
+
+
+def numpy_tensor(values):
+    return pytest.importorskip("onnx").numpy_helper.from_array(values, "constant")
+
+
+@pytest.mark.parametrize(("gelu", "tolerance"), [
+    ("Identity", 1e-12), ("Gelu", 1e-6),  # the reference has its constants in single precision
+])
+def test_a_network_in_onnx_has_the_values_of_its_reference(gelu, tolerance, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    from onnx.reference import ReferenceEvaluator
+
+    model = all_of_onnx(gelu)
+    onnx.save(model, tmp_path / "net.onnx")
+    (expected,) = ReferenceEvaluator(model).run(None, {"x": X})
+    for given in (model, tmp_path / "net.onnx", str(tmp_path / "net.onnx")):
+        net = pickle.loads(pickle.dumps(qpmhe.from_onnx(given)))
+        assert (net.inputs, net.outputs, len(net.layers)) == (3, 2, 19)
+        np.testing.assert_allclose(net(X), expected, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(net(X[0]), expected[0], rtol=tolerance, atol=tolerance)
+    system = qpmhe.System(lambda x, u: net(np.append(x, u)), lambda x: x[:1], n=2, p=1, m=1)
+    assert system.explain().startswith("f: traced. Jacobian: exact")
+
+
+def test_what_has_no_form_in_onnx_is_refused_by_name(tmp_path):
+    pytest.importorskip("onnx")
+    (tmp_path / "none.onnx").write_bytes(b"no such thing")
+    w, relu = {"w": np.eye(3)}, ("Relu", ("x",), "a", {})
+    weighted = ("MatMul", ("x", "w"), "b", {})
+    for given, message in (
+        (tmp_path / "none.onnx", "none.onnx cannot be read as ONNX"),
+        (tmp_path / "missing.onnx", "missing.onnx cannot be read as ONNX"),
+        (3, "model is a int; expected a file"),
+        (onnx_model([("Softmax", ("x",), "y", {})]), "y is a Softmax, which has no form"),
+        (onnx_model([("Relu", ("x",), "y", {"domain": "mine"})]), "y is a Relu"),
+        (onnx_model([("MatMul", ("w", "x"), "y", {})], w), "y is a MatMul"),
+        (onnx_model([("Sub", ("w", "x"), "y", {})], {"w": np.ones(3)}), "y is a Sub"),
+        (onnx_model([("Add", ("x", "w"), "y", {})], w), "y is a Add"),
+        (onnx_model([("Gemm", ("x", "w"), "y", {"transA": 1})], w), "y is a Gemm"),
+        (onnx_model([weighted, ("Gemm", ("x", "w"), "c", {})], w), "c is a Gemm"),  # a branch
+        (onnx_model([relu, ("Mul", ("x", "a"), "y", {})]), "y is a Mul"),
+        (onnx_model([("Add", ("x", "z"), "y", {})], inputs=("x", "z")), "has 2 inputs; expected"),
+        (onnx_model([weighted, ("Relu", ("b",), "c", {})], w, output="b"), "output is not"),
+        (onnx_model([relu]), "net has no linear layer"),
+        (onnx_model([weighted, ("Add", ("b", "d"), "c", {})], w | {"d": np.ones(4)}), "not fit"),
+        (onnx_model([weighted], {"w": np.eye(3, dtype=np.float16)}), "weights w have the type FLO"),
+        (onnx_model([("LayerNormalization", ("x", "d"), "y", {"axis": 0})], {"d": np.ones(3)}),
+         "y is a LayerNormalization"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            qpmhe.from_onnx(given)
 
 
 # With PyTorch, where it is installed
