@@ -121,7 +121,8 @@ for _feature in FEATURES:
     globals()[f"test_the_same_estimates_{_feature}"] = _agreements(_feature)
 
 
-@pytest.mark.parametrize("name", list(CASES)[::3])
+@pytest.mark.usefixtures("as_users_compile")
+@pytest.mark.parametrize("name", list(CASES)[::6])
 def test_the_same_runs(name):
     """Whole records, of measurements and inputs only."""
     one = case(name)

@@ -8,6 +8,7 @@ import pytest
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.solvers import available
+from tests.covering import covering
 
 A, C = np.array([[1.0, 0.1], [-0.3, 0.9]]), np.array([[1.0, 0.0]])
 COVARIANCES = {"prior": np.eye(2), "disturbance": 0.03**2 * np.eye(2), "noise": [[0.05**2]]}
@@ -64,9 +65,7 @@ def right():
     return found.states
 
 
-@pytest.mark.parametrize("kind", ENGINES)
-@pytest.mark.parametrize("where", ["states", "disturbances", "noises", "rows"])
-@pytest.mark.parametrize("far", FAR)
+@covering(far=FAR, where=["states", "disturbances", "noises", "rows"], kind=ENGINES)
 def test_a_bound_that_means_none_changes_nothing(kind, where, far):
     found = run(kind, far, where)
     assert found.share(qpmhe.Status.IMPROVED) == 1.0

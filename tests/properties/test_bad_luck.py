@@ -6,6 +6,7 @@ from scipy.optimize import least_squares
 
 import qpmhe
 from qpmhe import Status
+from tests.covering import covering
 from tests.estimation.untraced import untraced
 
 from .plain import observer_path
@@ -90,10 +91,9 @@ BREAKAGES = {
 }
 
 
-@pytest.mark.parametrize("max_qps", [0, 1, None])
-@pytest.mark.parametrize("part", ["f", "h"])
-@pytest.mark.parametrize("how", BREAKAGES)
-@pytest.mark.parametrize("broken", [(10, 11, 20), range(10, 30)], ids=["briefly", "for long"])
+@covering(
+    broken=[(10, 11, 20), range(10, 30)], how=BREAKAGES, part=["f", "h"], max_qps=[0, 1, None]
+)
 def test_a_model_that_breaks_for_a_while(how, part, max_qps, broken):
     X, Y = record(60)
     functions = {"f": f, "h": h}

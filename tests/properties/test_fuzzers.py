@@ -81,6 +81,7 @@ def test_the_judge_of_mixed_steps_sees_a_broken_promise():
 
 
 @pytest.mark.shortened
+@pytest.mark.usefixtures("as_users_compile")
 @pytest.mark.parametrize(("source", "writing"), WAYS)
 def test_every_step_is_what_it_says(pytestconfig, source, writing):
     if source != "numpy":
