@@ -166,12 +166,12 @@ def true_cost(plan, estimate, x, w, v):
     "make", [scalar, swap, bent_output], ids=lambda make: make.__name__
 )
 def test_no_run_exceeds_a_bound(make, pytestconfig, monkeypatch):
-    """With --all, 10,000 adversarial runs of three systems."""
+    """Adversarial runs of three systems, each sample the worst of many."""
     monkeypatch.setattr(Model, "fault", lambda *_: "")  # compared elsewhere
     system, region, sizes, gain = make()
     plan = design(system, region, sizes=sizes)
     assert plan.evidence is Evidence.PROVED
-    trials = 3400 if pytestconfig.option.all else 100
+    trials = 600 if pytestconfig.option.all else 100
     shares, compared = attack(plan, gain, trials=trials)
     assert compared > 10 * trials
     assert max(shares.values()) <= 1.0 + 1e-9

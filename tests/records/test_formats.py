@@ -13,6 +13,7 @@ from qpmhe.records import RecordError, formats, read
 from qpmhe.records.arrays import read_record
 from qpmhe.records.channels import merged
 from qpmhe.records.record_model import load_record_model
+from tests.covering import covering
 
 from .oscillator import DT, lines
 from .tools import CONTINUOUS, DISCRETE, estimate, get, killed, put
@@ -333,9 +334,9 @@ def test_every_kind_is_the_same_record(here):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("out", ["out.csv", "out.jsonl", "out.parquet"])
-@pytest.mark.parametrize(
-    "name", ["record.csv", "record.jsonl", "record.parquet", "record.mf4", "record.h5", "run"]
+@covering(
+    strength=1, out=["out.csv", "out.jsonl", "out.parquet"],
+    name=["record.csv", "record.jsonl", "record.parquet", "record.mf4", "record.h5", "run"],
 )
 def test_killed_runs_resume_byte_for_byte(here, name, out):
     """SIGKILL at a random row, and while a checkpoint, or the Parquet file, takes its place."""
