@@ -33,8 +33,10 @@ def folded(text: str, value: Callable[[str], bool | None]) -> str:
 
 def _without_calls(text: str, name: str, number: str) -> str:
     """The text with the calls of an idle function replaced by its number, or left out."""
+    # A pattern that begins with a literal is found ten times as fast.
+    call = re.compile(rf"{name}(?<!static void {name})(?<!\w{name})\(")
     start = 0
-    while (found := re.compile(rf"(?<!static void )(?<!\w){name}\(").search(text, start)):
+    while (found := call.search(text, start)):
         start, first = found.end(), text.rfind("\n", 0, found.start()) + 1
         end = _closing(text, start)
         if text.startswith("static ", first) or re.search(r"\+\+|--|[^=!<>]=[^=]", text[start:end]):

@@ -15,9 +15,10 @@ from qpmhe.codegen.library import generated
 from qpmhe.codegen.strip import stripped
 
 from .cases import CASES, case
-from .test_written import DRIVER
+from .test_written import DRIVER, EXACT, STRICT
 
 CC = shutil.which("cc")
+HEADERS = {"<math.h>", "<tgmath.h>", "<stddef.h>", "<string.h>", '"mhe.h"'}
 FOLDER = Path(codegen.__file__).parent
 HEADER = """#ifndef A_H
 #define A_H
@@ -168,11 +169,15 @@ def test_what_does_nothing_goes(text, left):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_written_code_reads_well(name, tmp_path):
+def test_written_code_reads_well_and_compiles_without_warnings(name, tmp_path):
     files = write(case(name).estimator("python"), tmp_path)
+    if CC:
+        command = [CC, "-std=c99", *STRICT, *EXACT, "-fsyntax-only", files[1]]
+        subprocess.run(command, check=True)
     header, written = (path.read_text() for path in files)
     conditions = re.findall(r"#\s*(?:el)?if.*", header + written)
     assert [one for one in conditions if not re.search(COMPILERS, one)] == []
+    assert set(re.findall(r"^#include (.*)", written, re.M)) <= HEADERS
     for text in (header, written):
         for pattern in (
             r"\n\n\n", r"\{\n\n", r"\n\n\s*\}", r"\{\s*\}", r"\*/\n*\Z", r"\*/\n\n/\*.*\*/\n\n",
