@@ -17,7 +17,7 @@ from .._version import __version__
 from ..errors import CompilationError
 from ..model.algebraic import CURVED, LESS, MOST_HALVINGS, MOST_ITERATIONS, ROUNDING, SMALL
 from ..model.expressions import CasadiModel, import_casadi
-from ..model.implicit_steps import COLLOCATIONS
+from ..model.implicit_steps import COLLOCATIONS, Collocation
 from ..terms.soft import SOFT
 from .layout import SET_NAMES, TERMS, Layout
 from .single import in_single_precision
@@ -26,6 +26,8 @@ from .single import in_single_precision
 MAIN = "mhe.c"
 # Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
+# An implicit step keeps one Jacobian for so many iterations, while corrections fall to this share.
+_MOST_KEPT, _CONTRACTION = 20, 0.25
 
 
 @cache
@@ -248,16 +250,42 @@ def _step_parts(model: CasadiModel) -> list[str]:
     substeps = [] if single else [_filled("substeps", {"steps": how.steps})]
     if not how.is_implicit:
         return [_filled(f"step_{how.method}", names), *substeps]
-    method = COLLOCATIONS[how.method]
-    values = names | {
+    values = {
         "iterations": MOST_ITERATIONS, "halvings": MOST_HALVINGS, "rounding": repr(ROUNDING),
         "small": repr(SMALL), "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
-        "stages": len(method.A), "ends": ", ".join(map(repr, method.d.tolist())),
-        "weights": ", ".join(f"{{{', '.join(map(repr, row))}}}" for row in method.A.tolist()),
         "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),
-    }
+        "kept": _MOST_KEPT, "contraction": repr(_CONTRACTION),
+        "step_slope": template(f"slope_{how.method}.c"),
+    } | names | _collocation(COLLOCATIONS[how.method])
     rate = _filled("algebraic", values) if model.guess else template("rate.c")
-    return [_filled("equations", values), rate, _filled("step_implicit", values), *substeps]
+    parts = "equations", "stages", "stages_kept", "step_implicit"
+    first, *others = (_filled(part, values) for part in parts)
+    return [first, rate, *others, *substeps]
+
+
+def _collocation(method: Collocation) -> dict[str, object]:
+    """The coefficients of an implicit method in C, and the eigenvectors of the inverse of A."""
+    count, inverse = len(method.A), np.linalg.inv(method.A)
+    eigenvalues, vectors = np.linalg.eig(inverse)
+    real = int(np.argmin(np.abs(eigenvalues.imag)))
+    columns, pair = [vectors[:, real].real], 0.0j
+    if count > 1:
+        one = int(np.argmax(eigenvalues.imag))
+        pair = eigenvalues[one]
+        columns += [vectors[:, one].real, -vectors[:, one].imag]
+    modes = np.column_stack(columns)
+
+    def matrix(one: NDArray[np.float64]) -> str:
+        return ", ".join(f"{{{', '.join(map(repr, row))}}}" for row in one.tolist())
+
+    first, shift = float(eigenvalues[real].real), pair - float(eigenvalues[real].real)
+    return {
+        "stages": count, "weights": matrix(method.A), "inverse": matrix(inverse),
+        "ends": ", ".join(map(repr, method.d.tolist())),
+        "from_modes": matrix(modes), "to_modes": matrix(np.linalg.inv(modes)), "real": repr(first),
+        "shift": repr(float(shift.real)), "turning": repr(float(pair.imag)),
+        "square": repr(float(abs(shift) ** 2)),
+    }
 
 
 # Classes of CasADi that have no C code, in words. CasADi itself prints a warning for each call.

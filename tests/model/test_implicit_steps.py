@@ -2,12 +2,14 @@
 
 import pickle
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import qpmhe
+from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import ModelError, OptionError
 from qpmhe.model.discretize import METHODS
 from qpmhe.model.implicit_steps import COLLOCATIONS, ImplicitStep
@@ -141,6 +143,35 @@ def test_units_scale_the_step(unit):
     )
     found = scaled.functions.f(x * scale, NONE) / scale
     np.testing.assert_allclose(found, plain.functions.f(x, NONE), rtol=1e-11)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("method", COLLOCATIONS)
+def test_the_compiled_step_keeps_a_jacobian_and_has_the_same_values(method):
+    """Over states from which one Jacobian does for the step, and others where it does not."""
+    x = ca.SX.sym("x", 3)
+    slow, fast, back = 0.04 * x[0], 3e7 * x[1] ** 2, 1e4 * x[1] * x[2]
+    functions = (
+        ca.Function("rate", [x], [ca.vertcat(back - slow, slow - back - fast, fast)]),
+        ca.Function("h", [x], [x[0]]),
+    )
+    generator = np.random.default_rng(0)
+    states = np.column_stack((
+        generator.uniform(0.5, 1.0, 40), 10.0 ** generator.uniform(-7.0, -3.5, 40),
+        generator.uniform(0.0, 0.5, 40),
+    ))
+    inputs = np.zeros((40, 0))
+    written, python = (
+        qpmhe.from_casadi(*functions, dt=1.0, method=method, compiled=compiled).model()
+        for compiled in (True, False)
+    )
+    # B is a small difference of large flows.
+    np.testing.assert_allclose(
+        written.step(states, inputs), python.step(states, inputs), rtol=5e-12
+    )
+    slopes, expected = (model.linear(states, inputs)[0] for model in (written, python))
+    sizes = np.abs(expected).max(axis=2, keepdims=True)
+    assert (np.abs(slopes - expected) < 1e-9 * sizes).all()
 
 
 def test_steps_of_other_lengths_and_inputs():

@@ -9,7 +9,7 @@ static const real mhe_algebraic_guess[NZ] = {$guess};
  * equations, its Jacobian, Newton's correction of z, and the derivative of z by x. */
 typedef struct {
     real rate[NX], jacobian[NX * NX], step[NZ], slope[NZ * NX];
-    real full[NW * NW], factors[NZ * NZ], inverse[NZ * NZ];
+    real full[NW * NW], factors[NZ * NZ];
     real values[NW];
     int pivot[NZ], side; /* the sign of det(dg/dz), which changes where solutions meet */
 } mhe_reduced;
@@ -18,7 +18,7 @@ typedef struct {
 static void mhe_algebraic_step(const mhe_reduced *r, const real *values, real *step)
 {
     for (int i = 0; i < NZ; i++) step[i] = -values[NX + i];
-    mhe_solve_equations(NZ, r->factors, r->pivot, 1, step);
+    mhe_solve_equations(NZ, r->factors, r->pivot, step);
 }
 
 /* Linearise f at w; whether it is finite and dg/dz regular there. */
@@ -32,14 +32,10 @@ static int mhe_reduce(const real *w, const real *u, mhe_reduced *r)
     for (int i = 0; i < NZ; i++) {
         const real *row = r->full + (NX + i) * NW;
         for (int j = 0; j < NX; j++) r->slope[i * NX + j] = -row[j];
-        for (int j = 0; j < NZ; j++) {
-            r->factors[i * NZ + j] = row[NX + j];
-            r->inverse[i * NZ + j] = i == j;
-        }
+        for (int j = 0; j < NZ; j++) r->factors[j * NZ + i] = row[NX + j];
     }
     if (!mhe_factor_equations(NZ, r->factors, r->pivot)) return 0;
-    mhe_solve_equations(NZ, r->factors, r->pivot, NX, r->slope);
-    mhe_solve_equations(NZ, r->factors, r->pivot, NZ, r->inverse);
+    mhe_solve_columns(NZ, r->factors, r->pivot, NX, r->slope);
     mhe_algebraic_step(r, r->values, r->step);
     r->side = 1;
     for (int i = 0; i < NZ; i++)
@@ -57,26 +53,30 @@ static int mhe_reduce(const real *w, const real *u, mhe_reduced *r)
     return 1;
 }
 
+/* What rounding amounts to in z, from the sizes of x and of z. */
+static void mhe_algebraic_sizes(const mhe_reduced *r, const real *z, const real *sizes, real *out)
+{
+    real inverse[NZ * NZ];
+    for (int i = 0; i < NZ * NZ; i++) inverse[i] = i / NZ == i % NZ;
+    mhe_solve_columns(NZ, r->factors, r->pivot, NZ, inverse);
+    for (int i = 0; i < NZ; i++) out[i] = z[i];
+    for (int j = 0; j < NZ; j++) {
+        const real *row = r->full + (NX + j) * NW;
+        real term = 0;
+        for (int l = 0; l < NX; l++) term += (real)fabs(row[l]) * sizes[l];
+        for (int l = 0; l < NZ; l++) term += (real)fabs(row[NX + l]) * z[l];
+        for (int i = 0; i < NZ; i++) out[i] += (real)fabs(inverse[i * NZ + j]) * term;
+    }
+}
+
 /* The largest share that a correction of z has of what rounding amounts to, from the sizes of x. */
 static real mhe_algebraic_share(const mhe_reduced *r, const real *z, const real *sizes,
                                 const real *step)
 {
-    real terms[NZ], length = 0;
-    for (int i = 0; i < NZ; i++) {
-        const real *row = r->full + (NX + i) * NW;
-        terms[i] = 0;
-        for (int j = 0; j < NX; j++) terms[i] += (real)fabs(row[j]) * sizes[j];
-        for (int j = 0; j < NZ; j++)
-            terms[i] += (real)fabs(row[NX + j]) * (real)fabs(z[j] + step[j]);
-    }
-    for (int i = 0; i < NZ; i++) {
-        real size = (real)fabs(z[i] + step[i]);
-        for (int j = 0; j < NZ; j++) size += (real)fabs(r->inverse[i * NZ + j]) * terms[j];
-        const real share = step[i] != 0 ? (real)fabs(step[i]) / size : 0;
-        if (!isfinite(share)) return NAN;
-        length = mhe_max(share, length);
-    }
-    return length;
+    real moved[NZ], own[NZ];
+    for (int i = 0; i < NZ; i++) moved[i] = (real)fabs(z[i] + step[i]);
+    mhe_algebraic_sizes(r, moved, sizes, own);
+    return mhe_share(NZ, step, own);
 }
 
 /* Let a correction of z, step = (dx, dz), follow that of x. */
@@ -94,19 +94,20 @@ static real mhe_move_algebraic(const mhe_reduced *r, const real *w, const real *
     return mhe_algebraic_share(r, w + NX, sizes, step + NX);
 }
 
-/* The rate at another point by the Jacobian of r, and Newton's correction of z in step = (dx, dz). */
-static void mhe_freeze(const mhe_reduced *r, const mhe_reduced *next, real *rate, real *step)
+/* The rate at another point, from values of f and by the Jacobian of r, and Newton's correction of z
+ * in step = (dx, dz). */
+static void mhe_freeze(const mhe_reduced *r, const real *values, real *rate, real *step)
 {
-    mhe_algebraic_step(r, next->values, step + NX);
+    mhe_algebraic_step(r, values, step + NX);
     for (int i = 0; i < NX; i++) {
-        rate[i] = next->values[i];
+        rate[i] = values[i];
         for (int l = 0; l < NZ; l++) rate[i] += r->full[i * NW + NX + l] * step[NX + l];
     }
 }
 
 /* w = (x, z(x, u)) by Newton steps from the guess, damped so that f is nearly linear along them;
- * whether they converge. */
-static int mhe_complete(const real *x, const real *u, real *w)
+ * whether they converge. `last_r` gets f, linearised before the last correction, unless it is null. */
+static int mhe_complete(const real *x, const real *u, real *w, mhe_reduced *last_r)
 {
     mhe_reduced both[2];
     real trial[NW], sizes[NX], scale[NZ], again[NZ], last = INFINITY;
@@ -141,7 +142,10 @@ static int mhe_complete(const real *x, const real *u, real *w)
         }
         if (!good) return 0;
         for (int i = 0; i < NZ; i++) w[NX + i] = trial[NX + i];
-        if (done) return 1;
+        if (done) {
+            if (last_r) *last_r = *r;
+            return 1;
+        }
         last = length;
         now = !now;
     }
@@ -151,7 +155,7 @@ static int mhe_complete(const real *x, const real *u, real *w)
 static void mhe_h(const real *x, const real *u, real *y)
 {
     real w[NW];
-    if (mhe_complete(x, u, w)) {
+    if (mhe_complete(x, u, w, 0)) {
         mhe_output(w, u, y);
         return;
     }
@@ -163,7 +167,7 @@ static void mhe_h_jacobian(const real *x, const real *u, real *y, real *C)
 {
     mhe_reduced r;
     real w[NW], full[NY * NW];
-    if (!mhe_complete(x, u, w) || !mhe_reduce(w, u, &r)) {
+    if (!mhe_complete(x, u, w, 0) || !mhe_reduce(w, u, &r)) {
         for (int i = 0; i < NY; i++) y[i] = NAN;
         for (int i = 0; i < NY * NX; i++) C[i] = NAN;
         return;

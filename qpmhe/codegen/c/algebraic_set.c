@@ -3,7 +3,7 @@
 
 static int mhe_join_algebraic(const real *joint, const real *u, real *full, real *w)
 {
-    const int found = mhe_complete(joint, u, w);
+    const int found = mhe_complete(joint, u, w, 0);
     for (int j = 0; j < $joint; j++) full[j] = joint[j];
     for (int i = 0; i < NZ; i++) full[$joint + i] = found ? w[NX + i] : NAN;
     return found;

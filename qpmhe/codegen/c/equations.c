@@ -1,5 +1,4 @@
-/* Equations by Newton's method: its end, and LU factors with row pivots. Matrices are stored by
- * rows. */
+/* Equations by Newton's method: its end, and LU factors with row pivots. */
 
 /* Whether rounding stops Newton's method behind corrections of these shares, or it converges so
  * fast that the next correction would be rounding. */
@@ -37,48 +36,79 @@ static real mhe_share(int size, const real *step, const real *sizes)
     return length;
 }
 
-/* The factors of M, in place; whether M is regular. */
+/* The factors of M, stored by columns, in place, with the reciprocals of pivots; whether M is
+ * regular. */
 static int mhe_factor_equations(int size, real *M, int *pivot)
 {
     for (int c = 0; c < size; c++) {
+        real *column = M + c * size;
         int best = c;
         for (int r = c + 1; r < size; r++)
-            if (fabs(M[r * size + c]) > fabs(M[best * size + c])) best = r;
+            if (fabs(column[r]) > fabs(column[best])) best = r;
         pivot[c] = best;
-        if (!(fabs(M[best * size + c]) > 0) || !isfinite(M[best * size + c])) return 0;
+        if (!(fabs(column[best]) > 0) || !isfinite(column[best])) return 0;
         if (best != c)
             for (int j = 0; j < size; j++) {
-                const real held = M[c * size + j];
-                M[c * size + j] = M[best * size + j];
-                M[best * size + j] = held;
+                const real held = M[j * size + c];
+                M[j * size + c] = M[j * size + best];
+                M[j * size + best] = held;
             }
-        for (int r = c + 1; r < size; r++) {
-            const real share = M[r * size + c] /= M[c * size + c];
-            if (share != 0)
-                for (int j = c + 1; j < size; j++) M[r * size + j] -= share * M[c * size + j];
+        const real share = 1 / column[c];
+        column[c] = share;
+        for (int r = c + 1; r < size; r++) column[r] *= share;
+        for (int j = c + 1; j < size; j++) {
+            real *other = M + j * size;
+            const real factor = other[c];
+            if (factor != 0)
+                for (int r = c + 1; r < size; r++) other[r] -= factor * column[r];
         }
     }
     return 1;
 }
 
-/* The solution of M z = z of some columns, with the factors of M, in place. */
-static void mhe_solve_equations(int size, const real *M, const int *pivot, int columns, real *z)
+/* The solution of M z = z, with the factors of M, in place. */
+static void mhe_solve_equations(int size, const real *M, const int *pivot, real *z)
 {
+    for (int c = 0; c < size; c++) {
+        const real held = z[pivot[c]];
+        z[pivot[c]] = z[c];
+        z[c] = held;
+    }
     for (int c = 0; c < size; c++)
-        if (pivot[c] != c)
-            for (int j = 0; j < columns; j++) {
-                const real held = z[c * columns + j];
-                z[c * columns + j] = z[pivot[c] * columns + j];
-                z[pivot[c] * columns + j] = held;
-            }
-    for (int c = 0; c < size; c++)
-        for (int r = c + 1; r < size; r++)
-            for (int j = 0; j < columns; j++)
-                z[r * columns + j] -= M[r * size + c] * z[c * columns + j];
+        for (int r = c + 1; r < size; r++) z[r] -= z[c] * M[c * size + r];
     for (int c = size - 1; c >= 0; c--) {
-        for (int j = 0; j < columns; j++) z[c * columns + j] /= M[c * size + c];
-        for (int r = 0; r < c; r++)
-            for (int j = 0; j < columns; j++)
-                z[r * columns + j] -= M[r * size + c] * z[c * columns + j];
+        const real found = z[c] *= M[c * size + c];
+        for (int r = 0; r < c; r++) z[r] -= found * M[c * size + r];
+    }
+}
+
+/* The same for some columns z, stored by rows. */
+static void mhe_solve_columns(int size, const real *M, const int *pivot, int columns, real *z)
+{
+    for (int c = 0; c < size; c++) {
+        real *row = z + c * columns, *other = z + pivot[c] * columns;
+        if (pivot[c] == c) continue;
+        for (int j = 0; j < columns; j++) {
+            const real held = row[j];
+            row[j] = other[j];
+            other[j] = held;
+        }
+    }
+    for (int c = 0; c < size; c++) {
+        const real *row = z + c * columns;
+        for (int r = c + 1; r < size; r++) {
+            const real share = M[c * size + r];
+            if (share != 0)
+                for (int j = 0; j < columns; j++) z[r * columns + j] -= share * row[j];
+        }
+    }
+    for (int c = size - 1; c >= 0; c--) {
+        real *row = z + c * columns;
+        for (int j = 0; j < columns; j++) row[j] *= M[c * size + c];
+        for (int r = 0; r < c; r++) {
+            const real share = M[c * size + r];
+            if (share != 0)
+                for (int j = 0; j < columns; j++) z[r * columns + j] -= share * row[j];
+        }
     }
 }

@@ -1,174 +1,19 @@
-/* An implicit step of a rate: the stages Z_i = h sum_j A_ij f(x + Z_j, z_j), with algebraic states
- * z_i where there are any, by Newton's method from Z = 0 and z at x, to rounding, with whole steps or,
- * where these fail, damped ones, and next = x + sum_i d_i Z_i. The derivative is that of the implicit function theorem at the converged
- * stages. qpmhe/model/implicit_steps.py says the same in Python. A stage is Z_i, and z_i below. */
+/* An implicit step of a rate: next = x + sum_i d_i Z_i. The derivative is that of the implicit
+ * function theorem at the converged stages. qpmhe/model/implicit_steps.py says the same in Python. */
 
-#define MHE_STAGES $stages
-#define MHE_UNKNOWNS (MHE_STAGES * NX)
-static const real mhe_stage_weights[MHE_STAGES][MHE_STAGES] = {$weights};
 static const real mhe_step_weights[MHE_STAGES] = {$ends};
 
-static void mhe_stage_state(const real *x, const real *stage, real *at)
-{
-    for (int j = 0; j < NX; j++) at[j] = x[j] + stage[j];
-    for (int j = NX; j < NW; j++) at[j] = stage[j];
-}
-
-/* Rates and Jacobians at all stages W; whether f is finite there, and dg/dz regular. */
-static int mhe_stage_rates(const real *x, const real *u, const real *W, mhe_reduced *r)
-{
-    real at[NW];
-    for (int i = 0; i < MHE_STAGES; i++) {
-        mhe_stage_state(x, W + i * NW, at);
-        if (!mhe_reduce(at, u, r + i)) return 0;
-    }
-    return 1;
-}
-
-/* The negative residual h A f(x + Z) - Z of the linearised rates. */
-static void mhe_stage_residual(const real *rates, real h, const real *W, real *residual)
-{
-    for (int i = 0; i < MHE_STAGES; i++)
-        for (int a = 0; a < NX; a++) {
-            real sum = 0;
-            for (int j = 0; j < MHE_STAGES; j++) sum += mhe_stage_weights[i][j] * rates[j * NX + a];
-            residual[i * NX + a] = -(W[i * NW + a] - h * sum);
-        }
-}
-
-/* LU factors of M = I - h A_ij J_j; whether M is regular. */
-static int mhe_stage_factor(real h, const mhe_reduced *r, real *M, int *pivot)
-{
-    for (int i = 0; i < MHE_STAGES; i++)
-        for (int a = 0; a < NX; a++)
-            for (int j = 0; j < MHE_STAGES; j++)
-                for (int b = 0; b < NX; b++)
-                    M[(i * NX + a) * MHE_UNKNOWNS + j * NX + b] =
-                        (i == j && a == b) -
-                        h * mhe_stage_weights[i][j] * r[j].jacobian[a * NX + b];
-    return mhe_factor_equations(MHE_UNKNOWNS, M, pivot);
-}
-
-/* What rounding of the states and of their flows amounts to in each equation. */
-static void mhe_stage_sizes(const real *x, real h, const real *W, const real *step,
-                            const mhe_reduced *r, real *sizes)
-{
-    real states[NX];
-    for (int a = 0; a < NX; a++) {
-        real most = 0;
-        for (int i = 0; i < MHE_STAGES; i++)
-            most = mhe_max((real)fabs(W[i * NW + a] + step[i * NX + a]), most);
-        states[a] = (real)fabs(x[a]) + most;
-    }
-    for (int a = 0; a < NX; a++) {
-        sizes[a] = states[a];
-        for (int b = 0; b < NX; b++) {
-            real most = 0;
-            for (int i = 0; i < MHE_STAGES; i++)
-                most = mhe_max((real)fabs(r[i].jacobian[a * NX + b]), most);
-            sizes[a] += h * most * states[b];
-        }
-    }
-}
-
-/* The corrections of the stages W, from those of Z; the largest share of one. */
-static real mhe_stage_moves(const mhe_reduced *r, const real *W, const real *sizes,
-                            const real *step, real *moves)
-{
-    real length = 0;
-    (void)r; (void)W;
-    for (int i = 0; i < MHE_STAGES; i++) {
-        for (int a = 0; a < NX; a++) {
-            const real moved = (real)fabs(step[i * NX + a]);
-            if (!isfinite(moved)) return NAN;
-            if (moved > 0) length = mhe_max(moved / sizes[a], length);
-            moves[i * NW + a] = step[i * NX + a];
-        }
-        const real share = mhe_move_algebraic(r + i, W + i * NW, sizes, moves + i * NW);
-        if (!isfinite(share)) return NAN;
-        length = mhe_max(share, length);
-    }
-    return length;
-}
-
-/* How far the correction behind a step of this factor is from that of linear equations, by the
- * Jacobians r and the factors M at its start: a share of the sizes in scale. */
-static real mhe_stage_curved(const mhe_reduced *r, const mhe_reduced *next, real h, const real *M,
-                             const int *pivot, const real *trial, const real *moves, real factor,
-                             const real *scale)
-{
-    real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], again[MHE_STAGES * NW];
-    for (int i = 0; i < MHE_STAGES; i++) mhe_freeze(r + i, next + i, rates + i * NX, again + i * NW);
-    mhe_stage_residual(rates, h, trial, step);
-    mhe_solve_equations(MHE_UNKNOWNS, M, pivot, 1, step);
-    for (int i = 0; i < MHE_STAGES; i++) {
-        for (int a = 0; a < NX; a++) again[i * NW + a] = step[i * NX + a];
-        mhe_follow(r + i, again + i * NW);
-    }
-    for (int i = 0; i < MHE_STAGES * NW; i++) again[i] -= (1 - factor) * moves[i];
-    return mhe_share(MHE_STAGES * NW, again, scale);
-}
-
-/* The stages W of a step from w = (x, z), by whole Newton steps or by damped ones, along which f is
- * nearly linear; whether they converge. */
-static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, real *W)
-{
-    mhe_reduced both[2][MHE_STAGES];
-    real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], moves[MHE_STAGES * NW], trial[MHE_STAGES * NW];
-    real M[MHE_UNKNOWNS * MHE_UNKNOWNS], scale[MHE_STAGES * NW], sizes[NX], last = INFINITY;
-    int pivot[MHE_UNKNOWNS], now = 0;
-    for (int i = 0; i < MHE_STAGES; i++)
-        for (int j = 0; j < NW; j++) W[i * NW + j] = j < NX ? 0 : w[j];
-    if (!mhe_stage_rates(w, u, W, both[0])) return 0;
-    const int side = both[0][0].side;
-    for (int iteration = 0; iteration < $iterations; iteration++) {
-        const mhe_reduced *r = both[now];
-        mhe_reduced *next = both[!now];
-        if (!mhe_stage_factor(h, r, M, pivot)) return 0;
-        for (int i = 0; i < MHE_UNKNOWNS; i++) rates[i] = r[i / NX].rate[i % NX];
-        mhe_stage_residual(rates, h, W, step);
-        mhe_solve_equations(MHE_UNKNOWNS, M, pivot, 1, step);
-        mhe_stage_sizes(w, h, W, step, r, sizes);
-        const real length = mhe_stage_moves(r, W, sizes, step, moves);
-        if (!isfinite(length)) return 0;
-        const int done = mhe_converged(length, last);
-        real factor = 1, before = NAN;
-        if (damped) {
-            for (int i = 0; i < MHE_STAGES * NW; i++)
-                scale[i] =
-                    (real)(fabs(W[i]) + fabs(moves[i]) + (i % NW < NX ? fabs(w[i % NW]) : 0));
-            before = mhe_share(MHE_STAGES * NW, moves, scale);
-        }
-        int good = 0;
-        for (int halving = 0; halving < $halvings && !good; halving++) {
-            real curved = NAN;
-            for (int i = 0; i < MHE_STAGES * NW; i++) trial[i] = W[i] + factor * moves[i];
-            good = done || mhe_stage_rates(w, u, trial, next);
-            if (good && damped && !done) {
-                curved = mhe_stage_curved(r, next, h, M, pivot, trial, moves, factor, scale);
-                good = mhe_straight(curved, factor, before, length);
-            }
-            if (!good) factor = mhe_shorter(curved, factor, before);
-        }
-        if (!good) return 0;
-        for (int i = 0; i < MHE_STAGES * NW; i++) W[i] = trial[i];
-        if (done) {
-            /* Another solution for z is no stage of this step. */
-            for (int i = 0; i < MHE_STAGES; i++) good = good && r[i].side == side;
-            return good;
-        }
-        last = length;
-        now = !now;
-    }
-    return 0;
-}
-
-/* The stages W of a step; whether one of both iterations has converged. */
+/* The stages W of a step; whether one of the iterations has converged. */
 static int mhe_solve_stages(const real *x, const real *u, real h, real *W)
 {
+    mhe_reduced r;
     real w[NW];
-    return mhe_complete(x, u, w) &&
-           (mhe_iterate_stages(w, u, h, 0, W) || mhe_iterate_stages(w, u, h, 1, W));
+    int found = mhe_complete(x, u, w, &r);
+    if (!found || mhe_keep_jacobian(w, u, h, &r, W)) return found;
+    found = 0;
+    for (int damped = 0; damped < 2 && !found; damped++)
+        found = mhe_iterate_stages(w, u, h, damped, W);
+    return found;
 }
 
 static void mhe_step_end(const real *x, const real *W, real *next)
@@ -189,34 +34,16 @@ static void $value(const real *x, const real *u, real dt, real *next)
     for (int a = 0; a < NX; a++) next[a] = NAN;
 }
 
+$step_slope
 /* f and its Jacobian with respect to x, by rows. */
 static void $slope(const real *x, const real *u, real dt, real *next, real *A)
 {
-    real W[MHE_STAGES * NW], M[MHE_UNKNOWNS * MHE_UNKNOWNS], dZ[MHE_UNKNOWNS * NX];
+    real W[MHE_STAGE_VALUES];
     mhe_reduced r[MHE_STAGES];
-    int pivot[MHE_UNKNOWNS];
-    const int regular = mhe_solve_stages(x, u, dt, W) && mhe_stage_rates(x, u, W, r) &&
-                        mhe_stage_factor(dt, r, M, pivot);
-    if (!regular) {
-        for (int a = 0; a < NX; a++) next[a] = NAN;
-        for (int i = 0; i < NX * NX; i++) A[i] = NAN;
+    if (mhe_solve_stages(x, u, dt, W) && mhe_stage_rates(x, u, W, r) && mhe_step_slope(dt, r, A)) {
+        mhe_step_end(x, W, next);
         return;
     }
-    mhe_step_end(x, W, next);
-    for (int i = 0; i < MHE_STAGES; i++)
-        for (int a = 0; a < NX; a++)
-            for (int b = 0; b < NX; b++) {
-                real sum = 0;
-                for (int j = 0; j < MHE_STAGES; j++)
-                    sum += mhe_stage_weights[i][j] * r[j].jacobian[a * NX + b];
-                dZ[(i * NX + a) * NX + b] = dt * sum;
-            }
-    mhe_solve_equations(MHE_UNKNOWNS, M, pivot, NX, dZ);
-    for (int a = 0; a < NX; a++)
-        for (int b = 0; b < NX; b++) {
-            real sum = a == b;
-            for (int i = 0; i < MHE_STAGES; i++)
-                sum += mhe_step_weights[i] * dZ[(i * NX + a) * NX + b];
-            A[a * NX + b] = sum;
-        }
+    for (int a = 0; a < NX; a++) next[a] = NAN;
+    for (int i = 0; i < NX * NX; i++) A[i] = NAN;
 }
