@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-_LOCK = threading.Lock()
+_LOCK = threading.RLock()  # the stream of a thread that holds it may be one of these
 _QUIET: dict[int, int] = {}  # how many evaluations go on in each thread, within each other
-_KEPT: list[Any] = []  # the stream in whose place `_Stream` is
 
 
 class _Stream:
@@ -20,13 +19,28 @@ class _Stream:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        if self._stream is None or threading.get_ident() in _QUIET:
+        if threading.get_ident() in _QUIET:
+            return len(text)
+        _leave()
+        if self._stream is None:
             return len(text)
         written: int = self._stream.write(text)
         return written
 
     def __getattr__(self, name: str) -> Any:
+        _leave()
         return getattr(self._stream, name)
+
+
+def _leave() -> None:
+    """Put the stream itself back, if no evaluation goes on.
+
+    One that ends while another thread has redirected ``sys.stderr`` cannot: what that thread puts
+    back does so when it is used.
+    """
+    with _LOCK:
+        while not _QUIET and isinstance(sys.stderr, _Stream):
+            sys.stderr = sys.stderr._stream
 
 
 @contextmanager
@@ -34,8 +48,7 @@ def quiet() -> Iterator[None]:
     """Drop what this thread writes to ``sys.stderr``, where CasADi reports on failures."""
     own = threading.get_ident()
     with _LOCK:
-        if not _QUIET:
-            _KEPT.append(sys.stderr)
+        if not isinstance(sys.stderr, _Stream):
             sys.stderr = _Stream(sys.stderr)
         _QUIET[own] = _QUIET.get(own, 0) + 1
     try:
@@ -45,7 +58,4 @@ def quiet() -> Iterator[None]:
             _QUIET[own] -= 1
             if not _QUIET[own]:
                 del _QUIET[own]
-            if not _QUIET:
-                kept = _KEPT.pop()
-                if isinstance(sys.stderr, _Stream):  # nobody else has replaced it since
-                    sys.stderr = kept
+            _leave()

@@ -1,5 +1,7 @@
 """What only CasADi's models have: ways of writing, matrix functions, code, failed evaluations."""
 
+import contextlib
+import io
 import math
 import pickle
 import sys
@@ -266,6 +268,28 @@ def test_other_threads_print_while_one_is_quiet(capsys):
     assert sys.stderr is before
     print("later", file=sys.stderr)
     assert capsys.readouterr() == ("", "kept\nlater\n")
+
+
+def test_a_thread_that_redirects_across_an_evaluation_finds_the_stream_itself(capsys):
+    before, theirs, mine = sys.stderr, io.StringIO(), io.StringIO()
+    redirected = contextlib.redirect_stderr(theirs)
+    with quiet():
+        redirected.__enter__()  # as a thread that is not quiet does
+        with quiet():  # of the stream that has come instead, too
+            print("lost", file=sys.stderr)
+    assert sys.stderr is theirs
+    redirected.__exit__(None, None, None)
+    assert not sys.stderr.closed  # any use puts the stream itself back
+    assert sys.stderr is before
+    with quiet():
+        redirected.__enter__()
+    redirected.__exit__(None, None, None)
+    with quiet():  # as does the end of another evaluation
+        print("lost", file=sys.stderr)
+    assert sys.stderr is before
+    with contextlib.redirect_stderr(mine):
+        print("kept", file=sys.stderr)
+    assert (theirs.getvalue(), mine.getvalue(), capsys.readouterr().err) == ("", "kept\n", "")
 
 
 @pytest.mark.parametrize("timed", [False, True])
