@@ -162,18 +162,18 @@ _KNOWN = {
 
 
 def augmented(system: System, change: Augmentation, **options: Unpack[SystemOptions]) -> System:
-    """The augmented system, made by the adapter that made the system, with exact derivatives."""
+    """The augmented system, made by the adapter that made the system, with exact derivatives.
+
+    A set of algebraic states is the only one of its extensions that it has, too.
+    """
     unknown = [
         name for name in SystemOptions.__annotations__
         if name not in _KNOWN and getattr(system, name) is not None
     ]
-    lost = [*system.extensions, *unknown]
-    if lost:
-        raise InvalidInputError(
-            f"the system has {' and '.join(lost)}, which "
-            "an augmented model does not inherit; leave them out, or write the augmented model as "
-            "a System with its own functions."
-        )
+    constraints, extensions = system.constraints, system.extensions
+    if constraints is not None and constraints.are_algebraic:
+        extensions = extensions[:-1]
+    check_inherits(*extensions, *unknown)
     if system.origin.make_augmented is not None:
         found = system.origin.make_augmented(change, options)
     else:
@@ -184,6 +184,16 @@ def augmented(system: System, change: Augmentation, **options: Unpack[SystemOpti
             n=change.n, p=system.p, m=change.m, **given, **options,
         )
     return found.with_origin(held=system.held)
+
+
+def check_inherits(*lost: str) -> None:
+    """Raise an error that names what an augmented model does not have, if there is any."""
+    if lost:
+        raise InvalidInputError(
+            f"the system has {' and '.join(lost)}, which "
+            "an augmented model does not inherit; leave them out, or write the augmented model as "
+            "a System with its own functions."
+        )
 
 
 def chosen(name: str, given: ArrayLike | None, size: int, kind: str) -> Index:

@@ -397,6 +397,11 @@ class ConstraintFunctions:
         return other
 
     @property
+    def are_algebraic(self) -> bool:
+        """Whether all of them are sets of algebraic states."""
+        return all(one.algebraic is not None for one in self._bound)
+
+    @property
     def is_traced(self) -> bool:
         """Whether some are evaluated by expressions that may become wrong."""
         return any(one.trace is not None for one in self._bound)

@@ -190,7 +190,8 @@ def made_from_dae(
 
         return cls.from_dae(
             *(moved(functions[name]) for name in given), dt=dt, method=how.method,
-            steps=how.steps, n=change.n, k=k, p=p, m=change.m, algebraic_guess=start, **others,
+            steps=how.steps, n=change.n, k=k, p=p, m=change.m, algebraic_guess=start,
+            algebraic_set=algebraic_set, **others,
         )
 
     checked_set("algebraic_set", algebraic_set, k, ", the number of algebraic states")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InvalidInputError
-from .augmentation import Augmentation, augmented, chosen, inherited
+from .augmentation import Augmentation, augmented, check_inherits, chosen, inherited
 from .functions import Trusted
 from .model import Origin
 from .system import System, checked_system
@@ -71,6 +71,7 @@ def noisy_inputs(system: System, inputs: ArrayLike | None = None) -> System:
     noisy = chosen("inputs", inputs, m, "input")
     if noisy.size == 0:
         raise InvalidInputError("inputs is empty; expected at least one input, or leave it out.")
+    check_inherits(*system.extensions)
     options = inherited(system, noisy.size)
     held = augmented(system, Augmentation(n, m, np.zeros(0), noisy), **options)
     recipe = noisy_inputs, {"system": system, "inputs": noisy}

@@ -367,6 +367,47 @@ def test_parameters_go_through_the_step():
     np.testing.assert_allclose(slope[:2, 2], (moved[0] - moved[1]) / 2e-6, rtol=1e-7, atol=1e-12)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_set_of_algebraic_states_goes_into_augmented_models(engine):
+    """The load as a parameter: the set bounds z of the augmented state, soft or hard."""
+    def loaded(x, z, u):
+        return balance(x, z) - u[..., 1:] * np.array([0.1, 0.0])
+
+    box = Box([-INF, 0.99], [0.14, INF]).soften(linear=30.0)
+    plain, bounded = (
+        System.from_dae(
+            lambda x, z, u: swing(x, z, u), loaded, lambda x, z: z, dt=0.1, **SIZES | {"m": 2},
+            algebraic_guess=[0.0, 1.0], **options,
+        ) for options in ({}, {"algebraic_set": box})
+    )
+    free, held = (
+        qpmhe.augment_parameters(one, nominal=[0.5], drifting=True) for one in (plain, bounded)
+    )
+    assert held.extensions == ("nonlinear constraints",)
+    state, row = np.append(X, 0.7), held.constraints._bound[0]
+    z = plain.algebraic_states(X, np.append(U, 0.7))
+    np.testing.assert_allclose(row.function(state, U), [z[0] - 0.14, 0.99 - z[1]], atol=1e-13)
+    moved = [row.function(state + d, U) for d in np.diag([0, 0, 1e-6])[2] * [[1], [-1]]]
+    slope = row.jacobian(state, U)
+    np.testing.assert_allclose(slope[:, 2], (moved[0] - moved[1]) / 2e-6, rtol=1e-6)
+    covariances = {"disturbance": 1e-4 * np.eye(3), "noise": 1e-3 * np.eye(2)}
+    observer = ExtendedKalman(prior=0.1 * np.eye(3), **covariances)
+    cost = QuadraticCost.from_covariances(**covariances)
+    options = {"horizon": 3, "initial_state": [0.3, 0.0, 0.5], "max_qps": 3}
+    Y, inputs = np.tile([0.17, 0.98], (6, 1)), np.full((6, 1), 0.8)
+    without, reference, found = (
+        MovingHorizonEstimator(system, observer, cost, engine=name, **options).run(Y, inputs)
+        for system, name in ((free, "python"), (held, "python"), (held, engine))
+    )
+    np.testing.assert_allclose(found.states, reference.states, rtol=0, atol=1e-9)
+    assert np.abs(found.states - without.states).max() > 1e-3
+    assert qpmhe.augment_noise(
+        bounded, [0], correlation=0.5, deviation=0.1
+    ).system.extensions == ("nonlinear constraints",)
+    with pytest.raises(qpmhe.errors.InvalidInputError, match="nonlinear constraints, which an"):
+        qpmhe.noisy_inputs(bounded)
+
+
 def test_an_implicit_equation_is_the_dae_that_it_contains():
     """The swing model with its flow as it is written down, inertia times acceleration."""
     def residual(xdot, x, z, u):
