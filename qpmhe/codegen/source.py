@@ -275,7 +275,7 @@ def _collocation(method: Collocation) -> dict[str, object]:
         columns += [vectors[:, one].real, -vectors[:, one].imag]
     modes = np.column_stack(columns)
 
-    def matrix(one: NDArray[np.float64]) -> str:
+    def matrix(one: NDArray[Any]) -> str:
         return ", ".join(f"{{{', '.join(map(repr, row))}}}" for row in one.tolist())
 
     first, shift = float(eigenvalues[real].real), pair - float(eigenvalues[real].real)
