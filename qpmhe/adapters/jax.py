@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import dimension, need, positive
+from ..errors import OptionError
 from ..model.augmentation import Augmentation
-from ..model.discretize import Discretization
+from ..model.discretize import AUTO, EXPLICIT, Discretization
 from ..model.functions import Trusted, takes_input
 from ..model.model import Origin
+from ..model.ode import checked_method, made_from_ode
 from ..model.points import FEW, points
 from ..model.system import System
 from ..model.system_arguments import SystemOptions, checked_set, timed_options
@@ -26,6 +28,8 @@ Function = Callable[..., Any]
 # Batches are filled up to a power of two, this one at least: few programs serve all lengths.
 _SMALLEST_BATCH = 16
 _DOUBLE = 8  # bytes
+# Steps that JAX computes.
+_STEPS = tuple(Discretization(method) for method in EXPLICIT)
 _NOTHING: Array = np.empty(0)
 
 
@@ -38,6 +42,8 @@ def from_jax(
     m: int = 0,
     dt: float | None = None,
     method: str = "rk4",
+    steps: int = 1,
+    tolerance: float | None = None,
     **options: Unpack[SystemOptions],
 ) -> System:
     r"""Make a system from functions of one state in ``jax.numpy``, with exact Jacobians.
@@ -60,8 +66,12 @@ def from_jax(
         Number of known inputs; 0 for none.
     dt : float, optional
         Sampling time, in the time unit of the rate; left out, f is the discrete-time map.
-    method : {"rk4", "euler"}
-        With dt: Runge-Kutta of order 4, or one explicit Euler step.
+    method : {"rk4", "euler", "radau", "midpoint", "auto"}
+        With dt: how the ODE is discretised, see `qpmhe.System.from_ode`.
+    steps : int
+        With dt: number of substeps in each sample; left out with ``"auto"``.
+    tolerance : float, optional
+        With ``"auto"``, as for `qpmhe.System.from_ode`.
     **options
         Sets and scales, as for `qpmhe.System`.
 
@@ -79,7 +89,7 @@ def from_jax(
         If JAX cannot trace a function, or the function returns the wrong shape or less than double
         precision, or indexes out of range at one of a few points in the set X.
     OptionError
-        If a size or dt is out of range, or the method unknown.
+        If a size or dt is out of range, the method unknown, or ``"auto"`` without dt.
     SetError
         If a set has the wrong dimension.
 
@@ -104,6 +114,10 @@ def from_jax(
     ``jax.config.update("jax_cpu_enable_async_dispatch", False)``, before JAX computes anything in a
     process, avoids the thread switch.
 
+    JAX computes a single explicit step. Implicit steps, and several substeps, take the rate and its
+    Jacobian from JAX, and are computed in NumPy or, where the functions are known as expressions,
+    in CasADi or C.
+
     Examples
     --------
     >>> import jax.numpy as jnp
@@ -116,7 +130,26 @@ def from_jax(
     """
     n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
     length = None if dt is None else positive("dt", dt)
+    how, allowed = checked_method(method, steps, tolerance)
+    if length is None and (method == AUTO or how.is_implicit):
+        raise OptionError(
+            f"method is {method!r}, but dt is missing, so that f is the step; pass dt and the rate."
+        )
     probes = points(FEW, n, m, checked_set("states", options.get("states"), n))
+    arguments = {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt}
+    if length is not None and how not in _STEPS:
+        programs = Programs(f, h, n, p, m, _STEPS[0].method, False, probes)
+        rate, output, slope, slope_of_h = _Model(programs, None).parts
+        made = made_from_ode(
+            System, rate, output, dt=length, n=n, p=p, m=m, how=how, rate_jacobian=slope,
+            h_jacobian=slope_of_h, options=options, tolerance=allowed, jacobians="jax",
+            sources={name: programs.as_numpy(name) for name in ("f", "h")},
+        )
+        taken = {"method": made.method, "steps": made.steps}
+        return made.with_origin(
+            make_augmented=partial(_augmented, f, h, p, m, dt, taken),
+            recipe=(from_jax, arguments | taken | options),
+        )
     programs = Programs(f, h, n, p, m, method, length is not None, probes)
 
     def timed(_: System) -> System:
@@ -124,20 +157,17 @@ def from_jax(
         return _assembled(_Model(programs, None), m + 1, own, timed_options(options))
 
     origin = Origin(
-        dt=length, how=None if length is None else Discretization(method),
+        dt=length, how=None if length is None else how,
         sources={name: programs.as_numpy(name) for name in ("f", "h")},
         make_timed=None if length is None else timed,
-        make_augmented=partial(_augmented, f, h, p, m, dt, method),
-        recipe=(
-            from_jax,
-            {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt, "method": method, **options},
-        ),
+        make_augmented=partial(_augmented, f, h, p, m, dt, {"method": method}),
+        recipe=(from_jax, {**arguments, "method": method, **options}),
     )
     return _assembled(_Model(programs, length), m, origin, options)
 
 
 def _assembled(model: _Model, m: int, origin: Origin, options: SystemOptions) -> System:
-    f, h, f_jacobian, h_jacobian = (Trusted(partial(model.evaluate, part)) for part in range(4))
+    f, h, f_jacobian, h_jacobian = model.parts
     remedy = "It is JAX's: look for stop_gradient or a custom derivative within {name}."
     return System.made(
         f, h, replace(origin, kernel=model, jacobians="jax", remedy=remedy), n=model.n, p=model.p,
@@ -146,7 +176,7 @@ def _assembled(model: _Model, m: int, origin: Origin, options: SystemOptions) ->
 
 
 def _augmented(
-    f: Function, h: Function, p: int, m: int, dt: float | None, method: str,
+    f: Function, h: Function, p: int, m: int, dt: float | None, how: dict[str, Any],
     change: Augmentation, options: SystemOptions,
 ) -> System:
     jnp: Any = need("jax.numpy", "from_jax", "jax")
@@ -161,7 +191,7 @@ def _augmented(
     return from_jax(
         change.of_one_state(of_both("f", f), join, 1.0 if dt is None else 0.0),
         change.of_one_state(of_both("h", h), join),
-        n=change.n, p=p, m=change.m, dt=dt, method=method, **options,
+        n=change.n, p=p, m=change.m, dt=dt, **how, **options,
     )
 
 
@@ -175,6 +205,8 @@ class _Model:
         self._splits = programs.timed and length is None
         # Of each kind the last argument with its result, in one object: threads may share it.
         self._last: list[tuple[bytes, list[Array]]] = [(b"", [])] * 4
+        #: f, h, A and C as functions of a system.
+        self.parts = tuple(Trusted(partial(self.evaluate, part)) for part in range(4))
 
     def evaluate(self, part: int, x: Array, u: Array = _NOTHING) -> Array:
         """The part at x (n,) and u (m,), or over x (B, n) and u (B, m)."""

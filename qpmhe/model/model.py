@@ -179,7 +179,8 @@ class Origin:
     choice : Choice, optional
         Which discretisations were tried, where the method was to be chosen.
     sources : dict, optional
-        Functions of x and u, named ``f`` and ``h``, which are traced in the place of f and h.
+        Functions of x and u, named ``f`` and ``h``, which are traced in the place of f, or of the
+        rate, and h.
     kernel : ModelKernel, optional
         Evaluates f, h and their Jacobians in one call, where f and h are expressions.
     jacobians : str

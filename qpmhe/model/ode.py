@@ -50,9 +50,9 @@ def made_from_ode(
     cls: type[System], rate: Function | Trusted, h: Function | Trusted, *, dt: float, n: int,
     p: int, m: int, how: Discretization, rate_jacobian: Function | Trusted | None,
     h_jacobian: Function | Trusted | None, options: SystemOptions, tolerance: float = TOLERANCE,
-    jacobians: str = "given",
+    jacobians: str = "given", sources: dict[str, Function] | None = None,
 ) -> System:
-    """The system that `System.from_ode` describes; for ``jacobians`` see `Origin`."""
+    """The system that `System.from_ode` describes; for the last two see `Origin`."""
     n, m = dimension("n", n, 1), dimension("m", m, 0)
     states = checked_set("states", options.get("states"), n)
     probes = points(FEW, n, m, states)
@@ -110,7 +110,7 @@ def made_from_ode(
         Trusted(partial(step, length)), h,
         Origin(
             dt=length, how=how, rate=batched, rate_jacobian=compared, choice=chosen,
-            jacobians=jacobians,
+            jacobians=jacobians, sources=sources,
             make_timed=timed, make_augmented=augmented,
             recipe=(cls.from_ode, {
                 "rate": rate, "h": h, "dt": dt, "n": n, "p": p, "m": m, "method": how.method,

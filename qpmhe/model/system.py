@@ -208,7 +208,7 @@ class System(ContinuousTime):
             own["tracing"] = ModelTrace(
                 origin.rate or functions.f, functions.h, n, p, m, self.states,
                 origin.dt if known else None, origin.how if known else None, origin.sources,
-                origin.equations,
+                known and origin.rate is None, origin.equations,
             )
         own["evaluation"] = Model(self, functions, functions, scales)
         own["_models"] = ModelCache()

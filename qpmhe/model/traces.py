@@ -87,8 +87,9 @@ class ModelTrace:
         Where f is a rate: the step length, and the discretisation.
     sources : dict, optional
         Functions of x and u, named ``f`` and ``h``, to be traced in place of those above, which
-        they are to agree with: f then is the step where there is a step length, and its source
-        the rate.
+        they are to agree with.
+    is_step : bool
+        Whether f is a step where there is a step length, and its source the rate.
     equations : Equations, optional
         The functions of a DAE, which then are traced as functions of w = (x, z), f with the
         algebraic residuals below the rate.
@@ -98,9 +99,9 @@ class ModelTrace:
         self, f: BatchedFunction, h: BatchedFunction, n: int, p: int, m: int,
         states: ConvexSet | None, dt: float | None = None, how: Discretization | None = None,
         sources: dict[str, Callable[[Array, Array], Any]] | None = None,
-        equations: Equations | None = None,
+        is_step: bool = False, equations: Equations | None = None,
     ) -> None:
-        self._equations, self._width = equations, n
+        self._equations, self._width, self._is_step = equations, n, is_step
         if equations is not None:
             f, h, self._width = equations.joint, equations.output, equations.joint.shape[0]
         self._sources = sources
@@ -174,7 +175,7 @@ class ModelTrace:
 
     def _difference(self, name: str, found: Traced, where: Points) -> str:
         """Where a trace differs from its function; blank where it does not."""
-        if name == "f" and self._sources is not None:
+        if name == "f" and self._is_step:
             # As the step in C takes it: a rate by the method, a map as it is.
             ca, n = import_casadi(), self._n
             x, u = ca.SX.sym("x", n), ca.SX.sym("u", self._m)

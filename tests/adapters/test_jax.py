@@ -7,7 +7,7 @@ import pytest
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, SetError
-from tests.adapters.twins import NONE, same
+from tests.adapters.twins import FUNCTIONS, NONE, by_jax, by_numpy, points, same
 
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
@@ -259,3 +259,66 @@ def test_a_jax_model_without_an_expression_says_why(name):
     assert system.symbolic is None
     assert word in system.no_symbolic
     assert word in system.explain()
+
+
+# Implicit steps, and substeps
+
+
+@pytest.mark.parametrize("options", [
+    {"method": "radau"}, {"method": "midpoint", "steps": 2}, {"method": "rk4", "steps": 3},
+    {"method": "auto", "tolerance": 1e-4},
+], ids=lambda one: one["method"])
+def test_steps_that_jax_does_not_compute_are_those_of_the_rate(options):
+    mine, theirs = by_jax(dt=0.1, **options), by_numpy(dt=0.1, **options)
+    assert (mine.method, mine.steps) == (theirs.method, theirs.steps)
+    assert mine.symbolic is not None, mine.no_symbolic
+    xs, us = points(3)
+    same(mine, theirs.model().functions, xs, us, 1e-7)
+    for one, other in ((mine, theirs), (mine.timed, theirs.timed)):
+        inputs = us if one is mine else np.column_stack((us, [0.05, 0.1, 0.2]))
+        exact = other.model().functions
+        for name in FUNCTIONS:
+            np.testing.assert_allclose(
+                getattr(one.model().functions, name).batch(xs, inputs),
+                getattr(exact, name).batch(xs, inputs), rtol=1e-9, atol=1e-11,
+            )
+
+
+def test_an_implicit_step_of_a_rate_without_an_expression():
+    """Values and derivatives by JAX's programs alone, through an estimator and a copy."""
+    def rate(x):
+        top = jax.lax.while_loop(lambda c: c[0] < 0.0, lambda c: c + 1.0, 0.0 * x)
+        return jnp.array([-50.0 * (x[0] - jnp.cos(x[1])), 1.0 - x[0] * x[1]]) + top
+
+    options = {"n": 2, "p": 1, "dt": 0.1, "method": "radau"}
+    mine = from_jax(rate, lambda x: x[0], **options)
+    assert mine.symbolic is None
+    assert "while" in mine.no_symbolic
+    plain = qpmhe.System.from_ode(
+        lambda x: np.stack(
+            [-50.0 * (x[..., 0] - np.cos(x[..., 1])), 1.0 - x[..., 0] * x[..., 1]], axis=-1
+        ),
+        lambda x: x[..., 0], **options,
+    ).model().functions
+    for x in np.random.default_rng(0).normal(size=(4, 2)):
+        for name in FUNCTIONS:
+            found, expected = (getattr(one, name)(x, NONE) for one in (mine, plain))
+            np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
+    assert "jax" in mine.derivatives["f"]
+    augmented = qpmhe.augment_parameters(
+        from_jax(lambda x, u: rate(x) + u[0], lambda x, u: x[0], m=1, **options), nominal=[0.0]
+    )
+    assert (augmented.method, augmented.n) == ("radau", 3)
+    expected = np.append(mine.f(x), 0.0)
+    np.testing.assert_allclose(augmented.f(np.append(x, 0.0)), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"method": "radau"}, "method is 'radau', but dt is missing"),
+    ({"method": "auto"}, "method is 'auto', but dt is missing"),
+    ({"dt": 0.1, "method": "auto", "steps": 2}, "leave steps out"),
+    ({"dt": 0.1, "tolerance": 1e-3}, "tolerance is 0.001, but method is 'rk4'"),
+])
+def test_bad_options_of_steps(options, words):
+    with pytest.raises(OptionError, match=words):
+        from_jax(lambda x: -x, lambda x: x, n=1, p=1, **options)
