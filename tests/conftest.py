@@ -20,7 +20,7 @@ import pytest
 
 CASES, DEEP = 3, {"oracles", "properties"}
 # Examples of each property whose test names no number: without --all, and with it.
-FEW, MANY = 6, 25
+FEW, MANY = 6, 12
 # Begun first, so that no long test is the last one: most of these tests start processes.
 FIRST = {"studies", "tests", "cli", "examples", "records"}
 # How many cases run, and of how many.

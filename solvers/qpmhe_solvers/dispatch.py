@@ -43,6 +43,10 @@ class DispatchSolver(NativeSolver):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.name, self.options)
 
+    def prepare(self, size: int) -> None:
+        """Import what this solver's first solve imports; see `Solver.prepare`."""
+        self._rehearse(self.name)
+
     def structure(self, qp: QP) -> QPStructure:
         """The limits of this QP."""
         return QPStructure.of(qp, exact=True, bounds=self.style.bounds == "rows")

@@ -25,7 +25,8 @@ from .solution import Errors, RawSolution, Residuals, Solution, SolveStatus
 _SLACK = 1e3
 _LOOSEST = 1e-3
 _NUMBERS = count(1)
-_REHEARSED: set[type] = set()  # classes of which one has solved its two small QPs
+# Classes of which one has solved its two small QPs, and which of a class's solvers it runs.
+_REHEARSED: set[tuple[type, str]] = set()
 
 
 class Solver(ABC):
@@ -103,11 +104,11 @@ class Solver(ABC):
             Unknowns K n of the largest expected QP.
         """
 
-    def _rehearse(self) -> None:
+    def _rehearse(self, name: str = "") -> None:
         """Solve two small QPs, once in a process: what the first solves import is then there."""
-        if type(self) in _REHEARSED:
+        if (type(self), name) in _REHEARSED:
             return
-        _REHEARSED.add(type(self))
+        _REHEARSED.add((type(self), name))
         self.solve(sample(3, 2))
         self.solve(sample(3, 2, 2, bounds="part", sides="mixed"))
         self.forget()

@@ -6,6 +6,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
+from tests.covering import covering
 
 from .systems import SYSTEMS
 
@@ -72,7 +73,6 @@ def test_convergence_is_ipopts_constrained_minimum(name, kind):
     assert sum(binds) >= 0.2 * len(binds)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("name", "kind"), CASES)
-def test_backends_reach_the_constrained_minimum(name, kind, backend):
-    check(name, kind, SEEDS[0], backend)
+@covering(strength=1, case=CASES, backend=BACKENDS)
+def test_backends_reach_the_constrained_minimum(case, backend):
+    check(*case, SEEDS[0], backend)

@@ -92,10 +92,9 @@ def test_converged_cost_is_ipopts(name):
     SETS, (*SETS, "soft", "rows"), ("constraint", "noises"), ("disturbances", "soft", "matrix"),
 ], ids="+".join)
 def test_every_backend_reaches_it(backend, features):
-    for seed in range(2):
-        one = Problem([seed, 8], dict.fromkeys(features, 1.0))
-        _, above = compared(one, 2, backend=backend, solver_tolerance=1e-9)
-        assert above == []
+    one = Problem([BACKENDS.index(backend) % 2, 8], dict.fromkeys(features, 1.0))
+    _, above = compared(one, 2, backend=backend, solver_tolerance=1e-9)
+    assert above == []
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")

@@ -1,5 +1,6 @@
 """What becomes of a candidate outside of the sets, and of a step whose time is up."""
 
+import functools
 import re
 
 import numpy as np
@@ -64,6 +65,11 @@ def estimator(sets, **options):
         qpmhe.QuadraticCost(prior=prior, disturbance=disturbance, noise=noise),
         horizon=HORIZON, initial_state=START, **options,
     )
+
+
+@functools.cache
+def by(name, backend):
+    return [one for one, _ in tight(name, backend=backend, max_qps=5)]
 
 
 def tight(name, **options):
@@ -133,10 +139,7 @@ def test_the_rungs_of_the_ladder(name, infeasible, max_qps):
 @pytest.mark.parametrize("backend", [b for b in BACKENDS if qpmhe.solvers.backend(b).inequalities])
 @pytest.mark.parametrize("name", ["X, W and V", "without zero"])
 def test_backends_take_the_same_rung(name, backend):
-    found, usual = (
-        [one for one, _ in tight(name, backend=given, max_qps=5)] for given in (backend, "auto")
-    )
-    for estimate, expected in zip(found, usual, strict=True):
+    for estimate, expected in zip(by(name, backend), by(name, "auto"), strict=True):
         # Where linearised rows exclude each other, what a solver ends at is its own.
         if Status.SOLVER_STOPPED not in expected.status:
             assert estimate.dropped == expected.dropped
