@@ -174,7 +174,9 @@ def search_all(
 
 def _alone(recipe: tuple[Any, ...], k: int, begin: Array) -> tuple[int, Array, float]:
     """One search in a separate process."""
-    return k, *search_likelihood(Likelihood(*recipe), begin, lambda *_: None)
+    likelihood = Likelihood(*recipe)
+    likelihood.compile()
+    return k, *search_likelihood(likelihood, begin, lambda *_: None)
 
 
 def _curvature(likelihood: Likelihood, theta: Array) -> Array:

@@ -197,6 +197,8 @@ def tune(
         starts = 2 if objective == "likelihood" else 1
     likelihoods = {kind.limit: Likelihood(plan, data, make, remade, kind.limit) for kind in kinds}
     at_start = _likelihood_at_start(likelihoods[kinds[0].limit])
+    for one in likelihoods.values():
+        one.compile()
     truth = objective == "truth"
     score = Score(
         data, make, plain() if observers else kinds[0].make, start, ahead=ahead, truth=truth,
