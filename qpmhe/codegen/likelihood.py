@@ -56,6 +56,7 @@ class LikelihoodLibrary:
         self, model: CasadiModel, check: Callable[[LikelihoodLibrary], str]
     ) -> None:
         self._n, self._m, self._p = model.n, model.m, model.p
+        self._kept = np.empty(0, np.uint8)
 
         def fault(library: ctypes.CDLL) -> str:
             self._bind(library)
@@ -90,7 +91,9 @@ class LikelihoodLibrary:
         length = samples
         if samples * self._size > _MOST_BYTES:
             length = int(np.sqrt(samples)) + 1
-        costs, kept = np.empty(samples), np.empty(length * self._size, np.uint8)
+        if self._kept.size < length * self._size:  # new pages take time
+            self._kept = np.empty(length * self._size, np.uint8)
+        costs, kept = np.empty(samples), self._kept
         points = np.empty((-(-samples // length), n + n * n))
         common = ctypes.byref(record), samples, length, _at(points), _at(kept)
         self._library.mhe_filter_record(*common, _at(costs))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,25 @@ class Likelihood:
                 one.compile(self.structure.first, self.data[0])
             except CompilationError as error:
                 self.not_compiled = str(error)
+
+    @property
+    def samples(self) -> int:
+        """How many samples tune."""
+        return sum(int(mask.sum()) for mask in self.tuned)
+
+    def shortened(self, count: int) -> Likelihood | None:
+        """The one of so many samples, those of the first records; None of less than four times."""
+        if self.samples < 4 * count:
+            return None
+        short, left = copy(self), count
+        short.data, short.tuned = [], []
+        for one, mask in zip(self.data, self.tuned, strict=True):
+            if left > 0:
+                used = min(len(one), int(np.searchsorted(np.cumsum(mask), left)) + 1)
+                short.data.append(one.first(used))
+                short.tuned.append(mask[:used])
+                left -= int(mask[:used].sum())
+        return short
 
     def value(self, theta: Array, chosen: list[Mask] | None = None) -> float:
         """The value at theta, over each record's chosen samples; infinite where the model fails."""

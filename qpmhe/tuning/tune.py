@@ -196,9 +196,9 @@ def tune(
     if starts is None:  # a further one costs little where the filter alone is searched
         starts = 2 if objective == "likelihood" else 1
     likelihoods = {kind.limit: Likelihood(plan, data, make, remade, kind.limit) for kind in kinds}
-    at_start = _likelihood_at_start(likelihoods[kinds[0].limit])
     for one in likelihoods.values():
         one.compile()
+    at_start = _likelihood_at_start(likelihoods[kinds[0].limit])
     truth = objective == "truth"
     score = Score(
         data, make, plain() if observers else kinds[0].make, start, ahead=ahead, truth=truth,
