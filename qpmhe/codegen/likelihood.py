@@ -40,7 +40,7 @@ class FilterInput(NamedTuple):
 
 
 class _Record(ctypes.Structure):
-    _fields_ = [  # noqa: RUF012
+    _fields_ = [
         (name, ctypes.c_double if name in ("threshold", "scale") else ctypes.c_void_p)
         for name in FilterInput._fields
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import copy
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,10 @@ from .weights import Weights
 # Step of central differences by numbers without unit: rounding and curvature are balanced.
 _STEP = 3e-5
 # Gradients that a search takes, roughly, for each component of theta.
-_GRADIENTS = 10
-# Seconds that CasADi's machine takes for one of a step's operations in value and gradient, and a
-# compiler for one of those that are left in C, roughly; and for the rest of a library.
-_RUNNING, _COMPILING, _USUAL = 2e-8, 4e-4, 1.5
+_GRADIENTS = 20
+# Seconds that a value and its gradient take CasADi's machine for a sample, and for each of the
+# step's operations; and a compiler for a library, and for each of the model's operations, roughly.
+_SAMPLE, _RUNNING, _LIBRARY, _COMPILING = 5e-6, 1.2e-8, 0.5, 1e-2
 # A library is compiled where it saves so many times the seconds that it takes.
 _PAYS = 3.0
 # Samples on which both filters are compared, and the difference that is no rounding.
@@ -81,14 +82,20 @@ class Likelihood:
         if self._remade:  # another system at each point would be another library
             return
         one = self._filter(self.structure.first)
-        if one is None or not one.traced or python_only():
+        if one is None or not one.traced or (python_only() and not always):
             return
         samples = sum(map(len, self.data))
-        if always or one.saves(samples * _GRADIENTS * len(self.structure.names)):
+        if always or one.saves(samples * _GRADIENTS * self.structure.seen):
             try:
                 one.compile(self.structure.first, self.data[0])
             except CompilationError as error:
                 self.not_compiled = str(error)
+
+    def expected_seconds(self) -> float:
+        """How long a search from one start will take, roughly, by the time of one gradient."""
+        began = perf_counter()
+        self.gradient(self.structure.start)
+        return (perf_counter() - began) * _GRADIENTS * self.structure.seen
 
     @property
     def samples(self) -> int:
@@ -216,8 +223,8 @@ class _Filter:
         model = self._model
         assert model is not None
         within = model.step().n_instructions() + model.h.n_instructions()
-        running = passes * self._step.n_instructions() * _RUNNING
-        return bool(running > _PAYS * (_USUAL + within * _COMPILING))
+        running = passes * (_SAMPLE + self._step.n_instructions() * _RUNNING)
+        return bool(running > _PAYS * (_LIBRARY + within * _COMPILING))
 
     def compile(self, weights: Weights, one: Data) -> None:
         """Compile the filter, compared with CasADi's on the first samples of a record."""
@@ -229,11 +236,12 @@ class _Filter:
             self._library = library
             found = self._adjoint_in_c(weights, first, chosen)
             self._library = None
-            sizes = [np.ones(1), *map(_deviations, self._covariances(weights)), np.ones(1)]
-            for got, true, size in zip(found, expected, sizes, strict=True):
-                there = np.asarray(true) * np.multiply.outer(size, size)
-                error = np.abs(np.asarray(got) * np.multiply.outer(size, size) - there)
-                if not (error <= _ROUNDING * np.abs(there).max(initial=0.0)).all():
+            scales = [_scales(one) for one in self._covariances(weights)]
+            for got, true in zip(map(np.asarray, found), map(np.asarray, expected), strict=True):
+                if true.ndim == 2:  # of symmetric matrices, in their own units
+                    scale = scales.pop(0)
+                    got, true = scale * (got + got.T), scale * (true + true.T)
+                if not (abs(got - true) <= _ROUNDING * abs(true).max(initial=0.0)).all():
                     return "the likelihood, or its slope, is not the one of CasADi's interpreter"
             return ""
 
@@ -383,8 +391,9 @@ def _clipped_variance(k: float) -> float:
     return 1.0 - beyond - 2.0 * k * density + k * k * beyond
 
 
-def _deviations(covariance: Array) -> Array:
-    return np.asarray(np.sqrt(covariance.diagonal()))
+def _scales(covariance: Array) -> Array:
+    deviations = np.sqrt(covariance.diagonal())
+    return np.multiply.outer(deviations, deviations)
 
 
 def _bounds(system: System) -> tuple[Array, Array]:

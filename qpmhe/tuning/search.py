@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -155,9 +156,10 @@ def search_likelihood(
         value, slope = value_at(inside)
         return value, spread.T @ np.where(theta == inside, slope, 0.0)
 
+    known = hessian is not None
     minimize(
-        *(value_at, begin) if hessian is None else (value_along, 0.0 * begin), jac=True,
-        method="L-BFGS-B", bounds=likelihood.structure.limits if hessian is None else None,
+        value_along if known else value_at, 0.0 * begin if known else begin, jac=True,
+        method="L-BFGS-B", bounds=None if known else likelihood.structure.limits,
         callback=lambda _: note(best[0], best[1], False),
         options={"maxiter": _ITERATIONS, "ftol": 1e-9, "gtol": 1e-6},
     )
@@ -317,7 +319,8 @@ def limit(
             return at + sign * size
         return at + 0.5 * float(np.log1p(sign * size)) if sign * size > -1.0 else -np.inf
 
-    inside, outside, known = at, sign * np.inf, []
+    inside, outside = at, sign * np.inf
+    known: list[tuple[float, float]] = []
     to = at + sign * NORMAL / np.sqrt(max(hessian[k, k], 1.0))
     for _ in range(12):
         to = min(to, end) if sign > 0 else max(to, end)
@@ -327,10 +330,10 @@ def limit(
         if abs(found - NORMAL) < 0.03:
             break
         inside, outside = (to, outside) if found < NORMAL else (inside, to)
-        known = [*known, (np.log(distance(to)), np.log(max(found, 1e-3)))][-2:]
+        known = [*known, (math.log(distance(to)), math.log(max(found, 1e-3)))][-2:]
         (before, low), (last, high) = known[0], known[-1]
         power = (high - low) / (last - before) if len(known) > 1 and last != before else 1.0
-        wanted = place(float(np.exp(last + (np.log(NORMAL) - high) / np.clip(power, 0.3, 3.0))))
+        wanted = place(math.exp(last + (math.log(NORMAL) - high) / min(max(power, 0.3), 3.0)))
         if np.isfinite(outside):
             middle, half = 0.5 * (inside + outside), 0.45 * abs(outside - inside)
             to = float(np.clip(wanted, middle - half, middle + half))
@@ -362,6 +365,9 @@ def refine(
     def total(point: Array) -> float:
         return min(plain(point) + _STAY * float(np.sum((point - anchor) ** 2)), _FAILED)
 
+    samples = sum(map(len, likelihood.data))
+    most = score.seconds * samples * 2 * len(theta) * _REFINEMENTS
+    advance(f"estimator, at most about {most:.2g} s")
     anchor = min((theta, structure.start), key=plain)
     best: list[Any] = [anchor if known is None else known, value]
 

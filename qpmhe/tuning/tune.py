@@ -215,6 +215,8 @@ def tune(
     )))
     blocks = Blocks(data)
     with _interruptible(), _shown(progress) as advance:
+        expected = starts * likelihoods[kinds[0].limit].expected_seconds()
+        advance(f"likelihood, about {expected:.2g} s")
         searches = Searches(
             likelihoods, score, objective, blocks, _beginnings(plan, starts, seed), jobs, kept,
             advance,
