@@ -64,13 +64,12 @@ static void mhe_multiply_transposed(int m, int k, int n, const real *A, const re
 /* out += A' B for A (k, m) and B (k, n). */
 static void mhe_add_product(int k, int m, int n, const real *A, const real *B, real *out)
 {
-    for (int i = 0; i < m; i++) {
-        real *row = out + i * n;
-        for (int l = 0; l < k; l++) {
+    for (int l = 0; l < k; l++)
+        for (int i = 0; i < m; i++) {
             const real a = A[l * m + i], *other = B + l * n;
+            real *row = out + i * n;
             for (int j = 0; j < n; j++) row[j] += a * other[j];
         }
-    }
 }
 
 /* Both halves become their mean, and the matrix exactly symmetric. */

@@ -51,6 +51,16 @@ static void mhe_noise_of(const mhe_record *r, const unsigned char *there, real *
             out[i * NY + j] = there[i] && there[j] ? r->noise[i * NY + j] : (real)(i == j);
 }
 
+/* out = A' B for A (k, m) and B (k, n), with the transposed matrix in `turned`: as a product of
+ * rows it takes a sixth of the time of one of columns. */
+static void mhe_turned_product(int k, int m, int n, const real *A, const real *B, real *turned,
+                               real *out)
+{
+    for (int l = 0; l < k; l++)
+        for (int i = 0; i < m; i++) turned[i * k + l] = A[l * m + i];
+    mhe_multiply(m, k, n, turned, B, out);
+}
+
 /* One sample from k->z and k->P, which the rest of k is of; its cost. */
 static real mhe_filter_step(const mhe_record *r, int t, mhe_kept *k, real *z, real *P)
 {
@@ -103,15 +113,15 @@ static real mhe_filter_step(const mhe_record *r, int t, mhe_kept *k, real *z, re
         k->bounded[j] = z[j] < r->low[j] || z[j] > r->high[j];
         z[j] = z[j] < r->low[j] ? r->low[j] : z[j] > r->high[j] ? r->high[j] : z[j];
     }
-    real closed[NX * NX], turned[NX * NX], moved[NX * NX], weighed[NY * NX];
+    real closed[NX * NX], turned[NX * NX], moved[NX * NX], weighed[NY * NX], rows[NX * NY];
     mhe_closed_loop(k, closed);
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) turned[j * NX + i] = closed[i * NX + j];
     mhe_multiply(NX, NX, NX, closed, k->P, moved);
     mhe_multiply(NX, NX, NX, moved, turned, P);
     mhe_multiply(NY, NY, NX, noise, gain, weighed);
-    mhe_add_product(NY, NX, NX, gain, weighed, P);
-    for (int i = 0; i < NX * NX; i++) P[i] += r->disturbance[i];
+    mhe_turned_product(NY, NX, NX, gain, weighed, rows, moved);
+    for (int i = 0; i < NX * NX; i++) P[i] += moved[i] + r->disturbance[i];
     mhe_symmetrise(NX, P);
     return cost;
 }
@@ -175,7 +185,8 @@ static void mhe_filter_back(const mhe_record *r, int t, const mhe_kept *k, real 
     real given[NX + NX + MHE_A_NONZEROS + NY + MHE_C_NONZEROS];
     real *by_f = given + NX, *by_A = by_f + NX, *by_h = by_A + MHE_A_NONZEROS, *by_C = by_h + NY;
     const real *L = k->root;
-    real closed[NX * NX], moved[NX * NX], back[NX * NX], seen[NX * NY], held[NY * NX];
+    real closed[NX * NX], turned[NX * NX], moved[NX * NX], back[NX * NX];
+    real seen[NX * NY], held[NY * NX];
     real gained[NY * NY];
     memcpy(given, k->z, sizeof k->z);
     for (int j = 0; j < NX; j++) by_f[j] = k->bounded[j] ? 0 : by_z[j];
@@ -186,8 +197,7 @@ static void mhe_filter_back(const mhe_record *r, int t, const mhe_kept *k, real 
     mhe_multiply(NY, NX, NX, k->gain, by_P, held);
     mhe_multiply_transposed(NY, NX, NY, held, k->gain, gained);
     mhe_multiply(NY, NX, NX, k->gain, moved, held);
-    for (int i = 0; i < NX * NX; i++) back[i] = 0;
-    mhe_add_product(NX, NX, NX, closed, moved, back);
+    mhe_turned_product(NX, NX, NX, closed, moved, turned, back);
 
     real ahead[NX] = {0}, seen_by[NX] = {0}, solved[NY], ahead_P[NX], seen_P[NX];
     for (int a = 0; a < MHE_A_NONZEROS; a++) ahead[mhe_A_column[a]] += k->A[a] * by_f[mhe_A_row[a]];
