@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.resources import files
 from string import Template
@@ -71,9 +71,7 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         )
     _check_solvers(model)
     ca = import_casadi()
-    # Without comments, which would have the numbers of large matrices again.
-    options = {"casadi_int": "int", "include_math": False, "verbose": False}
-    generator = ca.CodeGenerator("mhe_model.c", options)
+    generator = _generator("mhe_model.c")
     calls = []
     for which in ("f", "h"):
         function = getattr(model, which)
@@ -125,6 +123,13 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
             "converged as a root; use engine='python', which reports a failure."
         )
     return "\n".join((
+        *_quieted(code, single), *calls, *_model_parts(model), *_algebraic_set(model),
+    ))
+
+
+def _quieted(code: str, single: bool) -> tuple[str, ...]:
+    """CasADi's code without the compiler's warnings of it."""
+    return (
         # CasADi writes out some functions that are not called, and arguments without use.
         "#if defined(__GNUC__)\n#pragma GCC diagnostic push\n"
         '#pragma GCC diagnostic ignored "-Wunused-function"\n'
@@ -133,8 +138,7 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         + '#pragma GCC diagnostic ignored "-Wconversion"\n' * single + "#endif",
         "#define casadi_real mhe_real", code,
         "#if defined(__GNUC__)\n#pragma GCC diagnostic pop\n#endif\n",
-        *calls, *_model_parts(model), *_algebraic_set(model),
-    ))
+    )
 
 
 def _constraint_calls(ca: Any, generator: Any, model: CasadiModel) -> list[str]:
@@ -387,11 +391,43 @@ def _call(name: str, inner: str, function: Any) -> str:
 
 def model_files(model: CasadiModel) -> dict[str, str]:
     """Source of a library that evaluates a model, in double precision."""
-    head = (
+    return {"model.c": _sizes(model) + model_source(model) + template("model_api.c")}
+
+
+def likelihood_files(
+    model: CasadiModel, functions: Mapping[str, Any], slopes: Mapping[str, Any]
+) -> dict[str, str]:
+    """Source of a library that filters records, in double precision.
+
+    Of the functions and the Jacobians whose nonzeros they have, by name; `LikelihoodLibrary` makes
+    them.
+    """
+    generator = _generator("mhe_likelihood.c")
+    calls = []
+    for name, function in functions.items():
+        generator.add(function)
+        calls.append(_call(f"mhe_call_{name}", function.name(), function))
+    for name, slope in slopes.items():
+        calls += _tables(name, *slope.sparsity().get_triplet())
+    return {"likelihood.c": "\n".join((
+        _sizes(model), *_quieted(_bare(generator.dump()), False), *calls, template("algebra.c"),
+        template("likelihood.c"),
+    ))}
+
+
+def _generator(name: str) -> Any:
+    # Without comments, which would have the numbers of large matrices again.
+    options = {"casadi_int": "int", "include_math": False, "verbose": False}
+    return import_casadi().CodeGenerator(name, options)
+
+
+def _sizes(model: CasadiModel) -> str:
+    """What stands before a library without a header."""
+    return (
         "#include <stdint.h>\ntypedef double mhe_real;\n"
         f"#define MHE_NX {model.n}\n#define MHE_NY {model.p}\n#define MHE_NU {model.m}\n"
+        + prologue()
     )
-    return {"model.c": head + prologue() + model_source(model) + template("model_api.c")}
 
 
 def estimator_files(

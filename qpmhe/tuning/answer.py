@@ -133,7 +133,9 @@ class Tuning:
             f"input {j + 1} is constant in all records, so its effect cannot be identified; vary "
             "it." for j in constant
         ) + ((f"the model failed at some points of the search ({likelihood.failure}), which were "
-              "avoided.",) if likelihood.failure else ())
+              "avoided.",) if likelihood.failure else ()) + ((
+            f"the likelihood was computed without C, which takes longer: {likelihood.not_compiled}",
+        ) if likelihood.not_compiled else ())
         likeliest = structure.weights(self._likeliest)
         self.innovations = innovations_of(
             likelihood.system(likeliest), likeliest, self._data, labels["noise"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,6 +120,14 @@ class Data:
 
     def __len__(self) -> int:
         return len(self.y)
+
+    def first(self, count: int) -> Data:
+        """The first samples alone."""
+        part = copy(self)
+        for name in ("y", "observed", "u", "dt", "block", "held"):
+            array = getattr(self, name)
+            setattr(part, name, None if array is None else array[:count])
+        return part
 
     def inputs(self, system: System, parameters: Mapping[str, float]) -> Array:
         """The inputs, followed by the model's parameters where these are inputs."""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from copy import copy
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from .._checks import Array
+from ..codegen.likelihood import FilterInput, LikelihoodLibrary, scalar_model
 from ..diagnosis.bank import FilterBank, Hypothesis
-from ..errors import QpmheError
+from ..errors import CompilationError, QpmheError
+from ..estimation.engines import python_only
 from ..model.expressions import import_casadi
-from ..model.products import in_scalars
 from ..model.system import System
 from .data import Data, Mask
 from .structures import Structure
@@ -21,6 +23,15 @@ from .weights import Weights
 
 # Step of central differences by numbers without unit: rounding and curvature are balanced.
 _STEP = 3e-5
+# Gradients that a search takes, roughly, for each component of theta.
+_GRADIENTS = 20
+# Seconds that a value and its gradient take CasADi's machine for a sample, and for each of the
+# step's operations; and a compiler for a library, and for each of the model's operations, roughly.
+_SAMPLE, _RUNNING, _LIBRARY, _COMPILING = 5e-6, 1.2e-8, 0.5, 1e-2
+# A library is compiled where it saves so many times the seconds that it takes.
+_PAYS = 3.0
+# Samples on which both filters are compared, and the difference that is no rounding.
+_COMPARED, _ROUNDING = 40, 1e-6
 
 
 class Likelihood:
@@ -41,6 +52,8 @@ class Likelihood:
 
     For a traced system, the gradient is exact, from one backward sweep through the filter. For
     others, it consists of central differences; the filter runs for all of them at once.
+
+    `compile` has both sweeps done in C from then on.
     """
 
     def __init__(
@@ -57,10 +70,51 @@ class Likelihood:
         self._filters: dict[tuple[float, ...], _Filter] = {}
         #: The first thing that a model has raised far from the start; blank if none did.
         self.failure = ""
+        #: Why there is no C where it would have saved time; blank if there is, or none was needed.
+        self.not_compiled = ""
 
     def system(self, weights: Weights) -> System:
         """The system with the parameters of these weights."""
         return self._make(weights.parameters)
+
+    def compile(self, always: bool = False) -> None:
+        """Have the filter compiled where that saves more time than it takes."""
+        if self._remade:  # another system at each point would be another library
+            return
+        one = self._filter(self.structure.first)
+        if one is None or not one.traced or (python_only() and not always):
+            return
+        samples = sum(map(len, self.data))
+        if always or one.saves(samples * _GRADIENTS * self.structure.seen):
+            try:
+                one.compile(self.structure.first, self.data[0])
+            except CompilationError as error:
+                self.not_compiled = str(error)
+
+    def expected_seconds(self) -> float:
+        """How long a search from one start will take, roughly, by the time of one gradient."""
+        began = perf_counter()
+        self.gradient(self.structure.start)
+        return (perf_counter() - began) * _GRADIENTS * self.structure.seen
+
+    @property
+    def samples(self) -> int:
+        """How many samples tune."""
+        return sum(int(mask.sum()) for mask in self.tuned)
+
+    def shortened(self, count: int) -> Likelihood | None:
+        """The one of so many samples, those of the first records; None of less than four times."""
+        if self.samples < 4 * count:
+            return None
+        short, left = copy(self), count
+        short.data, short.tuned = [], []
+        for one, mask in zip(self.data, self.tuned, strict=True):
+            if left > 0:
+                used = min(len(one), int(np.searchsorted(np.cumsum(mask), left)) + 1)
+                short.data.append(one.first(used))
+                short.tuned.append(mask[:used])
+                left -= int(mask[:used].sum())
+        return short
 
     def value(self, theta: Array, chosen: list[Mask] | None = None) -> float:
         """The value at theta, over each record's chosen samples; infinite where the model fails."""
@@ -136,18 +190,18 @@ class _Filter:
         self._ahead: dict[int, Any] = {}
         self._back: dict[int, Any] = {}
         self._step: Any = None
-        model = self._system.symbolic
-        if model is not None and model.is_implicit:  # a step is no expression
-            model = None
-        if model is not None:
-            model = replace(model, f=in_scalars(model.f), h=in_scalars(model.h))
+        self._library: LikelihoodLibrary | None = None
+        self._model = scalar_model(self._system.symbolic)
         residual = system.output_residual
-        self.traced = (
-            model is not None and model.f.is_a("SXFunction") and model.h.is_a("SXFunction")
-            and (residual is None or residual.periods is not None)
+        self._periods = np.zeros(system.p)
+        if residual is not None and residual.periods is not None:
+            self._periods[list(residual.components)] = residual.periods
+        self.traced = self._model is not None and (
+            residual is None or residual.periods is not None
         )
         if self.traced:
-            self._step = _symbolic_step(model, self._system, self._clip, self._threshold)
+            self._step = _symbolic_step(
+                self._model, self._periods, self._clip, self._threshold)
 
     def _covariances(self, weights: Weights) -> tuple[Array, Array, Array]:
         entering = self._system.state_covariance(weights.disturbance)
@@ -157,7 +211,52 @@ class _Filter:
         """Costs (T, B) of a record at B settings."""
         if not self.traced:
             return self._run_together(settings, one)
+        if self._library is not None:
+            given = [self._record(weights, one) for weights in settings]
+            return np.stack([self._library.costs(each) for each in given], axis=1)
         return np.stack([self._forward(weights, one)[2] for weights in settings], axis=1)
+
+    # In C
+
+    def saves(self, passes: int) -> bool:
+        """Whether C saves time where so many samples pass, forwards and back."""
+        model = self._model
+        assert model is not None
+        within = model.step().n_instructions() + model.h.n_instructions()
+        running = passes * (_SAMPLE + self._step.n_instructions() * _RUNNING)
+        return bool(running > _PAYS * (_LIBRARY + within * _COMPILING))
+
+    def compile(self, weights: Weights, one: Data) -> None:
+        """Compile the filter, compared with CasADi's on the first samples of a record."""
+        first = one.first(_COMPARED)
+        chosen = np.ones(len(first), np.bool_)
+
+        def fault(library: LikelihoodLibrary) -> str:
+            expected = self._adjoint_in_casadi(weights, first, chosen)
+            self._library = library
+            found = self._adjoint_in_c(weights, first, chosen)
+            self._library = None
+            scales = [_scales(one) for one in self._covariances(weights)]
+            for got, true in zip(map(np.asarray, found), map(np.asarray, expected), strict=True):
+                if true.ndim == 2:  # of symmetric matrices, in their own units
+                    scale = scales.pop(0)
+                    got, true = scale * (got + got.T), scale * (true + true.T)
+                if not (abs(got - true) <= _ROUNDING * abs(true).max(initial=0.0)).all():
+                    return "the likelihood, or its slope, is not the one of CasADi's interpreter"
+            return ""
+
+        model = self._model
+        assert model is not None
+        self._library = LikelihoodLibrary(model, fault)
+
+    def _record(self, weights: Weights, one: Data) -> FilterInput:
+        y, u, dt, _ = self._given(weights, one)
+        return FilterInput(
+            one.start, *self._covariances(weights), y, np.hstack((u, dt)), one.observed,
+            *self._clip, self._periods,
+            *(() if self._threshold is None
+              else (self._threshold, _clipped_variance(self._threshold))),
+        )
 
     # In CasADi
 
@@ -186,22 +285,56 @@ class _Filter:
                 "backward", samples, [0, 1], [0, 1], {"base": 10})
         return self._back[samples]
 
-    def _given(self, weights: Weights, one: Data) -> list[Any]:
-        """What the step takes besides z and P, sample beside sample."""
-        _, q, r = self._covariances(weights)
-        observed = one.observed.T.astype(np.float64)
-        dt = np.full((1, len(one)), self._system.dt or 0.0) if one.dt is None else one.dt[None]
+    def _given(self, weights: Weights, one: Data) -> list[Array]:
+        """What the step takes of a record besides z and P, sample below sample."""
+        dt = np.full(len(one), self._system.dt or 0.0) if one.dt is None else one.dt
         return [
-            np.where(one.observed, one.y, 0.0).T, one.inputs(self._system, weights.parameters).T,
-            dt, observed, np.tile(q, len(one)), np.tile(r, len(one)),
+            np.where(one.observed, one.y, 0.0), one.inputs(self._system, weights.parameters),
+            dt[:, None], one.observed.astype(np.float64),
         ]
+
+    def _columns(self, weights: Weights, one: Data) -> list[Any]:
+        """What CasADi's step takes besides z and P, sample beside sample."""
+        _, q, r = self._covariances(weights)
+        return [each.T for each in self._given(weights, one)] + [
+            np.tile(q, len(one)), np.tile(r, len(one))]
 
     def _forward(self, weights: Weights, one: Data) -> tuple[Array, Array, Array]:
         """Z (n, T) and P (n, n T) after each sample, and costs (T,)."""
         z, covariance, cost = map(np.asarray, self._sweep(len(one))(
-            one.start, weights.prior, *self._given(weights, one)
+            one.start, weights.prior, *self._columns(weights, one)
         ))
         return z, covariance, cost[0]
+
+    def _adjoint_in_casadi(
+        self, weights: Weights, one: Data, mask: Mask
+    ) -> tuple[float, Array, Array, Array, Array]:
+        """As `LikelihoodLibrary.adjoint`."""
+        n, p = self._system.n, self._system.p
+        z, covariance, cost = self._forward(weights, one)
+        total = float(cost[mask].sum())
+        if not np.isfinite(total):
+            return total, np.zeros((n, n)), np.zeros((n, n)), np.zeros((p, p)), np.zeros(0)
+        blocks = covariance.reshape(n, len(one), n)
+        begun = np.concatenate((weights.prior[:, None], blocks[:, :-1]), axis=1)
+        given = self._columns(weights, one)
+        found = list(map(np.asarray, self._sweep_back(len(one))(
+            np.zeros(n), np.zeros((n, n)),
+            np.hstack((one.start[:, None], z[:, :-1]))[:, ::-1],
+            begun[:, ::-1].reshape(n, -1), *(each[:, ::-1] for each in given[:4]), *given[4:],
+            mask[None, ::-1].astype(np.float64),
+        )))
+        return (
+            total, found[1][:, -n:], found[6].reshape(n, -1, n).sum(axis=1),
+            found[7].reshape(p, -1, p).sum(axis=1), found[3].sum(axis=1),
+        )
+
+    def _adjoint_in_c(
+        self, weights: Weights, one: Data, mask: Mask
+    ) -> tuple[float, Array, Array, Array, Array]:
+        """As `LikelihoodLibrary.adjoint`."""
+        assert self._library is not None
+        return self._library.adjoint(self._record(weights, one), mask.astype(np.float64))
 
     def adjoint(
         self, weights: Weights, data: list[Data], chosen: list[Mask]
@@ -210,25 +343,16 @@ class _Filter:
         system, n, p = self._system, self._system.n, self._system.p
         prior, entering, noise = np.zeros((n, n)), np.zeros((n, n)), np.zeros((p, p))
         total, behind = 0.0, np.zeros(len(weights.parameters))
+        of_record = self._adjoint_in_casadi if self._library is None else self._adjoint_in_c
         for one, mask in zip(data, chosen, strict=True):
-            z, covariance, cost = self._forward(weights, one)
-            total += float(cost[mask].sum())
+            value, *by, by_u = of_record(weights, one, mask)
+            total += value
             if not np.isfinite(total):
                 break
-            blocks = covariance.reshape(n, len(one), n)
-            begun = np.concatenate((weights.prior[:, None], blocks[:, :-1]), axis=1)
-            given = self._given(weights, one)
-            found = list(map(np.asarray, self._sweep_back(len(one))(
-                np.zeros(n), np.zeros((n, n)),
-                np.hstack((one.start[:, None], z[:, :-1]))[:, ::-1],
-                begun[:, ::-1].reshape(n, -1), *(each[:, ::-1] for each in given[:4]), *given[4:],
-                mask[None, ::-1].astype(np.float64),
-            )))
-            prior += found[1][:, -n:]
+            for sum_, part in zip((prior, entering, noise), by, strict=True):
+                sum_ += part
             if behind.size and system.m > one.u.shape[1]:
-                behind += found[3][one.u.shape[1] :].sum(axis=1)
-            entering += found[6].reshape(n, -1, n).sum(axis=1)
-            noise += found[7].reshape(p, -1, p).sum(axis=1)
+                behind += by_u[one.u.shape[1] :]
         matrix = system.disturbance_matrix
         by_w = entering if matrix is None else matrix.T @ entering @ matrix
         return total, {"prior": prior, "disturbance": by_w, "noise": noise}, behind
@@ -267,6 +391,11 @@ def _clipped_variance(k: float) -> float:
     return 1.0 - beyond - 2.0 * k * density + k * k * beyond
 
 
+def _scales(covariance: Array) -> Array:
+    deviations = np.sqrt(covariance.diagonal())
+    return np.multiply.outer(deviations, deviations)
+
+
 def _bounds(system: System) -> tuple[Array, Array]:
     """The bounds of X on components that are no angles."""
     low, high = np.full(system.n, -np.inf), np.full(system.n, np.inf)
@@ -279,7 +408,7 @@ def _bounds(system: System) -> tuple[Array, Array]:
 
 
 def _symbolic_step(
-    model: Any, system: System, clip: tuple[Array, Array], threshold: float | None
+    model: Any, periods: Array, clip: tuple[Array, Array], threshold: float | None
 ) -> Any:
     """One step: (z, P, y, u, dt, observed, Q, R) to z and P after it, and cost."""
     ca = import_casadi()
@@ -290,11 +419,8 @@ def _symbolic_step(
     following, output = model.step()(z, u, dt), model.h(z, u)
     A, C = ca.jacobian(following, z), ca.mtimes(ca.diag(there), ca.jacobian(output, z))
     e = y - output
-    residual = system.output_residual
-    periods = None if residual is None else residual.periods
-    if residual is not None and periods is not None:
-        for i, period in zip(residual.components, periods, strict=True):
-            e[int(i)] -= period * ca.floor(e[int(i)] / period + 0.5)
+    for i in np.flatnonzero(periods).tolist():
+        e[i] -= periods[i] * ca.floor(e[i] / periods[i] + 0.5)
     # An output that is missing has the innovation 0 and the variance 1.
     e = ca.if_else(there > 0.0, e, 0.0)
     r = R * ca.mtimes(there, there.T) + ca.diag(1.0 - there)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -33,6 +34,13 @@ NORMAL = 1.959964
 # Step of the score's differences; the estimator's iterations make it less smooth than a filter.
 _STEP = 1e-2
 _HESSIAN_STEP = 1e-3
+# Newton's steps at most, the gain (in the likelihood's logarithm) that is the last one, curvatures
+# that are none, and how far off a Hessian is still the one of the minimum.
+_STEPS, _GAIN, _FLAT, _NEAR = 20, 1e-6, 1e-3, 0.02
+# How far beyond a point that is still within the limit the next one may be, upwards.
+_FURTHER = 3.0
+# Samples of the part of long records that is searched first.
+_SHORT = 1000
 
 
 class TuningCheckpointError(QpmheError):
@@ -116,22 +124,42 @@ def identity_of(likelihood: Likelihood, value: float, options: Any) -> str:
 
 
 def search_likelihood(
-    likelihood: Likelihood, begin: Array, note: Callable[[Array, float, bool], None]
+    likelihood: Likelihood, begin: Array, note: Callable[[Array, float, bool], None],
+    hessian: Array | None = None,
 ) -> tuple[Array, float]:
-    """The minimum of the likelihood near a start, and its value per sample."""
-    samples = sum(int(mask.sum()) for mask in likelihood.tuned)
+    """The minimum of the likelihood near a start, and its value per sample.
+
+    Of long records, a part is searched first: its minimum is nearby, where its Hessian, or one
+    that is known, tells the directions in which to search.
+    """
+    if hessian is None:
+        short = likelihood.shortened(_SHORT)
+        if short is not None:
+            begin = search_likelihood(short, begin, lambda *_: None)[0]
+            hessian = likelihood.samples / short.samples * _curvature(short, begin)
+    count, spread = likelihood.structure.seen, np.eye(len(begin))
+    if hessian is not None:
+        spread[:count, :count] = _alike(hessian)
     best: list[Any] = [begin.copy(), np.inf]
 
-    def cost(theta: Array) -> tuple[float, Array]:
+    def value_at(theta: Array) -> tuple[float, Array]:
         value, slope = likelihood.gradient(theta)
         if not np.isfinite(value):
             return _FAILED, np.zeros(len(theta))
-        if value / samples < best[1]:
-            best[:] = theta.copy(), value / samples
-        return value / samples, slope / samples
+        if value / likelihood.samples < best[1]:
+            best[:] = theta.copy(), value / likelihood.samples
+        return value / likelihood.samples, slope / likelihood.samples
 
+    def value_along(part: Array) -> tuple[float, Array]:
+        theta = begin + spread @ part
+        inside = likelihood.structure.bounded(theta)
+        value, slope = value_at(inside)
+        return value, spread.T @ np.where(theta == inside, slope, 0.0)
+
+    known = hessian is not None
     minimize(
-        cost, begin, jac=True, method="L-BFGS-B", bounds=likelihood.structure.limits,
+        value_along if known else value_at, 0.0 * begin if known else begin, jac=True,
+        method="L-BFGS-B", bounds=None if known else likelihood.structure.limits,
         callback=lambda _: note(best[0], best[1], False),
         options={"maxiter": _ITERATIONS, "ftol": 1e-9, "gtol": 1e-6},
     )
@@ -174,7 +202,9 @@ def search_all(
 
 def _alone(recipe: tuple[Any, ...], k: int, begin: Array) -> tuple[int, Array, float]:
     """One search in a separate process."""
-    return k, *search_likelihood(Likelihood(*recipe), begin, lambda *_: None)
+    likelihood = Likelihood(*recipe)
+    likelihood.compile()
+    return k, *search_likelihood(likelihood, begin, lambda *_: None)
 
 
 def _curvature(likelihood: Likelihood, theta: Array) -> Array:
@@ -189,24 +219,41 @@ def _curvature(likelihood: Likelihood, theta: Array) -> Array:
     return np.asarray(0.5 * (found + found.T))
 
 
-def polish(likelihood: Likelihood, theta: Array) -> tuple[Array, Array]:
-    """Newton's steps to the minimum, and the Hessian there."""
+def _alike(hessian: Array) -> Array:
+    """Directions along which the likelihood curves alike, in columns."""
+    values, vectors = np.linalg.eigh(hessian)
+    return np.asarray(vectors / np.sqrt(np.maximum(values, 1.0)))
+
+
+def polish(
+    likelihood: Likelihood, theta: Array, hessian: Array | None = None
+) -> tuple[Array, Array]:
+    """Newton's steps to the minimum, and the Hessian there; one of nearby may be known.
+
+    Between Hessians, the differences of slopes update them (BFGS).
+    """
     count = likelihood.structure.seen
     value, slope = likelihood.gradient(theta)
-    H = _curvature(likelihood, theta)
-    for _ in range(5):
+    known = theta
+    H = _curvature(likelihood, theta) if hessian is None else hessian
+    for _ in range(_STEPS):
         values, vectors = np.linalg.eigh(H)
-        usable = vectors[:, values > 1e-3]
+        usable = vectors[:, values > _FLAT]
         step = np.zeros(len(theta))
-        step[:count] = -(usable / values[values > 1e-3]) @ (usable.T @ slope[:count])
+        step[:count] = -(usable / values[values > _FLAT]) @ (usable.T @ slope[:count])
         moved = likelihood.structure.bounded(theta + np.clip(step, -1.0, 1.0))
         reached, by = likelihood.gradient(moved)
         if not reached < value:
             break
+        s, change = (moved - theta)[:count], (by - slope)[:count]
         gain, theta, value, slope = value - reached, moved, reached, by
-        H = _curvature(likelihood, theta)
-        if gain < 1e-6:
+        if gain < _GAIN:
             break
+        along = H @ s
+        if s @ change > 0.0 and s @ along > 0.0:
+            H = H + np.outer(change, change) / (s @ change) - np.outer(along, along) / (s @ along)
+    if hessian is not None or np.abs(theta - known).max() > _NEAR:
+        H = _curvature(likelihood, theta)
     return theta, H
 
 
@@ -215,11 +262,13 @@ def refit(likelihood: Likelihood, theta: Array, hessian: Array) -> tuple[Array, 
 
     From here on, the likelihood is that of all samples.
     """
-    every = [np.ones_like(mask) for mask in likelihood.tuned]
     if all(mask.all() for mask in likelihood.tuned):
         return theta, hessian
-    likelihood.tuned = every
-    return polish(likelihood, search_likelihood(likelihood, theta, lambda *_: None)[0])
+    tuned = likelihood.samples
+    likelihood.tuned = [np.ones_like(mask) for mask in likelihood.tuned]
+    hessian = likelihood.samples / tuned * hessian
+    theta, _ = search_likelihood(likelihood, theta, lambda *_: None, hessian)
+    return polish(likelihood, theta, hessian)
 
 
 def limit(
@@ -232,9 +281,7 @@ def limit(
     structure = likelihood.structure
     least, end = likelihood.value(theta), structure.limits[k][1 if sign > 0 else 0]
     others = [j for j in range(structure.seen) if j != k]
-    # Coordinates of the others in which the likelihood curves alike in all directions.
-    values, vectors = np.linalg.eigh(hessian[np.ix_(others, others)])
-    spread = vectors / np.sqrt(np.maximum(values, 1.0))
+    spread = _alike(hessian[np.ix_(others, others)])
     point = theta.copy()
 
     def rise(to: float) -> float:
@@ -260,24 +307,38 @@ def limit(
         point[:] = structure.bounded(begin)
         return float(np.sqrt(2.0 * max(difference, 0.0)))
 
-    inside, outside, inner, outer = float(theta[k]), None, 0.0, np.inf
-    to = theta[k] + sign * NORMAL / np.sqrt(max(hessian[k, k], 1.0))
+    # The rise is about a power of the distance, which is one of variances where k is a logarithm:
+    # also where the least cost is at a variance of 0, behind a long way on which nothing changes.
+    is_log, at = structure.is_log(k), float(theta[k])
+
+    def distance(to: float) -> float:
+        return abs(float(np.expm1(2.0 * (to - at)))) if is_log else abs(to - at)
+
+    def place(size: float) -> float:
+        if not is_log:
+            return at + sign * size
+        return at + 0.5 * float(np.log1p(sign * size)) if sign * size > -1.0 else -np.inf
+
+    inside, outside = at, sign * np.inf
+    known: list[tuple[float, float]] = []
+    to = at + sign * NORMAL / np.sqrt(max(hessian[k, k], 1.0))
     for _ in range(12):
         to = min(to, end) if sign > 0 else max(to, end)
         found = rise(to)
-        if found < NORMAL:
-            if to == end:
-                return None
-            inside, inner = to, found
-        else:
-            outside, outer = to, found
+        if found < NORMAL and to == end:
+            return None
         if abs(found - NORMAL) < 0.03:
             break
-        if outside is None:
-            to = theta[k] + np.clip(NORMAL / max(found, 1e-3), 1.2, 3.0) * (to - theta[k])
+        inside, outside = (to, outside) if found < NORMAL else (inside, to)
+        known = [*known, (math.log(distance(to)), math.log(max(found, 1e-3)))][-2:]
+        (before, low), (last, high) = known[0], known[-1]
+        power = (high - low) / (last - before) if len(known) > 1 and last != before else 1.0
+        wanted = place(math.exp(last + (math.log(NORMAL) - high) / min(max(power, 0.3), 3.0)))
+        if np.isfinite(outside):
+            middle, half = 0.5 * (inside + outside), 0.45 * abs(outside - inside)
+            to = float(np.clip(wanted, middle - half, middle + half))
         else:
-            share = np.clip((NORMAL - inner) / (outer - inner), 0.1, 0.9)
-            to = inside + share * (outside - inside)
+            to = wanted if sign < 0 else min(wanted, to + _FURTHER)
     return float(to)
 
 
@@ -304,6 +365,9 @@ def refine(
     def total(point: Array) -> float:
         return min(plain(point) + _STAY * float(np.sum((point - anchor) ** 2)), _FAILED)
 
+    samples = sum(map(len, likelihood.data))
+    most = score.seconds * samples * 2 * len(theta) * _REFINEMENTS
+    advance(f"estimator, at most about {most:.2g} s")
     anchor = min((theta, structure.start), key=plain)
     best: list[Any] = [anchor if known is None else known, value]
 

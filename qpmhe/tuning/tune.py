@@ -196,6 +196,8 @@ def tune(
     if starts is None:  # a further one costs little where the filter alone is searched
         starts = 2 if objective == "likelihood" else 1
     likelihoods = {kind.limit: Likelihood(plan, data, make, remade, kind.limit) for kind in kinds}
+    for one in likelihoods.values():
+        one.compile()
     at_start = _likelihood_at_start(likelihoods[kinds[0].limit])
     truth = objective == "truth"
     score = Score(
@@ -213,6 +215,8 @@ def tune(
     )))
     blocks = Blocks(data)
     with _interruptible(), _shown(progress) as advance:
+        expected = starts * likelihoods[kinds[0].limit].expected_seconds()
+        advance(f"likelihood, about {expected:.2g} s")
         searches = Searches(
             likelihoods, score, objective, blocks, _beginnings(plan, starts, seed), jobs, kept,
             advance,
