@@ -43,10 +43,10 @@ def test_cheap_steps_keep_the_promise(pytestconfig, seed):
 
 
 @pytest.mark.parametrize(("engine", "seed", "steps"), [
-    ("python", 0, 200), *(pytest.param("python", k, 400, marks=pytest.mark.slow) for k in (1, 2)),
-    *(pytest.param("compiled", k, 1200, marks=[pytest.mark.slow, pytest.mark.skipif(
+    ("python", 0, 200), pytest.param("python", 1, 400, marks=pytest.mark.slow),
+    pytest.param("compiled", 2, 1200, marks=[pytest.mark.slow, pytest.mark.skipif(
         find_compiler() is None, reason="there is no C compiler"
-    )]) for k in (0, 2)),
+    )]),
 ])
 def test_steps_with_everything_mixed_keep_the_promise(engine, seed, steps):
     counts, faults = fuzz_general.run(steps, seed, engine)
@@ -277,4 +277,6 @@ def test_the_campaign_notices_engines_that_differ(monkeypatch):
     monkeypatch.setattr(engines.Beside, "compare", wrong)
     for seed in range(3, 7):
         kinds |= {kind for kind, _ in Run(seed, "compiled", samples=40).go().faults}
-    assert any("engines: estimate" in kind and "open" in kind for kind in kinds), kinds
+        if any("engines: estimate" in kind and "open" in kind for kind in kinds):
+            return
+    pytest.fail(str(kinds))
