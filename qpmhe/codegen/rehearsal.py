@@ -406,12 +406,20 @@ class _Rehearsal:
     def _note_roots(self) -> None:
         """Allow for the rounding of an observer's update by roots, which no nudge shows.
 
-        A root, in units of its deviations, is rounded to shares of its least singular value.
+        A root, in units of its deviations, is rounded to shares of its least singular value. So is
+        the inverse of a covariance, which may be the prior's weight, of its least eigenvalue.
         """
         window = self._python.memory.window
-        if window.root is None:
-            return
         here = slice(window.start, window.end + 1)
+        if window.root is None:
+            if window.covariance is not None and self._arguments[2].observer_prior is not None:
+                P = window.covariance[here]
+                scaled = P / np.sqrt(np.einsum("ki,kj->kij", *[P.diagonal(0, 1, 2)] * 2))
+                if np.isfinite(scaled).all():
+                    least = np.linalg.eigvalsh(scaled).min()
+                    share = _EPSILONS / max(least, _EPSILONS)
+                    self._rounding = max(self._rounding, min(share, _LOST))
+            return
         roots = window.root[here][window.is_vague[here]]
         deviations = np.linalg.norm(roots, axis=-2, keepdims=True)
         if not (np.isfinite(deviations) & (deviations > 0.0)).all():

@@ -76,8 +76,12 @@ class PythonEngine:
         settings: Settings,
         initial_state: Array,
     ) -> None:
-        if not (settings.qp_limit or observer.needs_jacobians):
-            # A trace saves little here, and the observer is the user's to the last bit.
+        settles = settings.projection is not None and system.states is not None and (
+            observer.metric is None and observer.initial_covariance() is None
+        )
+        if not (settings.qp_limit or observer.needs_jacobians or settles):
+            # A trace saves little here, and the observer is the user's to the last bit. The metric
+            # of a projection that settles needs exact Jacobians.
             system = system.as_written()
         system.evaluation.prepare(settings.horizon)
         self._use_system(system)

@@ -149,3 +149,28 @@ def test_active_bounds_hold_exactly():
         assert (away[away < 1e-9] == 0.0).all()
         active += (away == 0.0).sum()
     assert active > 200
+
+
+def test_the_metric_is_that_of_exact_jacobians_also_where_no_qp_needs_them():
+    # Differences take steps in the scale of the prior: here out of the domain of f.
+    def f(x):
+        return np.array([0.9 * x[0] + 0.1 * np.sqrt(x[0] - 0.4), 0.95 * x[1] + 0.05 * x[0]])
+
+    system = qpmhe.System(
+        f, lambda x: np.array([np.log(x[0]) + 0.1 * x[1], x[1]]), n=2, p=2,
+        states=qpmhe.Box([1.0, -0.5], [1.0, 0.5]),
+    )
+    observer = qpmhe.Luenberger([[0.15, -0.02], [0.03, 0.18]])
+    cost = qpmhe.QuadraticCost(
+        prior=1e-18 * np.eye(2), disturbance=100.0 * np.eye(2), noise=100.0 * np.eye(2)
+    )
+    paths = []
+    for qps in (0, 1):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, observer, cost, horizon=3, initial_state=[1.0, 0.1], max_qps=qps,
+            engine="python",
+        )
+        paths.append([mhe.update([0.1 * t, 0.2]).observer_state for t in range(6)])
+        assert mhe._engine._window.metric.settled
+    np.testing.assert_allclose(*paths, rtol=1e-12)
+    assert 0.01 < abs(paths[0][-1][1]) < 0.49
