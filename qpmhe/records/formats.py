@@ -75,17 +75,54 @@ def read_mat(file: str, time: str | None = None) -> Channels:
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version
 
+    hint = " Objects such as timeseries are not read: save their Time and Data as arrays."
     major, _ = _attempt(file, "MAT", Exception, lambda: matfile_version(file))
-    if major == 2:  # v7.3, which is HDF5
-        loaded = partial(need("pymatreader", "a MAT file of version 7.3", "mat").read_mat, file)
-    else:
-        loaded = partial(loadmat, file, simplify_cells=True)
-    content = _attempt(file, "MAT", Exception, loaded)
-    tree = _grown({
+    if major != 2:
+        content = _attempt(file, "MAT", Exception, lambda: loadmat(file, simplify_cells=True))
+        return _of_tree(file, _variables(content), {}, time, hint)
+    kind = "a MAT file of version 7.3"  # which is HDF5
+    load, h5py = need("pymatreader", kind, "mat").read_mat, need("h5py", kind, "mat")
+    root = _attempt(file, "MAT", OSError, lambda: h5py.File(file, "r"))
+
+    def listed() -> dict[str, Any]:
+        found = {name: _matrix(item) for name, item in root.items() if name[0] != "#"}
+        others = [name for name, item in found.items() if item is None]
+        return found | _variables(load(file, variable_names=others) if others else {})
+
+    tree = _attempt(file, "MAT", Exception, listed, root.close)
+    channels = _of_tree(file, tree, {}, time, hint)
+    channels.close = root.close
+    return channels
+
+
+def _variables(content: dict[str, Any]) -> dict[str, Any]:
+    return _grown({
         name: value for name, value in content.items() if not name.startswith(("__", "#"))
     })
-    hint = " Objects such as timeseries are not read: save their Time and Data as arrays."
-    return _of_tree(file, tree, {}, time, hint)
+
+
+def _matrix(item: Any) -> Any:
+    """A matrix of numbers in a MAT file of version 7.3, or a struct of some; None if another."""
+    kind = item.attrs.get("MATLAB_class", b"")
+    if kind == b"struct" and hasattr(item, "items"):
+        fields = {name: _matrix(each) for name, each in item.items()}
+        return None if any(each is None for each in fields.values()) else fields
+    if hasattr(item, "items") or "MATLAB_empty" in item.attrs or item.dtype.kind not in "biuf":
+        return None
+    return np.zeros(0) if kind == b"char" else _Matrix(item)
+
+
+class _Matrix:
+    """A matrix of a MAT file, which has its columns first; read when it is needed."""
+
+    def __init__(self, item: Any) -> None:
+        self._item, self.dtype = item, item.dtype
+        self.shape = tuple(each for each in item.shape[::-1] if each != 1)
+
+    def __getitem__(self, key: Any) -> Any:
+        if len(self.shape) == 2 == len(self._item.shape) == len(key):
+            return self._item[key[::-1]]
+        return np.squeeze(self._item[()].T)[key]
 
 
 def read_hdf5(file: str, time: str | None = None) -> Channels:

@@ -151,6 +151,17 @@ def test_mat_has_what_scipy_or_pymatreader_reads(here, version):
         pytest.importorskip("pymatreader")
         mat73("record.mat", {name: np.asarray(each) if not isinstance(each, dict) else each
                              for name, each in variables.items()})
+        h5py = sys.modules["h5py"]
+        with h5py.File("record.mat", "r+") as file:  # what only pymatreader reads, and a text
+            parts = [file.create_dataset(f"#refs#/{k}", data=row[None])
+                     for k, row in enumerate(both.T)]
+            for part in parts:
+                part.attrs["MATLAB_class"] = np.bytes_("double")
+            cell = file.create_dataset("cell", data=np.array(
+                [[part.ref] for part in parts], h5py.ref_dtype))
+            cell.attrs["MATLAB_class"] = np.bytes_("cell")
+            text = file.create_dataset("slow/name", data=np.array([[111], [107]], np.uint16))
+            text.attrs["MATLAB_class"] = np.bytes_("char")
         content = sys.modules["pymatreader"].read_mat("record.mat")
     else:
         savemat("record.mat", variables, format=version)
@@ -161,6 +172,10 @@ def test_mat_has_what_scipy_or_pymatreader_reads(here, version):
     assert frame["level"].dropna().tolist() == FAST.tolist()
     assert seconds(frame["level"].dropna()) == pytest.approx(content["t"])
     assert "g" not in frame
+    assert "slow.name" not in frame
+    if version == "7.3":
+        assert frame["cell[1]"].dropna().tolist() == (FAST**2).tolist()
+        assert np.array_equal(content["cell"], both.T)
     if version == "4":
         assert list(frame) == ["pos[0]", "pos[1]", "across[0]", "across[1]", "level"]
         return
