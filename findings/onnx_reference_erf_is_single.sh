@@ -1,6 +1,6 @@
 #!/bin/sh
 # What happens: the reference evaluator of ONNX, onnx.reference, computes Erf in single precision where all tensors are
-# double: the values have 8 correct digits. Gelu and other operators that it builds of Erf have them, too.
+# double: the values have 8 correct digits.
 # Why most guess wrong: it is the reference, its result has the type of doubles, and its other functions have 16 digits.
 # Who meets it: who tests a converter, or a runtime in double precision, against the reference with a tolerance below 1e-8,
 # and looks for the fault in his own code.

@@ -208,22 +208,23 @@ def merged(
         return times[0], [np.arange(len(times[0]))]
     every = np.concatenate(times) if times else np.zeros(0)
     order = np.argsort(every, kind="stable")
-    owners = np.repeat(np.arange(len(times)), [len(each) for each in times])[order].tolist()
-    begins: list[int] = []
-    samples: list[int] = []
+    owners = np.repeat(np.arange(len(times)), [len(each) for each in times])[order]
+    moments, is_first = every[order], np.zeros(len(every), np.bool_)
     seen: set[int] = set()
     start: Any = None
-    for position, (time, owner) in enumerate(zip(every[order].tolist(), owners, strict=True)):
-        if start is None or time - start > tolerance or owner in seen:
-            start = time
-            seen.clear()
-            begins.append(position)
-        seen.add(owner)
-        samples.append(len(begins) - 1)
+    for begin in range(0, len(every), _BATCH):
+        span = slice(begin, begin + _BATCH)
+        pairs = zip(moments[span].tolist(), owners[span].tolist(), strict=True)
+        for position, (time, owner) in enumerate(pairs, begin):
+            if start is None or time - start > tolerance or owner in seen:
+                start = time
+                seen.clear()
+                is_first[position] = True
+            seen.add(owner)
     sample = np.empty(len(every), np.intp)
-    sample[order] = samples
+    sample[order] = np.cumsum(is_first) - 1
     ends = np.cumsum([len(each) for each in times])[:-1]
-    return every[order][begins], np.split(sample, ends)
+    return moments[is_first], np.split(sample, ends)
 
 
 def _texts(values: NDArray[Any]) -> list[str]:
