@@ -96,9 +96,9 @@ def read_mat(file: str, time: str | None = None) -> Channels:
 
 
 def _variables(content: dict[str, Any]) -> dict[str, Any]:
-    return _grown({
-        name: value for name, value in content.items() if not name.startswith(("__", "#"))
-    })
+    return {
+        name: _grown(value) for name, value in content.items() if not name.startswith(("__", "#"))
+    }
 
 
 def _matrix(item: Any) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.records import RecordError, channels, formats, read
+from qpmhe.records import RecordError, formats, read
 from qpmhe.records.arrays import read_record
 from qpmhe.records.channels import merged
 from qpmhe.records.record_model import load_record_model
@@ -281,7 +281,7 @@ def test_text_and_parquet_as_frames(here):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_merged_clocks_lose_nothing_and_invent_nothing(seed, monkeypatch):
-    monkeypatch.setattr(channels, "_BATCH", 5)
+    monkeypatch.setattr("qpmhe.records.channels._BATCH", 5)
     generator = np.random.default_rng(seed)
     tolerance = [0.0, 0.01, 0.3, 5.0][seed]
     times = [np.sort(generator.uniform(0, 3, generator.integers(0, 40)).round(2))
