@@ -53,8 +53,8 @@ def test_some_cases_of_every_test_run_and_the_rest_is_what_is_left_out(pytester)
     }
     # Oracles have more, each with other values.
     assert {name.rpartition("::")[2] for name in ran if "same_cases.py" in name} == {
-        *(f"test_product[{b}-{a}]" for a, b in enumerate("uvw")), "test_one", "test_short",
-        *(f"test_seeds[{seed}]" for seed in range(3)),
+        *(f"test_product[{b}-{a}]" for a, b in enumerate("uv")), "test_one", "test_short",
+        *(f"test_seeds[{seed}]" for seed in range(2)),
     }
     assert f"cases: {len(ran)} of 178" in output
     assert run("-n", "2")[0] == ran  # processes agree
