@@ -18,7 +18,7 @@ from collections import defaultdict
 import hypothesis
 import pytest
 
-CASES, DEEP = 3, {"oracles", "properties"}
+CASES, DEEP = 2, {"oracles", "properties"}
 # Examples of each property whose test names no number: without --all, and with it.
 FEW, MANY = 6, 12
 # Begun first, so that no long test is the last one: most of these tests start processes.

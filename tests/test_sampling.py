@@ -1,7 +1,12 @@
 """Which cases `make test` runs."""
 
+import itertools
 import re
 from pathlib import Path
+
+import pytest
+
+from tests.covering import covering
 
 pytest_plugins = "pytester"
 
@@ -48,8 +53,8 @@ def test_some_cases_of_every_test_run_and_the_rest_is_what_is_left_out(pytester)
     }
     # Oracles have more, each with other values.
     assert {name.rpartition("::")[2] for name in ran if "same_cases.py" in name} == {
-        *(f"test_product[{b}-{a}]" for a, b in enumerate("uvw")), "test_one", "test_short",
-        *(f"test_seeds[{seed}]" for seed in range(3)),
+        *(f"test_product[{b}-{a}]" for a, b in enumerate("uv")), "test_one", "test_short",
+        *(f"test_seeds[{seed}]" for seed in range(2)),
     }
     assert f"cases: {len(ran)} of 178" in output
     assert run("-n", "2")[0] == ran  # processes agree
@@ -63,3 +68,16 @@ def test_some_cases_of_every_test_run_and_the_rest_is_what_is_left_out(pytester)
     named = [f"test_cases.py::test_product[{b}-{a}]" for a in range(6) for b in "uvwxyz"]
     named.append("test_cases.py::test_slow")
     assert run(*named)[0] == set(named)
+
+
+def test_a_covering_array_has_every_pair_in_few_cases():
+    axes = {"a": "uvwxyz", "b": range(5), "c": [[], pytest.param({}, marks=pytest.mark.slow), ()]}
+    mark = covering(**axes).mark
+    assert mark.args[0] == ("a", "b", "c")
+    cases = mark.args[1]
+    for one, other in itertools.combinations(range(3), 2):
+        pairs = {(repr(case.values[one]), repr(case.values[other])) for case in cases}
+        assert len(pairs) == [6, 5, 3][one] * [6, 5, 3][other]
+    assert 30 <= len(cases) <= 36  # of 90
+    assert all(bool(case.marks) == (case.values[2] == {}) for case in cases)
+    assert len(covering(strength=1, **axes).mark.args[1]) == 6

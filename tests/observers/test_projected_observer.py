@@ -45,9 +45,9 @@ def test_projections_are_those_of_cvxpy(rank, diagonal):
             (np.eye(point.size), convex_set.lower, convex_set.upper),
             (convex_set.matrix, convex_set.row_lower, convex_set.row_upper),
         ):
-            for row, below, above in zip(rows, low, high, strict=True):
-                inside += [row @ target >= below] if np.isfinite(below) else []
-                inside += [row @ target <= above] if np.isfinite(above) else []
+            below, above = np.isfinite(low), np.isfinite(high)
+            inside += [rows[below] @ target >= low[below]] if below.any() else []
+            inside += [rows[above] @ target <= high[above]] if above.any() else []
         program = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(step)), inside)
         program.solve(solver="CLARABEL")
         assert found.reached == (program.status in ("optimal", "optimal_inaccurate"))

@@ -151,6 +151,7 @@ def test_converged_sequence_reaches_ipopts_minimum_on_every_window(seed, method)
         np.testing.assert_allclose(ours.trajectory, theirs.trajectory, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_statistics_of_the_papers_example():
     """As computed independently: about 0.59, 0.313, 0.311; 0.29 and 0.209 after 3 s."""
     system, observer, cost, scenario = qpmhe.models.batch_reactor()

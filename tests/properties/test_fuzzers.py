@@ -34,7 +34,7 @@ WAYS = [(source, writing) for source, writings in WRITINGS.items() for writing i
 @pytest.mark.shortened
 @pytest.mark.parametrize("seed", [3, 11])
 def test_cheap_steps_keep_the_promise(pytestconfig, seed):
-    steps = 1000 if pytestconfig.option.all else 200
+    steps = 1000 if pytestconfig.option.all else 100
     counts, faults = fuzz_promise.run(steps, seed)
     assert faults == []
     assert counts["steps"] >= steps
@@ -43,7 +43,7 @@ def test_cheap_steps_keep_the_promise(pytestconfig, seed):
 
 
 @pytest.mark.parametrize(("engine", "seed", "steps"), [
-    ("python", 0, 200), pytest.param("python", 1, 400, marks=pytest.mark.slow),
+    ("python", 0, 100), pytest.param("python", 1, 400, marks=pytest.mark.slow),
     pytest.param("compiled", 2, 1200, marks=[pytest.mark.slow, pytest.mark.skipif(
         find_compiler() is None, reason="there is no C compiler"
     )]),
