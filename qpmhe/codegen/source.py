@@ -394,24 +394,24 @@ def model_files(model: CasadiModel) -> dict[str, str]:
     return {"model.c": _sizes(model) + model_source(model) + template("model_api.c")}
 
 
-def likelihood_files(
-    model: CasadiModel, functions: Mapping[str, Any], slopes: Mapping[str, Any]
+def filter_files(
+    model: CasadiModel, part: str, functions: Mapping[str, Any], slopes: Mapping[str, Any]
 ) -> dict[str, str]:
     """Source of a library that filters records, in double precision.
 
-    Of the functions and the Jacobians whose nonzeros they have, by name; `LikelihoodLibrary` makes
-    them.
+    Of the functions and the Jacobians whose nonzeros they have, by name; `FilterLibrary` makes
+    them, and names the part.
     """
-    generator = _generator("mhe_likelihood.c")
+    generator = _generator("mhe_filter.c")
     calls = []
     for name, function in functions.items():
         generator.add(function)
         calls.append(_call(f"mhe_call_{name}", function.name(), function))
     for name, slope in slopes.items():
         calls += _tables(name, *slope.sparsity().get_triplet())
-    return {"likelihood.c": "\n".join((
+    return {f"{part}.c": "\n".join((
         _sizes(model), *_quieted(_bare(generator.dump()), False), *calls, template("algebra.c"),
-        template("likelihood.c"),
+        template(f"{part}.c"),
     ))}
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..codegen.filters import HypothesisInput, HypothesisLibrary, scalar_model
+from ..errors import CompilationError
+from ..estimation.engines import python_only
 from ..model.system import System
 
 Array = NDArray[np.float64]
@@ -18,12 +22,22 @@ Loss = Callable[[Array], tuple[Array, Array]]
 
 # Outliers have a Cauchy distribution, as they may be anything: their share, and its width.
 _SHARE, _WIDTH = 0.02, 8.0
+# Logarithms of densities: of one, beside the normal distribution's own, and of no outlier.
+_EXTREME = float(np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi)))
+_INLYING = float(np.log1p(-_SHARE))
 # Beyond this an innovation in its own deviations is an outlier rather than noise.
 _OUTLIER = 4.0
 # Of a sensor's samples, those that can be outliers at most.
 _MOST_OUTLIERS = 0.5
 # Samples without any measurement that make a gap, and measured ones after it that are no evidence.
 _GAP = 10
+# Seconds that NumPy takes for a sample of a filter, and a compiler for a library and for each of
+# the model's operations, roughly; a library is compiled where it saves so many times as much.
+_RUNNING, _LIBRARY, _COMPILING, _PAYS = 8e-6, 0.5, 4e-3, 3.0
+# Samples on which both filters are compared, and the difference that is no rounding.
+_COMPARED, _ROUNDING = 40, 1e-6
+# Of systems that were asked for one; None where it was not to be had.
+_libraries: WeakKeyDictionary[System, HypothesisLibrary | None] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +60,14 @@ class Hypothesis:
     def usual_noise(self) -> Array:
         """R, or its mean where it changes."""
         return self.noise if self.noise.ndim == 2 else np.asarray(self.noise.mean(axis=0))
+
+    def first(self, count: int) -> Hypothesis:
+        """The same of the first samples alone."""
+        return replace(
+            self, measurements=self.measurements[:count], inputs=self.inputs[:count],
+            noise=self.noise if self.noise.ndim == 2 else self.noise[:count],
+            repeats=None if self.repeats is None else self.repeats[:count],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +106,15 @@ class FilterBank:
 
     With a `loss`, of whitened innovations to their costs and to what corrects the filter, they are
     as `qpmhe.ExtendedKalman` is: linearised at the predictions alone; all samples are evidence.
+    Where so many filters are expected that C pays, they are compiled.
     """
 
     def __init__(
-        self, system: System, steps: Array | None, before: int = 0, *, loss: Loss | None = None
+        self, system: System, steps: Array | None, before: int = 0, *, loss: Loss | None = None,
+        filters: int = 1,
     ) -> None:
         self.system, self.before, self.steps, self._loss = system, before, steps, loss
+        self._filters = filters
         #: Length of the state that is filtered.
         self.n = system.n
         #: The first thing that the model has raised.
@@ -196,6 +221,13 @@ class FilterBank:
 
     def _run(self, hypotheses: Sequence[Hypothesis], usual: Hypothesis) -> Filtered:
         """Filter the record under hypotheses of this model, with units and evidence of `usual`."""
+        library = self._compiled(usual)
+        found = None if library is None else self._run_in_c(library, hypotheses, usual)
+        return self._run_in_numpy(hypotheses, usual) if found is None else found
+
+    def _run_in_numpy(
+        self, hypotheses: Sequence[Hypothesis], usual: Hypothesis
+    ) -> Filtered:
         y = np.array([one.measurements for one in hypotheses])
         u = np.array([self.full_inputs(one.inputs, one.step) for one in hypotheses])
         start = np.array([one.start for one in hypotheses])
@@ -219,11 +251,8 @@ class FilterBank:
         ])
         eye_n, eye_p = np.eye(n), np.eye(p)
         x, covariance = start.copy(), prior.copy()
-        alive, logs = np.ones(count, np.bool_), np.zeros((total, count))
-        shapes = (n,), (n,), (p,), (p, p), (p, p), (n, n), (n, n), (p, n), (n, p)
-        first = Filtered(logs, *(np.empty((total, *shape)) for shape in shapes))
-        extreme = np.log(_SHARE / _WIDTH * np.sqrt(2.0 / np.pi))  # beside a normal distribution
-        inlying, any_outliers = np.log1p(-_SHARE), outliers.any()
+        alive, first = np.ones(count, np.bool_), _results(total, count, n, p)
+        logs, any_outliers = first.logs, outliers.any()
         left_out = np.zeros((count, p))
         for t in range(total):
             now, seen = u[:, t], there[:, t]
@@ -238,8 +267,8 @@ class FilterBank:
                 far = outliers[:, None] & seen & (e * e > _OUTLIER**2 * own)
                 tail = np.log1p(e * e / own / _WIDTH**2) + 0.5 * np.log(own)
                 seen, left_out = seen & ~far, left_out + far
-                logs[t] += np.where(far, extreme - tail, 0.0).sum(axis=1)
-                logs[t] += inlying * (outliers * seen.sum(axis=1))
+                logs[t] += np.where(far, _EXTREME - tail, 0.0).sum(axis=1)
+                logs[t] += _INLYING * (outliers * seen.sum(axis=1))
             spread = spread + noise
             if not seen.all():
                 spread = np.where(seen[:, :, None] & seen[:, None, :], spread, eye_p)
@@ -290,6 +319,102 @@ class FilterBank:
                     covariance[some] += disturbance[some]
                     a[some] = slope @ a[some]
             first.transitions[t] = a[0]
+        self._judge(hypotheses, usual, logs, there, left_out)
+        if self._loss is None:
+            first.innovations[_recovering_of(usual)] = np.nan
+        logs[:, ~alive] = -np.inf
+        _in_outputs(first, unit)
+        return first
+
+    def _run_in_c(
+        self, library: HypothesisLibrary, hypotheses: Sequence[Hypothesis], usual: Hypothesis
+    ) -> Filtered | None:
+        """As `_run_in_numpy`; None where the first filter fails."""
+        (total, p), n = usual.measurements.shape, self.n
+        unit = np.sqrt(usual.usual_noise.diagonal())
+        first = _results(total, len(hypotheses), n, p)
+        there = np.array([np.isfinite(one.measurements) for one in hypotheses])
+        left_out, failed = np.zeros((len(hypotheses), p)), []
+        for k, one in enumerate(hypotheses):
+            found = library.run(
+                self._in_c(one, unit), [] if k else list(vars(first).values())[1:])
+            if found is None:
+                failed.append(k)
+            else:
+                first.logs[:, k], left_out[k] = found
+        if 0 in failed:
+            return None
+        self._judge(hypotheses, usual, first.logs, there, left_out)
+        if failed:  # as NumPy has them
+            some = self._run_in_numpy([hypotheses[k] for k in (0, *failed)], usual)
+            first.logs[:, failed] = some.logs[:, 1:]
+        first.innovations[_recovering_of(usual)] = np.nan
+        _in_outputs(first, unit)
+        return first
+
+    def _in_c(self, one: Hypothesis, unit: Array) -> HypothesisInput:
+        system, (total, p) = self.system, one.measurements.shape
+        inputs = self.full_inputs(one.inputs, one.step)
+        if not self._is_timed:
+            inputs = np.column_stack((inputs, np.full(total, system.dt or 0.0)))
+        states, residual, periods = system.states, system.output_residual, np.zeros(p)
+        if residual is not None:
+            periods[list(residual.components)] = residual.periods
+        return HypothesisInput(
+            one.start, one.prior, one.disturbance, one.noise / np.multiply.outer(unit, unit),
+            np.where(np.isfinite(one.measurements), one.measurements, 0.0), inputs,
+            np.isfinite(one.measurements), unit,
+            np.full(self.n, -np.inf) if states is None else states.lower,
+            np.full(self.n, np.inf) if states is None else states.upper, periods,
+            np.ones(total, np.int64) if one.repeats is None else one.repeats.astype(np.int64),
+            int(one.noise.ndim > 2), int(one.outliers), 1.0 if self._is_timed else one.step,
+            _OUTLIER, _WIDTH, _EXTREME, _INLYING,
+        )
+
+    def _compiled(self, one: Hypothesis) -> HypothesisLibrary | None:
+        """The library of this model, if it saves more time than it takes to compile it."""
+        system, residual = self.system, self.system.output_residual
+        if (
+            type(self) is not FilterBank or self._loss is not None or python_only()
+            or (residual is not None and residual.periods is None)
+            or (system.states is not None and system.turns is not None)
+        ):
+            return None
+        if system in _libraries:
+            return _libraries[system]
+        model = scalar_model(system.evaluated_by(system.model()).symbolic)
+        if model is None:
+            return None
+        operations = model.step().n_instructions() + model.h.n_instructions()
+        if self._filters * len(one.measurements) * _RUNNING < _PAYS * (
+            _LIBRARY + operations * _COMPILING
+        ):
+            return None
+        part = one.first(_COMPARED)
+
+        def fault(library: HypothesisLibrary) -> str:
+            found = self._run_in_c(library, [part], part)
+            if found is None:
+                return "the filter fails"
+            for got, true in zip(
+                vars(found).values(), vars(self._run_in_numpy([part], part)).values(), strict=True
+            ):
+                size = np.abs(np.nan_to_num(true)).max(axis=0)
+                if not (np.abs(np.nan_to_num(got - true)) <= _ROUNDING * size).all():
+                    return "the filter is not the one of NumPy"
+            return ""
+
+        try:
+            _libraries[system] = HypothesisLibrary(model, fault)
+        except CompilationError:
+            _libraries[system] = None
+        return _libraries[system]
+
+    def _judge(
+        self, hypotheses: Sequence[Hypothesis], usual: Hypothesis, logs: Array, there: Mask,
+        left_out: Array,
+    ) -> None:
+        """Log likelihoods of as many measurements as the usual one has, in its units."""
         for k, one in enumerate(hypotheses):  # the density of the record's own numbers
             if one.gains is not None:
                 logs[:, k] -= there[k] @ np.log(one.gains)
@@ -297,17 +422,29 @@ class FilterBank:
         counts, evidence = there.sum(axis=(1, 2)), np.isfinite(usual.measurements)
         logs *= evidence.sum() / np.maximum(counts, 1)
         if self._loss is None:
-            recovers = _recovering(np.asarray(evidence.any(axis=1)))
-            logs[recovers], first.innovations[recovers] = 0.0, np.nan
+            logs[_recovering_of(usual)] = 0.0
         # What leaves out most of a sensor does not explain it.
-        alive &= (left_out <= _MOST_OUTLIERS * there.sum(axis=1)).all(axis=1)
-        logs[:, ~alive | ~np.isfinite(logs).all(axis=0)] = -np.inf
-        first.innovations[...] *= unit
-        first.spreads[...] *= np.multiply.outer(unit, unit)
-        first.weights[...] /= np.multiply.outer(unit, unit)
-        first.outputs[...] *= unit[:, None]
-        first.gains[...] /= unit
-        return first
+        explains = (left_out <= _MOST_OUTLIERS * there.sum(axis=1)).all(axis=1)
+        logs[:, ~explains | ~np.isfinite(logs).all(axis=0)] = -np.inf
+
+
+def _results(total: int, count: int, n: int, p: int) -> Filtered:
+    shapes = (n,), (n,), (p,), (p, p), (p, p), (n, n), (n, n), (p, n), (n, p)
+    return Filtered(
+        np.zeros((total, count)), *(np.empty((total, *shape)) for shape in shapes))
+
+
+def _in_outputs(first: Filtered, unit: Array) -> None:
+    """Take results from units of the noise to those of the outputs."""
+    first.innovations[...] *= unit
+    first.spreads[...] *= np.multiply.outer(unit, unit)
+    first.weights[...] /= np.multiply.outer(unit, unit)
+    first.outputs[...] *= unit[:, None]
+    first.gains[...] /= unit
+
+
+def _recovering_of(usual: Hypothesis) -> Mask:
+    return _recovering(np.asarray(np.isfinite(usual.measurements).any(axis=1)))
 
 
 def _recovering(seen: Mask) -> Mask:

@@ -26,6 +26,8 @@ from .stuck import stuck
 
 # The search takes at most so many samples: of a longer record, those least like the model.
 _MOST_SAMPLES = 6000
+# Filters that a search for faults runs, roughly.
+_FILTERS = 200
 # Fewer samples with measurements say nothing about a covariance. Where the model fails, so many of
 # the longest stretches between are tried.
 LEAST_SAMPLES, _STRETCHES = 30, 3
@@ -130,7 +132,7 @@ class Examination:
         steps = None if source.steps is None else source.steps[part]
         # The system, by shorter steps where its own are too long, and the finding that they are.
         self.system, self.coarse = source.system, list[Finding]()
-        self.bank = FilterBank(self.system, steps, self.first)
+        self.bank = FilterBank(self.system, steps, self.first, filters=_FILTERS)
         start = run.states[self.first]
         start = start if np.isfinite(start).all() else run.states[0]
         y = source.measurements.copy()
@@ -236,7 +238,8 @@ class Examination:
     def _part(self, part: slice) -> tuple[FilterBank, Hypothesis, Filtered, int]:
         first, steps = self.first + part.start, self.source.steps
         bank = FilterBank(
-            self.system, None if steps is None else steps[self.first :][part], first
+            self.system, None if steps is None else steps[self.first :][part], first,
+            filters=_FILTERS,
         )
         base = replace(
             self.base, measurements=self.base.measurements[part], inputs=self.base.inputs[part],

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._checks import Array
-from ..codegen.likelihood import FilterInput, LikelihoodLibrary, scalar_model
+from ..codegen.filters import LikelihoodInput, LikelihoodLibrary, scalar_model
 from ..diagnosis.bank import FilterBank, Hypothesis
 from ..errors import CompilationError, QpmheError
 from ..estimation.engines import python_only
@@ -249,9 +249,9 @@ class _Filter:
         assert model is not None
         self._library = LikelihoodLibrary(model, fault)
 
-    def _record(self, weights: Weights, one: Data) -> FilterInput:
+    def _record(self, weights: Weights, one: Data) -> LikelihoodInput:
         y, u, dt, _ = self._given(weights, one)
-        return FilterInput(
+        return LikelihoodInput(
             one.start, *self._covariances(weights), y, np.hstack((u, dt)), one.observed,
             *self._clip, self._periods,
             *(() if self._threshold is None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.codegen import likelihood as library
+from qpmhe.codegen import filters as library
 from qpmhe.tuning import likelihood as tuned
 from qpmhe.tuning import search
 from tests.tuning.test_likelihood import check_slope, problem, untraced, zoo

@@ -68,7 +68,8 @@ static real mhe_filter_step(const mhe_record *r, int t, mhe_kept *k, real *z, re
     const real *y = r->y + (size_t)t * NY;
     real output[NY], seen[NX * NY], cross[NX * NY] = {0}, noise[NY * NY], cost = 0;
     real *L = k->root, *gain = k->gain;
-    mhe_call_ahead(k->z, r->u + (size_t)t * (NU + 1), z, k->A, output, k->C);
+    mhe_call_step(k->z, r->u + (size_t)t * (NU + 1), z, k->A);
+    mhe_call_output(k->z, r->u + (size_t)t * (NU + 1), output, k->C);
     for (int a = 0; a < MHE_C_NONZEROS; a++)
         if (!there[mhe_C_row[a]]) k->C[a] = 0;
     mhe_seen_covariance(k, seen);
