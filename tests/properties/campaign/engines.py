@@ -2,7 +2,8 @@
 
 A difference is explained, in this order: by the tolerance of the sequence, where both have
 converged and J is the same up to it; by a fall, where J is 1e-11 of the candidate's, or the
-estimates differ by so much of the step from it; by rounding, where an engine differs as much from
+estimates differ by so much of the step from it; by a flat J, where the J of two trajectories agree
+to 11 digits; by rounding, where an engine differs as much from
 itself when its memory and its data change in their last digits; by the tolerance of QPs, where one
 step follows the other once it solves them to 1e-12; by the rounding of the Hessian, where the
 Python step differs as much from itself when the QPs change in their last digits; by a cap or by a
@@ -187,6 +188,8 @@ class Beside:
             return "tolerance of the sequence"
         if kind != "candidate" and self._is_fall(estimate, other):
             return "a fall of 12 digits"
+        if kind == "memory" and J <= FALL and self._observers_agree():
+            return "flat J"
         engine = self.compiled._engine
         after, tools = engine._memory.copy(), engine._tools
         kept = self._kept() if kind == "memory" else None
@@ -205,6 +208,11 @@ class Beside:
         if solver.unsolved or STOPPED & (estimate.status | other.status):
             return "unsolved QP"
         return "open"
+
+    def _observers_agree(self):
+        ours, theirs = self._kept(), self.python._engine._window
+        size = self.case.x_units * (1.0 + np.abs(theirs.z[theirs.end] / self.case.x_units).max())
+        return bool((np.abs(ours.z[ours.end] - theirs.z[theirs.end]) <= CLOSE * size).all())
 
     def _is_fall(self, estimate, other):
         """Whether J or the estimate has left the candidate by all digits that a number has."""
@@ -256,6 +264,8 @@ class Beside:
             ]
         for python in self.exact:
             self._begin_again(python)
+            # Where a QP has many minimisers, what its solver has kept decides.
+            python.forget_warm_start()
             try:
                 again = act(python, _same)
             except QpmheError:  # a backend that cannot solve such QPs
