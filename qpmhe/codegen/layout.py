@@ -509,7 +509,7 @@ def _filled(
     for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = system.set_of(name)
         if name == "disturbances" and cost.space is not None:
-            _fill_rows(record[name], directions.constraints_of(system, cost).disturbances)
+            _fill_rows(record[name], directions.rows_of(system, cost))
             continue
         if one is None:
             continue

@@ -572,13 +572,15 @@ def _prior_parts(layout: Layout) -> tuple[str, ...]:
 
 def _search_parts(layout: Layout) -> tuple[str, ...]:
     """The parts of C that look for an estimate."""
+    soft, constrained = SOFT in layout.terms, layout.has_rows
     if layout.free is None:
         factor, blocks = "factor", ["factor_lapack" if layout.lapack else "factor_loops"]
     else:
-        factor, blocks = "elimination", []
-    soft = _or_none("soft", SOFT in layout.terms)
-    rows = f"rows_{factor}", "rows", "active_set", "interior_point", soft, "constrained", "curved"
-    constrained = layout.has_rows
+        factor, blocks = "elimination", [_or_none("pulls", soft)]
+    rows = (
+        f"rows_{factor}", "rows", "active_set", "interior_point", _or_none("soft", soft),
+        "constrained", "curved",
+    )
     return (
         *(["sets"] if constrained else []), _or_none("constraints", layout.constraints),
         "trial", "damping", factor, *blocks, "outcome", _or_none("budget", layout.clock), "trials",

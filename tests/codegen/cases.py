@@ -837,6 +837,21 @@ FEATURES = {
         "soft, graduated": (lambda: _inputs(states=NARROW.soften(linear=2.0)), losses(
             disturbance=qpmhe.Cauchy, noise=partial(qpmhe.GemanMcClure, graduation=30.0)
         ), WARM),
+        "soft states, fewer disturbances": (lambda: _fewer(
+            **SMALL, states=NARROW.soften(linear=0.5, quadratic=30.0),
+            noises=Box([-0.4, -0.4], [0.4, 0.4]),
+        ), gaps, conditions, MANY, AGAIN),
+        "soft disturbances, fewer": (lambda: _fewer(
+            disturbances=Box([-0.02, -0.03], [0.05, 0.03]).soften(linear=4.0),
+            noises=Box([-0.2, -0.1], [0.2, 0.1]).soften(linear=2.0, quadratic=1.0),
+        ), gaps, conditions, WARM, MANY),
+        "soft, singular covariance": (lambda: singular(_inputs(
+            states=NARROW.soften(linear=2.0), disturbances=SMALLER.soften(linear=1.0),
+        )), gaps),
+        "soft states, noise-free": (lambda: _inputs(
+            states=NARROW.soften(linear=2.0, quadratic=3.0),
+            disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
+        ), conditions, MANY, {"solver_tolerance": 1e-10}),
         "soft, unscented": (
             lambda: _reaction_in(POSITIVE.soften(linear=0.5)), filtered(UKF), gaps,
         ),

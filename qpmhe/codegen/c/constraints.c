@@ -127,6 +127,12 @@ static void mhe_linearize_constraints(mhe_estimator *e, mhe_workspace *k, const 
     }
 }
 
+/* The derivative of a row of stage i by component j of its state or of the next one. */
+static real mhe_value_slope(const mhe_workspace *k, int i, int r, int following, int j)
+{
+    return (following ? k->next_slopes : k->own_slopes)[(i * MHE_G_ROWS + r) * NX + j];
+}
+
 /* Rows that cannot be linearised have no limits. */
 static void mhe_leave_out(const mhe_workspace *k, int i, real *high)
 {

@@ -33,6 +33,12 @@ static void mhe_linearize_constraints(mhe_estimator *e, mhe_workspace *k, const 
     (void)e; (void)k; (void)around;
 }
 
+static real mhe_value_slope(const mhe_workspace *k, int i, int r, int following, int j)
+{
+    (void)k; (void)i; (void)r; (void)following; (void)j;
+    return 0;
+}
+
 static void mhe_leave_out(const mhe_workspace *k, int i, real *high)
 {
     (void)k; (void)i; (void)high;

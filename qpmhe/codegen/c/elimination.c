@@ -419,6 +419,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
 {
     const mhe_settings *s = e->settings;
     const int count = e->length;
+    real pull[NX] = {0};
     for (int i = count; i >= 0; i--) {
         const mhe_block *b = k->blocks + i, *later = b + 1;
         const real *drift = k->drift + i * NX, *target = k->targets + i * (MHE_FREE + NY);
@@ -442,6 +443,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
                 side[at] -= mhe_entry(later, j, MHE_FREE + l) * drift[l];
         }
         mhe_apply(b, side);
+        mhe_pull_side(e, k, i, side, pull);
     }
     const mhe_block *start = &k->start, *data = k->blocks;
     real side[2 * NX], first[NX];
@@ -449,6 +451,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
     for (int j = data->free; j < data->rank; j++) side[at++] = k->sides_of[j];
     for (int j = 0; j < NX; j++) side[at++] = push ? 0 : k->first_target[j];
     mhe_apply(start, side);
+    mhe_pull_first(k, side, pull);
     for (int j = NX - 1; j >= 0; j--) {
         real sum = side[j];
         for (int c = j + 1; c < NX; c++) sum -= start->rows[j * COLUMNS + c] * first[c];
