@@ -508,6 +508,8 @@ class Softened:
                 rounding = _ROUNDING * (magnitudes @ terms + np.abs(sides))
                 if (np.abs(off) <= rounding[solved]).all():
                     break
+                if not (np.isfinite(off).all() and np.isfinite(reaction).all()):
+                    return None
                 change = _least_squares(reaction, off)
                 forces[solved] += change
                 step = step - moves @ change

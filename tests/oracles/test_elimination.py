@@ -307,7 +307,7 @@ def unbalanced(name, model, P, scale, Y, trajectory):
     A, C, G, q = model
     n, r = G.shape
     count, size = len(trajectory) - 1, n + (len(trajectory) - 1) * r
-    at, moves, rows, side = np.eye(n, size), [np.eye(n, size)], [], []
+    at, moves, rows = np.eye(n, size), [np.eye(n, size)], []
     for i in range(count):
         at = A @ at + G @ np.eye(size)[n + r * i : n + r * (i + 1)]
         moves.append(at)
