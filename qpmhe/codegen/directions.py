@@ -68,8 +68,10 @@ class Directions:
     def _on_d(self, penalties: Mapping[str, Array], rows: Rows | None) -> dict[str, Array]:
         """Penalties of all rows of a stage, with those on d in place of those of W."""
         given, found = self.system.set_of("disturbances"), dict(penalties)
+        if rows is None:
+            return found
         first = 0 if given is None else given.dimension + len(given.matrix)
-        for name, usual in (("linear", np.inf), ("quadratic", 0.0)) if rows is not None else ():
+        for name, usual in (("linear", np.inf), ("quadratic", 0.0)):
             own = np.append(penalties[name][:first], usual)  # the last of noise-free directions
             bounds = np.full(self.system.n, usual)
             found[name] = np.concatenate((bounds, own[rows.numbers], penalties[name][first:]))

@@ -62,7 +62,7 @@ _SET_TYPE = Template("""typedef struct {
 _PARTS = {
     "covariances": "the observer's covariances", "elimination": "directions that have disturbances",
     "quiet": "directions that have none", "restart": "the test by which an observer is restarted",
-    "constraints": "the nonlinear constraints, by their rows; deviations are of (x, w, v)",
+    "constraints": "the nonlinear constraints; deviations are of (x, w, v), w = through d",
 }
 
 
@@ -117,6 +117,8 @@ class Layout:
     soft_states: bool = False
     #: Rows of nonlinear constraints at each stage, and whether some also hold at the newest state.
     constraints: int = 0
+    #: Components of the w that they are functions of, where it is not d; else 0.
+    constraints_w: int = 0
     constrains_end: bool = False
     #: States that are held where the window does not see them.
     held: int = 0
@@ -166,6 +168,7 @@ class Layout:
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
             free=directions.free, soft_states="states" in system.soft, held=len(system.held),
             constraints=0 if functions is None else functions.size,
+            constraints_w=0 if functions is None else functions.of_directions,
             constrains_end=functions is not None and bool(functions.on_state.any()),
             terms=tuple(term.name for term in terms),
             numbers_of=tuple(
@@ -215,6 +218,7 @@ class Layout:
             values[f"{letter}_rows"] = rows
         values["x_hard"] = int(self.projects)
         values["g_rows"], values["end_rows"] = self.constraints, int(self.ends_with_rows)
+        values["g_w"] = self.constraints_w
         return values
 
     def _part_types(self, prefix: str) -> tuple[str, str]:

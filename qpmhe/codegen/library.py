@@ -52,11 +52,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     functions = system.constraints
     if functions is not None and functions.untraced:
         return f"{functions.untraced}; change that, or take engine='python'."
-    if functions is not None and Directions(system, observer, cost).free is not None:
-        return (
-            "engine='compiled' does not have nonlinear constraints where disturbances have fewer "
-            "directions than the state; take engine='python'."
-        )
     form = observer.c_form
     if form is None:
         return (

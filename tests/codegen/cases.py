@@ -633,6 +633,14 @@ def _of_all(x, u, w, v):
     ])
 
 
+def _of_few(x, w, v):
+    """Curved rows of two disturbances; the last one of states and noises alone."""
+    return np.array([
+        x[0] * v[1] + w[0] * x[2] - 0.02, w[0] * w[1] + 5.0 * w[1] ** 2 - 0.01 - 0.05 * w[0],
+        v[0] ** 2 + 0.5 * x[1] - 0.3,
+    ])
+
+
 def _of_states(x):
     """Rows that also hold at the newest state."""
     return np.array([x[0] ** 2 + 2.0 * x[1] ** 2 - 0.5, 0.2 - x[0] - x[2] ** 2])
@@ -878,6 +886,20 @@ FEATURES = {
         "constraints of angles": (lambda: _ship(constraints=[
             Constraint(lambda x, v: np.sin(x[0]) * x[1] + 0.001 * v[0] - 0.3, linear=5.0),
         ]), gaps, MANY, {"solver_tolerance": 1e-12}),
+        "constraints, fewer disturbances": (lambda: _fewer(
+            constraints=[Constraint(_of_few, 3), Constraint(_of_states, 2)],
+        ), gaps, MANY),
+        "soft constraints, fewer disturbances": (lambda: _fewer(**SMALL, constraints=[
+            Constraint(_of_states, 2, linear=[2.0, 0.5], quadratic=[1.0, 30.0]),
+            Constraint(_of_few, 3, linear=20.0),
+        ], states=NARROW.soften(linear=1.0)), conditions, MANY),
+        "constraints, noise-free": (lambda: _inputs(
+            constraints=[Constraint(_of_states, 2), Constraint(_of_all, 3, linear=20.0)],
+            disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
+        ), gaps, AGAIN, {"solver_tolerance": 1e-10}),
+        "constraints, fewer disturbances, restored": (lambda: _fewer(
+            constraints=[Constraint(lambda w: 0.05 - w[0] + w[1] ** 2)]
+        ), gaps, RESTORE, {"solver_tolerance": 1e-10}),
         "constraints that fail": (lambda: _inputs(constraints=[
             Constraint(lambda x: 0.3 - np.sqrt(x[0] - 0.2), linear=2.0), Constraint(_undefined),
         ]),),

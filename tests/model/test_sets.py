@@ -220,9 +220,6 @@ WRONG = [
      "constraints[0] is [nan] at the initial state"),
     (lambda: make({"constraints": [Constraint(branching)]}, engine="compiled"), OptionError,
      "constraints[0] has no C form ("),
-    (lambda: make({"constraints": [Constraint(ball)], "disturbances": Box([0.0, -1.0], [0.0, 1.0])},
-                  engine="compiled"),
-     OptionError, "nonlinear constraints where disturbances have fewer directions"),
     (lambda: make({"state_residual": qpmhe.angles([0]), "states": SOFT["states"]}), SetError,
      "bounds an angle"),
 ]

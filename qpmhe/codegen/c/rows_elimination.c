@@ -30,6 +30,8 @@ static void mhe_stage_curvature(mhe_estimator *e, const mhe_workspace *k, int i,
         for (int j = 0; j < NX; j++)
             diagonal[j] = k->factors[i] * mhe_scaled(mhe_disturbance_weight(
                 s, mhe_stage_at(e, i - 1))[j * NX + j], k->at[i - 1]->disturbance_scale, j);
+    mhe_add_missed_curvature(e, k, i, diagonal);
+    mhe_add_bend_curvature(k, i, diagonal);
     if (i == e->length) return;
     const mhe_terms *t = k->at[i];
     const real *Q = mhe_disturbance_weight(s, mhe_stage_at(e, i));
@@ -46,7 +48,6 @@ static void mhe_stage_curvature(mhe_estimator *e, const mhe_workspace *k, int i,
             for (int j = 0; j < NX; j++)
                 diagonal[j] += weight * t->h_jacobian[r * NX + j] * t->h_jacobian[c * NX + j];
         }
-    mhe_add_missed_curvature(e, k, i, diagonal);
 }
 
 static void mhe_set_stiffness(mhe_estimator *e, mhe_workspace *k);
@@ -57,6 +58,7 @@ static int mhe_factorise_weighted(mhe_estimator *e, mhe_workspace *k, const real
                                   int active)
 {
     mhe_assemble(e, k, offset);
+    mhe_use_bends(k, nearest);
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);
     if (active) mhe_set_stiffness(e, k);
     return mhe_factorise(e, k, active);
@@ -115,7 +117,7 @@ static real mhe_twice_objective(mhe_estimator *e, const mhe_workspace *k)
                        (v[c] + 2 * k->around->v[i * NY + c]);
         objective += k->factors[i + 1] * sum;
     }
-    return objective;
+    return objective + mhe_bend_objective(e, k);
 }
 
 /* The same steps of the interior point. */

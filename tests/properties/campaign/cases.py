@@ -220,7 +220,7 @@ class Case:
         self.constraint = None
         if self.engine == "compiled":  # other draws are what they were before C had constraints
             r = np.random.default_rng([self.seed, 15])
-        if not (self.engine == "python" or self.is_everywhere) or r.random() >= 0.15:
+        if r.random() >= 0.15:
             return
         units, radius, R = 1.0 / self.x_units, 2.0 + np.sum(self.model.start**2), np.sqrt(
             np.diag(self.R)
