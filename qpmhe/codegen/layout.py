@@ -272,6 +272,7 @@ class Layout:
         """``mhe_estimate``."""
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
         rejected = [("rejected", np.uint8, self.sensors)] if self.sensors else []
+        failed = [("trial_failed", np.uint8)] if self.constraints else []
         missed = [("missed", np.uint8, self.rows)] if self.restores else []
         return _struct([
             ("cost", r), ("candidate_cost", r), ("restored_cost", r),
@@ -280,7 +281,7 @@ class Layout:
             ("observer_state", r, n), ("filtered", r, n),
             ("time", np.int64), ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, self.rows), *rejected, *missed,
+            ("dropped", np.uint8, self.rows), *rejected, *failed, *missed,
         ])
 
     def set_type(self, name: str) -> np.dtype[Any]:

@@ -903,6 +903,16 @@ FEATURES = {
         "constraints that fail": (lambda: _inputs(constraints=[
             Constraint(lambda x: 0.3 - np.sqrt(x[0] - 0.2), linear=2.0), Constraint(_undefined),
         ]),),
+        # Steps that converge, that do not, and that find no decrease behind trials without values.
+        "constraints that fail along trials": (
+            lambda: _inputs(constraints=[
+                Constraint(lambda x: np.log(x[1] + 0.3) - 1.0),
+                Constraint(lambda x, w: 0.02 - np.sqrt(x[0] + 0.1) + w[0]),
+            ]), MANY, {"tolerance": 1e-5},
+            lambda one: samples_with(
+                one, lambda t, y: {"y": y + 2.0} if t % 5 == 2 else {}
+            ),
+        ),
         "constraints of 1e200": (lambda: constraints_of(1e200), MANY),
         "constraints, restored": (lambda: _inputs(
             constraints=[Constraint(lambda w: 0.2 - w[0] + w[1] ** 2)]

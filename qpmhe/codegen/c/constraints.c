@@ -15,9 +15,11 @@
     mhe_real next_slopes[MHE_HORIZON * MHE_G_ROWS * MHE_NX];
     mhe_real pushes[(MHE_HORIZON + 1) * MHE_G_ROWS];
     uint8_t unusable[(MHE_HORIZON + 1) * MHE_G_ROWS];
-    int32_t has_pushes, has_bends;
+    int32_t has_pushes, has_bends, trial_failed;
     mhe_real change[MHE_JOINT * MHE_JOINT], directions_of[MHE_JOINT * MHE_JOINT];
     mhe_real moved[MHE_JOINT * 2 * MHE_NX];
+@mhe_estimate
+    uint8_t trial_failed; /* whether a constraint has had no value along a trial that led no further */
 @
 /* Step of second derivatives, as a share of the deviations. */
 #define MOVE (sizeof(real) == 8 ? (real)0.000244140625 : (real)0.015625)
@@ -247,7 +249,22 @@ static void mhe_missed_values(mhe_workspace *k, int i, const mhe_trial *best)
 }
 
 /* A new sequence of QPs begins. */
-static void mhe_forget_pushes(mhe_workspace *k) { k->has_pushes = k->has_bends = 0; }
+static void mhe_forget_pushes(mhe_workspace *k)
+{
+    k->has_pushes = k->has_bends = 0;
+    k->trial_failed = 0;
+}
+
+/* Note a trial that leads no further. */
+static void mhe_note_trial(const mhe_estimator *e, mhe_workspace *k, const mhe_trial *trial)
+{
+    if (!mhe_has_values(e, trial)) k->trial_failed = 1;
+}
+
+static void mhe_fill_trial_failed(const mhe_workspace *k, mhe_estimate *out)
+{
+    out->trial_failed = k->trial_failed != 0;
+}
 
 /* Keep the forces of a QP's solution, of its active set or of its interior point. */
 static void mhe_keep_pushes(mhe_estimator *e, mhe_workspace *k, int is_solved, int is_exact)

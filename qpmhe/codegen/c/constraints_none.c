@@ -88,6 +88,16 @@ static void mhe_forget_pushes(mhe_workspace *k)
     (void)k;
 }
 
+static void mhe_note_trial(const mhe_estimator *e, mhe_workspace *k, const mhe_trial *trial)
+{
+    (void)e; (void)k; (void)trial;
+}
+
+static void mhe_fill_trial_failed(const mhe_workspace *k, mhe_estimate *out)
+{
+    (void)k; (void)out;
+}
+
 static void mhe_keep_pushes(mhe_estimator *e, mhe_workspace *k, int is_solved, int is_exact)
 {
     (void)e; (void)k; (void)is_solved; (void)is_exact;
