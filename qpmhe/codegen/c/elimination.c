@@ -426,6 +426,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
     const mhe_settings *s = e->settings;
     const int count = e->length;
     real pull[NX] = {0};
+    (void)pull; /* no row pulls */
     for (int i = count; i >= 0; i--) {
         const mhe_block *b = k->blocks + i, *later = b + 1;
         const real *drift = k->drift + i * NX, *target = k->targets + i * (MHE_FREE + NY);

@@ -25,6 +25,13 @@ static void mhe_set_pulls(const mhe_estimator *e, mhe_workspace *k)
     memcpy(q->load, q->missed, sizeof(real) * (size_t)rows);
 }
 
+/* The loads of missed rows become 0. */
+static void mhe_unload_missed(const mhe_estimator *e, mhe_workspace *k)
+{
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++)
+        if (mhe_is_violated(&k->rows, i)) k->rows.load[i] = 0;
+}
+
 static void mhe_forget_pulls(mhe_workspace *k) { k->has_pulls = 0; }
 
 /* side += R'^-1 pull in the disturbances of stage i; `pull` is on the state behind it, and then on its
@@ -74,17 +81,19 @@ static real mhe_slope_of(const mhe_estimator *e, const mhe_workspace *k, int i, 
     real slope = 0;
     (void)s; (void)x;
     if (r >= G_AT) return mhe_value_slope(k, i, r - G_AT, following, j);
-    if (MHE_W_SET && v < 0)
+    if (MHE_W_SET && v < 0) {
         for (int q = 0; q < NX; q++) {
             const real share = r < NX ? r == q : s->disturbances.rows[(r - NX) * NX + q];
             if (share != 0) slope += share * (following ? q == j : k->at[i]->f_jacobian[q * NX + j]);
         }
+    }
     if (following || v < 0) return slope;
-    if (MHE_V_SET && x < 0)
+    if (MHE_V_SET && x < 0) {
         for (int q = 0; q < NY; q++) {
             const real share = v < NY ? v == q : s->noises.rows[(v - NY) * NY + q];
             if (share != 0) slope += share * k->at[i]->h_jacobian[q * NX + j];
         }
+    }
     if (MHE_X_SET && x >= 0) slope = x < NX ? x == j : s->states.rows[(x - NX) * NX + j];
     return slope;
 }

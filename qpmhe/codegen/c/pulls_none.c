@@ -5,6 +5,11 @@ static void mhe_set_pulls(const mhe_estimator *e, mhe_workspace *k)
     (void)e; (void)k;
 }
 
+static void mhe_unload_missed(const mhe_estimator *e, mhe_workspace *k)
+{
+    (void)e; (void)k;
+}
+
 static void mhe_forget_pulls(mhe_workspace *k)
 {
     (void)k;

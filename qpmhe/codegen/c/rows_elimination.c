@@ -77,9 +77,7 @@ static int mhe_solve_loaded(mhe_estimator *e, mhe_workspace *k, int nearest, int
 /* What the active rows' new forces add to them; those of missed rows are all in the solution. */
 static int mhe_solve_loads(mhe_estimator *e, mhe_workspace *k)
 {
-    mhe_rows *q = &k->rows;
-    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++)
-        if (mhe_is_violated(q, i)) q->load[i] = 0;
+    mhe_unload_missed(e, k);
     return mhe_solve(e, k, 1, k->direction);
 }
 
