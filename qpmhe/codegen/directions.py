@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +17,7 @@ from ..observers import Observer
 from ..terms.base import TermForm
 from ..terms.prior import PriorCost
 from ..terms.rows import Rows
+from ..terms.soft import SOFT, Penalties
 from ..terms.sum import CostSum
 
 Array = NDArray[np.float64]
@@ -57,7 +59,23 @@ class Directions:
         """The terms of J that not every estimator has."""
         prior = PriorCost(system, self.observer, cost)
         basis = Constraints(system, cost, prior.covariance).basis
-        return CostSum(system, cost, prior, basis).c_forms
+        forms, rows = CostSum(system, cost, prior, basis).c_forms, self.rows_of(system, cost)
+        return forms if cost.space is None else tuple(
+            one._replace(data=self._on_d(one.data, rows)) if one.name == SOFT else one
+            for one in forms
+        )
+
+    def _on_d(self, penalties: Mapping[str, Array], rows: Rows | None) -> dict[str, Array]:
+        """Penalties of all rows of a stage, with those on d in place of those of W."""
+        given, found = self.system.set_of("disturbances"), dict(penalties)
+        if rows is None:
+            return found
+        first = 0 if given is None else given.dimension + len(given.matrix)
+        for name, usual in (("linear", np.inf), ("quadratic", 0.0)):
+            own = np.append(penalties[name][:first], usual)  # the last of noise-free directions
+            bounds = np.full(self.system.n, usual)
+            found[name] = np.concatenate((bounds, own[rows.numbers], penalties[name][first:]))
+        return found
 
     @property
     def quiet(self) -> int:
@@ -104,7 +122,19 @@ class Directions:
     @property
     def rows(self) -> Rows | None:
         """The rows on d in place of the set W; None where W itself is on d."""
-        return None if self.cost.space is None else self.constraints.disturbances
+        return None if self.cost.space is None else self.rows_of(self.system, self.cost)
+
+    def rows_of(self, system: System, cost: Cost) -> Rows | None:
+        """The same for a system with other sets, and a cost of d with other weights."""
+        hard, soft, space = self.constraints_of(system, cost).disturbances, None, cost.space
+        if space is not None and "disturbances" in system.soft:
+            prior = PriorCost(system, self.observer, cost).covariance
+            soft = Penalties(system, cost, prior).rows_of("disturbances")
+        if soft is None or space is None:
+            return hard
+        found = soft.mapped(None, space.noise_free, np.zeros(len(soft.matrix), np.bool_))
+        found.fixed &= found.numbers < 0  # a soft row without width may be missed
+        return found
 
     def weight_of_d(self, weight: Array) -> Array:
         """The weight (n, n) of d, from that of w."""

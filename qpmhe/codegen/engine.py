@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from ..model.system import System
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
 from .exchange import empty_record, hand_over, own_fields, record_of, write
-from .failure import FAILED, FAILED_TRIAL, Failure
+from .failure import FAILED, Failure
 from .layout import CHANGES
 from .library import EstimatorLibrary
 from .sample import SampleRecord
@@ -37,6 +38,7 @@ from .watched import WatchedFunctions
 Array = NDArray[np.float64]
 
 _ROWS_DROPPED, _OUTSIDE = Status.ROWS_DROPPED.value, Status.CANDIDATE_OUTSIDE.value
+_TIME_UP, _NEVER = Status.TIME_UP.value, np.zeros(1, np.uint8)
 # So that a long record can be interrupted, and its times are means of pieces.
 _PIECE = 256
 
@@ -99,8 +101,8 @@ class CompiledEngine:
         self._call = library.update
         self._observer, self._watch = observer, CompiledWatch(horizon)
         self._rejects = observer.rejects
-        # What somebody may ask the words for.
-        self._failing = FAILED if system.constraints is None else FAILED | FAILED_TRIAL
+        # Whether a nonlinear constraint has failed along a trial, where there are any.
+        self._trial_failed = self._out["trial_failed"] if library.layout.constraints else _NEVER
         self._time = self._memory["time"]
         # Holds the present window where that is asked for.
         self._mirror: PythonEngine | None = None
@@ -188,7 +190,7 @@ class CompiledEngine:
             if not self.length:
                 return None
             estimate = self._collect(self.time - 1)
-            if self._numbers[1] & self._failing:
+            if self._numbers[1] & FAILED or self._trial_failed[0]:
                 estimate.failure = self._failure(
                     memory, before.usual, lambda engine: engine.set(changes, given)
                 )
@@ -214,7 +216,7 @@ class CompiledEngine:
                 self._own.fill(dt, own)
                 self._call(*self._special)
             estimate = self._collect(time)
-            if self._numbers[1] & self._failing:
+            if self._numbers[1] & FAILED or self._trial_failed[0]:
                 inputs = y.copy(), u.copy(), dt, own
                 memory = self._memory.copy()
                 self._library.undo(ctypes.c_void_p(memory.ctypes.data), self._undoing[1])
@@ -291,7 +293,7 @@ class CompiledEngine:
                 *self._amending, time, ctypes.c_void_p(self._y.ctypes.data), self._result
             )
             estimate = self._collect(self.time - 1)
-            if self._numbers[1] & self._failing:
+            if self._numbers[1] & FAILED or self._trial_failed[0]:
                 late = y.copy()
                 estimate.failure = self._failure(
                     before, self.usual, lambda engine: engine.amend(time, late)
@@ -306,7 +308,10 @@ class CompiledEngine:
         self, memory: NDArray[Any], usual: Conditions,
         step: Callable[[PythonEngine], Estimate | None],
     ) -> Failure:
-        parts = self._system, self._observer, self._given_cost, self._settings
+        settings = replace(self._settings, time_budget=None)
+        if self._numbers[1] & _TIME_UP:  # after as many QPs
+            settings = replace(settings, max_qps=int(self._numbers[2]))
+        parts = self._system, self._observer, self._given_cost, settings
         return Failure(parts, self._library, usual, memory, step)
 
     def run(self, ys: Array, us: Array | None) -> Run:

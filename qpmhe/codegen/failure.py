@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,8 @@ from ..observers import Observer
 from .exchange import hand_over
 from .library import EstimatorLibrary
 
-#: Flags of a step in which a function of the model, the observer or the cost has failed; and those
-#: with which a nonlinear constraint may have failed along a trial.
+#: Flags of a step in which a function of the model, the observer or the cost has failed.
 FAILED = Status.MODEL_FAILED.value
-FAILED_TRIAL = (Status.NO_DECREASE | Status.CAP_REACHED).value
 
 
 class Failure:
@@ -36,7 +33,7 @@ class Failure:
     Parameters
     ----------
     parts : tuple
-        System, observer, cost and settings of the estimator.
+        System, observer, cost and settings of the step, without a time budget.
     library : EstimatorLibrary
         Its library.
     usual : Conditions
@@ -60,9 +57,7 @@ class Failure:
         library, record = self._library, self._memory[0]
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the step in C has given them
-            engine = PythonEngine(
-                system, observer, cost, replace(settings, time_budget=None), record["z_end"].copy()
-            )
+            engine = PythonEngine(system, observer, cost, settings, record["z_end"].copy())
             hand_over(record, library.layout, library.directions, self._usual, engine, True)
             estimate = self._step(engine)
         return "" if estimate is None else estimate.message

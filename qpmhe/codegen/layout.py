@@ -62,7 +62,7 @@ _SET_TYPE = Template("""typedef struct {
 _PARTS = {
     "covariances": "the observer's covariances", "elimination": "directions that have disturbances",
     "quiet": "directions that have none", "restart": "the test by which an observer is restarted",
-    "constraints": "the nonlinear constraints, by their rows; deviations are of (x, w, v)",
+    "constraints": "the nonlinear constraints; deviations are of (x, w, v), w = through d",
 }
 
 
@@ -117,6 +117,8 @@ class Layout:
     soft_states: bool = False
     #: Rows of nonlinear constraints at each stage, and whether some also hold at the newest state.
     constraints: int = 0
+    #: Components of the w that they are functions of, where it is not d; else 0.
+    constraints_w: int = 0
     constrains_end: bool = False
     #: States that are held where the window does not see them.
     held: int = 0
@@ -166,6 +168,7 @@ class Layout:
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,
             free=directions.free, soft_states="states" in system.soft, held=len(system.held),
             constraints=0 if functions is None else functions.size,
+            constraints_w=0 if functions is None else functions.of_directions,
             constrains_end=functions is not None and bool(functions.on_state.any()),
             terms=tuple(term.name for term in terms),
             numbers_of=tuple(
@@ -215,6 +218,7 @@ class Layout:
             values[f"{letter}_rows"] = rows
         values["x_hard"] = int(self.projects)
         values["g_rows"], values["end_rows"] = self.constraints, int(self.ends_with_rows)
+        values["g_w"] = self.constraints_w
         return values
 
     def _part_types(self, prefix: str) -> tuple[str, str]:
@@ -268,6 +272,7 @@ class Layout:
         """``mhe_estimate``."""
         r, n, p, count = self.number, self.nx, self.ny, self.horizon
         rejected = [("rejected", np.uint8, self.sensors)] if self.sensors else []
+        failed = [("trial_failed", np.uint8)] if self.constraints else []
         missed = [("missed", np.uint8, self.rows)] if self.restores else []
         return _struct([
             ("cost", r), ("candidate_cost", r), ("restored_cost", r),
@@ -276,7 +281,7 @@ class Layout:
             ("observer_state", r, n), ("filtered", r, n),
             ("time", np.int64), ("length", np.int32), ("status", np.int32), ("qps", np.int32),
             ("iterations", np.int32), ("corrections", np.int32), ("nearest_points", np.int32),
-            ("dropped", np.uint8, self.rows), *rejected, *missed,
+            ("dropped", np.uint8, self.rows), *rejected, *failed, *missed,
         ])
 
     def set_type(self, name: str) -> np.dtype[Any]:
@@ -509,7 +514,7 @@ def _filled(
     for name, weight in zip(SET_NAMES, weights, strict=True):
         one: ConvexSet | None = system.set_of(name)
         if name == "disturbances" and cost.space is not None:
-            _fill_rows(record[name], directions.constraints_of(system, cost).disturbances)
+            _fill_rows(record[name], directions.rows_of(system, cost))
             continue
         if one is None:
             continue

@@ -52,15 +52,6 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
     functions = system.constraints
     if functions is not None and functions.untraced:
         return f"{functions.untraced}; change that, or take engine='python'."
-    if functions is not None or system.soft:
-        directions, kind = Directions(system, observer, cost), "soft sets"
-        if functions is not None:
-            kind = "nonlinear constraints"
-        if directions.free is not None:
-            return (
-                f"engine='compiled' does not have {kind} where disturbances have fewer directions "
-                "than the state; take engine='python'."
-            )
     form = observer.c_form
     if form is None:
         return (

@@ -170,16 +170,15 @@ def _tables(name: str, rows: list[int], columns: list[int]) -> list[str]:
 def _constraint_slopes(model: CasadiModel) -> tuple[Any, Any, Any, Any]:
     """Arguments, values and derivatives of the nonlinear constraints."""
     ca, function = import_casadi(), model.constraints
-    s, u = ca.SX.sym("s", function.numel_in(0)), ca.SX.sym("u", function.numel_in(1))
-    value = function(s, u)
+    joint, inputs, algebraic = (function.numel_in(i) for i in range(3))
+    s, u = ca.SX.sym("s", joint + algebraic), ca.SX.sym("u", inputs)
+    value = function(s[:joint], u, s[joint:])
     return s, u, value, ca.jacobian(value, s)
 
 
 def _has_algebraic(model: CasadiModel) -> bool:
     """Whether nonlinear constraints are functions of z."""
-    return model.constraints is not None and (
-        model.constraints.numel_in(0) > 2 * model.n + model.p
-    )
+    return model.constraints is not None and bool(model.constraints.numel_in(2))
 
 
 def _algebraic_set(model: CasadiModel) -> list[str]:
@@ -189,7 +188,7 @@ def _algebraic_set(model: CasadiModel) -> list[str]:
     """
     if not _has_algebraic(model):
         return []
-    joint = 2 * model.n + model.p
+    joint = model.constraints.numel_in(0)
     rows, columns = _constraint_slopes(model)[3].sparsity().get_triplet()
     direct = sum(column < joint for column in columns)
     places = {row: k for k, row in enumerate(dict.fromkeys(rows[direct:]))}
@@ -572,13 +571,17 @@ def _prior_parts(layout: Layout) -> tuple[str, ...]:
 
 def _search_parts(layout: Layout) -> tuple[str, ...]:
     """The parts of C that look for an estimate."""
+    soft, constrained = SOFT in layout.terms, layout.has_rows
     if layout.free is None:
         factor, blocks = "factor", ["factor_lapack" if layout.lapack else "factor_loops"]
+        blocks += ["constraints_factor"] if layout.constraints else []
     else:
-        factor, blocks = "elimination", []
-    soft = _or_none("soft", SOFT in layout.terms)
-    rows = f"rows_{factor}", "rows", "active_set", "interior_point", soft, "constrained", "curved"
-    constrained = layout.has_rows
+        factor, bends = "elimination", _or_none("constraints_elimination", layout.constraints)
+        blocks = [_or_none("pulls", soft), bends]
+    rows = (
+        f"rows_{factor}", "rows", "active_set", "interior_point", _or_none("soft", soft),
+        "constrained", "curved",
+    )
     return (
         *(["sets"] if constrained else []), _or_none("constraints", layout.constraints),
         "trial", "damping", factor, *blocks, "outcome", _or_none("budget", layout.clock), "trials",

@@ -431,33 +431,41 @@ class ConstraintFunctions:
         )
 
     def expression(self) -> Any:
-        """All of them as a casadi.Function of (x, w, v), one below the other, and u.
+        """All of them as a casadi.Function of (x, w, v), one below the other, u, and z.
 
-        Where there are sets of z, z is below.
+        z is empty where there are no sets of z.
         """
         ca = import_casadi()
         n, r, p = self._n, self._r, self._p
         sets = [one.algebraic for one in self._bound if one.algebraic is not None]
         k = sets[0].matrix.shape[1] if sets else 0
-        s, u, values = ca.SX.sym("s", n + r + p + k), ca.SX.sym("u", self._m), []
-        parts = {"x": s[:n], "w": s[n : n + r], "v": s[n + r : n + r + p]}
+        sizes = {"s": n + r + p, "u": self._m, "z": k}
+        (s, u, z), values = (ca.SX.sym(name, size) for name, size in sizes.items()), []
+        parts = {"x": s[:n], "w": s[n : n + r], "v": s[n + r :]}
         for one in self._bound:
             if one.algebraic is not None:
-                values.append(one.algebraic.expression(s[n + r + p :]))
+                values.append(one.algebraic.expression(z))
                 continue
             assert one.trace is not None
             values.append(one.trace.function(ca.vertcat(*(parts[k] for k in one.parts)), u))
-        return ca.Function("constraints", [s, u], [ca.densify(ca.vertcat(*values))])
+        return ca.Function("constraints", [s, u, z], [ca.densify(ca.vertcat(*values))])
 
     def numbers(self) -> dict[str, NDArray[Any]]:
         """What else the step in C knows of them."""
-        counts = [one.size for one in self._bound]
+        counts, through = [one.size for one in self._bound], self._through
         return {
+            # C has no arrays of length 0; the sizes say where it stands for the identity.
+            "through": np.ones(1) if through is None else through.ravel(),
             "scale": self.scale, "factor": self._factor, "deviations": self._deviations,
             "group": np.repeat(np.arange(len(counts)), counts),
             "on_state": self.on_state.astype(np.intp),
             "touched": self._touched.astype(np.intp).ravel(),
         }
+
+    @property
+    def of_directions(self) -> int:
+        """Components of w where it is not d = x+ - f(x) itself, else 0."""
+        return 0 if self._through is None else self._r
 
     @cached_property
     def _touched(self) -> Mask:

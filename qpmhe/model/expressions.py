@@ -34,8 +34,8 @@ class CasadiModel:
     functions, and f also has the algebraic equations' residuals, below the rate.
     ``output_residual`` and ``state_residual`` are the user's functions of (a, b) for differences,
     where there are any; ``losses`` those of one number q to rho(q) and rho'(q), for prior, w and v;
-    ``correction`` an observer's function of (z, v); ``constraints`` one of ((x, w, v), u) to the
-    values of all nonlinear constraints, or of ((x, w, v, z), u) where some are functions of z.
+    ``correction`` an observer's function of (z, v); ``constraints`` one of ((x, w, v), u, z) to
+    the values of all nonlinear constraints; z is empty where none is a function of z.
     """
 
     f: Any

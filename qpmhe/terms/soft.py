@@ -120,6 +120,10 @@ class Penalties:
         found = cls(system, cost, prior)
         return found if found.size else None
 
+    def rows_of(self, name: str) -> Rows | None:
+        """The soft rows of a set; None where it has no sides, or is hard."""
+        return next((part.rows for part in self.parts if part.rows.name == name), None)
+
     @property
     def c_form(self) -> TermForm:
         """The penalties of all rows of a stage: of W, V, X and g, infinite for hard ones."""
@@ -504,6 +508,8 @@ class Softened:
                 rounding = _ROUNDING * (magnitudes @ terms + np.abs(sides))
                 if (np.abs(off) <= rounding[solved]).all():
                     break
+                if not (np.isfinite(off).all() and np.isfinite(reaction).all()):
+                    return None
                 change = _least_squares(reaction, off)
                 forces[solved] += change
                 step = step - moves @ change

@@ -633,6 +633,14 @@ def _of_all(x, u, w, v):
     ])
 
 
+def _of_few(x, w, v):
+    """Curved rows of two disturbances; the last one of states and noises alone."""
+    return np.array([
+        x[0] * v[1] + w[0] * x[2] - 0.02, w[0] * w[1] + 5.0 * w[1] ** 2 - 0.01 - 0.05 * w[0],
+        v[0] ** 2 + 0.5 * x[1] - 0.3,
+    ])
+
+
 def _of_states(x):
     """Rows that also hold at the newest state."""
     return np.array([x[0] ** 2 + 2.0 * x[1] ** 2 - 0.5, 0.2 - x[0] - x[2] ** 2])
@@ -837,6 +845,21 @@ FEATURES = {
         "soft, graduated": (lambda: _inputs(states=NARROW.soften(linear=2.0)), losses(
             disturbance=qpmhe.Cauchy, noise=partial(qpmhe.GemanMcClure, graduation=30.0)
         ), WARM),
+        "soft states, fewer disturbances": (lambda: _fewer(
+            **SMALL, states=NARROW.soften(linear=0.5, quadratic=30.0),
+            noises=Box([-0.4, -0.4], [0.4, 0.4]),
+        ), gaps, conditions, MANY, AGAIN),
+        "soft disturbances, fewer": (lambda: _fewer(
+            disturbances=Box([-0.02, -0.03], [0.05, 0.03]).soften(linear=4.0),
+            noises=Box([-0.2, -0.1], [0.2, 0.1]).soften(linear=2.0, quadratic=1.0),
+        ), gaps, conditions, WARM, MANY),
+        "soft, singular covariance": (lambda: singular(_inputs(
+            states=NARROW.soften(linear=2.0), disturbances=SMALLER.soften(linear=1.0),
+        )), gaps),
+        "soft states, noise-free": (lambda: _inputs(
+            states=NARROW.soften(linear=2.0, quadratic=3.0),
+            disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
+        ), conditions, MANY, {"solver_tolerance": 1e-10}),
         "soft, unscented": (
             lambda: _reaction_in(POSITIVE.soften(linear=0.5)), filtered(UKF), gaps,
         ),
@@ -863,9 +886,33 @@ FEATURES = {
         "constraints of angles": (lambda: _ship(constraints=[
             Constraint(lambda x, v: np.sin(x[0]) * x[1] + 0.001 * v[0] - 0.3, linear=5.0),
         ]), gaps, MANY, {"solver_tolerance": 1e-12}),
+        "constraints, fewer disturbances": (lambda: _fewer(
+            constraints=[Constraint(_of_few, 3), Constraint(_of_states, 2)],
+        ), gaps, MANY),
+        "soft constraints, fewer disturbances": (lambda: _fewer(**SMALL, constraints=[
+            Constraint(_of_states, 2, linear=[2.0, 0.5], quadratic=[1.0, 30.0]),
+            Constraint(_of_few, 3, linear=20.0),
+        ], states=NARROW.soften(linear=1.0)), conditions, MANY),
+        "constraints, noise-free": (lambda: _inputs(
+            constraints=[Constraint(_of_states, 2), Constraint(_of_all, 3, linear=20.0)],
+            disturbances=Box([-0.5, 0.0, -0.5], [0.5, 0.0, 0.5]),
+        ), gaps, AGAIN, {"solver_tolerance": 1e-10}),
+        "constraints, fewer disturbances, restored": (lambda: _fewer(
+            constraints=[Constraint(lambda w: 0.05 - w[0] + w[1] ** 2)]
+        ), gaps, RESTORE, {"solver_tolerance": 1e-10}),
         "constraints that fail": (lambda: _inputs(constraints=[
             Constraint(lambda x: 0.3 - np.sqrt(x[0] - 0.2), linear=2.0), Constraint(_undefined),
         ]),),
+        # Steps that converge, that do not, and that find no decrease behind trials without values.
+        "constraints that fail along trials": (
+            lambda: _inputs(constraints=[
+                Constraint(lambda x: np.log(x[1] + 0.3) - 1.0),
+                Constraint(lambda x, w: 0.02 - np.sqrt(x[0] + 0.1) + w[0]),
+            ]), MANY, {"tolerance": 1e-5},
+            lambda one: samples_with(
+                one, lambda t, y: {"y": y + 2.0} if t % 5 == 2 else {}
+            ),
+        ),
         "constraints of 1e200": (lambda: constraints_of(1e200), MANY),
         "constraints, restored": (lambda: _inputs(
             constraints=[Constraint(lambda w: 0.2 - w[0] + w[1] ** 2)]

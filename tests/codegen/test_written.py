@@ -106,7 +106,7 @@ SINGLE_TOO = "inputs", "states in a polytope", "algebraic", "layered"
 @pytest.mark.parametrize("name", [
     "inputs", "euler", "extended", "unscented", "mixed losses", "states in a polytope",
     "fewer disturbances in sets", "held with gaps", "soft states", "constraints", "restored",
-    "restarted extended", "algebraic", "radau", "layered",
+    "soft constraints, fewer disturbances", "restarted extended", "algebraic", "radau", "layered",
 ])
 def test_the_written_code_is_the_python_step(name, tmp_path):
     one = case(name)

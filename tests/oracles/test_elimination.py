@@ -244,10 +244,16 @@ SOFT = {
 @pytest.mark.parametrize("rows", SOFT)
 @pytest.mark.parametrize("spread", [1.0, 1e3, 1e10])
 def test_soft_rows_and_curved_constraints_beside_a_vague_prior(spread, rows):
-    """Slack variables and the curvature of constraints join the QP without these directions."""
+    """Slack variables and the curvature of constraints join the QP without these directions.
+
+    In C, rows that are missed pull with a constant force, and the curvature is more rows of it.
+    """
     A, C, G, q = MODELS["position"]
     runs, free = [], None
-    for backend in ("daqp", "quadprog", "clarabel"):
+    for engine, backend in (("python", "daqp"), ("python", "quadprog"), ("python", "clarabel"),
+                            ("compiled", "auto")):
+        if engine == "compiled" and compiler.find_compiler() is None:
+            continue
         for sets in (SOFT[rows], {}) if free is None else (SOFT[rows],):
             mhe = qpmhe.MovingHorizonEstimator(
                 qpmhe.System(
@@ -257,7 +263,7 @@ def test_soft_rows_and_curved_constraints_beside_a_vague_prior(spread, rows):
                 qpmhe.QuadraticCost.from_covariances(
                     prior=spread**2 * np.eye(2), disturbance=[q], noise=np.eye(1)
                 ),
-                horizon=9, initial_state=[0.0, 0.25], backend=backend, max_qps=6,
+                horizon=9, initial_state=[0.0, 0.25], backend=backend, max_qps=6, engine=engine,
             )
             run = mhe.run(measured())
             if sets:
@@ -268,3 +274,112 @@ def test_soft_rows_and_curved_constraints_beside_a_vague_prior(spread, rows):
     for run in runs[1:]:
         np.testing.assert_allclose(run.costs, runs[0].costs, rtol=1e-5)
         np.testing.assert_allclose(run.filtered, runs[0].filtered, rtol=0.0, atol=1e-3)
+
+
+# Of the first state and the first disturbance: sides, linear and quadratic penalties.
+PENALTIES = {
+    "states": ([(10.0, 0.4, 0.0)], []),
+    "both penalties": ([(11.0, 0.4, 2.0)], [(0.004, 20.0, 3e3)]),
+    "squares": ([(11.0, 0.0, 30.0)], [(0.004, 0.0, 3e4)]),
+    "disturbances": ([], [(0.004, 30.0, 0.0)]),
+    "equations": ([(11.0, 0.4, 0.0)], [(0.0, 30.0, 0.0)]),
+}
+
+
+def soft_sets(name, model, scale):
+    states, disturbances = PENALTIES[name]
+    n, r = model[2].shape
+    sets = {}
+    if states:
+        upper, linear, quadratic = states[0]
+        side = np.full(n, np.inf)
+        side[0] = upper * scale[0]
+        sets["states"] = qpmhe.Box(-np.inf * np.ones(n), side).soften(
+            linear=linear / scale[0], quadratic=quadratic / scale[0] ** 2
+        )
+    if disturbances:
+        limit, linear, quadratic = disturbances[0]
+        side = np.full(r, np.inf)
+        side[0] = limit
+        sets["disturbances"] = qpmhe.Box(-side, side).soften(linear=linear, quadratic=quadratic)
+    return sets
+
+
+def unbalanced(name, model, P, scale, Y, trajectory):
+    """The force on the first state and the disturbances that no subgradient of J balances.
+
+    Dense, in these unknowns alone, as a share of the largest force.
+    """
+    A, C, G, q = model
+    n, r = G.shape
+    count, size = len(trajectory) - 1, n + (len(trajectory) - 1) * r
+    at, moves, rows = np.eye(n, size), [np.eye(n, size)], []
+    for i in range(count):
+        at = A @ at + G @ np.eye(size)[n + r * i : n + r * (i + 1)]
+        moves.append(at)
+    noises = np.array(Y[:count]) - trajectory[:-1] @ C.T
+    d = np.linalg.lstsq(G, (trajectory[1:] - trajectory[:-1] @ A.T).T, rcond=None)[0].T
+    z = np.append(trajectory[0], d)
+    units = np.append(np.sqrt(P.diagonal()), np.tile(np.sqrt(q), count))
+    force = z / units**2 + sum(-moves[i].T @ C.T @ noises[i] for i in range(count))
+    sizes = np.abs(noises) + 1e-6 * np.abs(Y[:count])  # rounding is a share of these
+    largest = np.abs(z / units**2) + sum(np.abs(moves[i].T @ C.T) @ sizes[i] for i in range(count))
+    states, disturbances = PENALTIES[name]
+    for upper, linear, quadratic in states:
+        for i in range(count + 1):
+            value = trajectory[i, 0] / scale[0]
+            rows.append((moves[i][0] / scale[0], value - upper, linear, quadratic, 1.0))
+    for limit, linear, quadratic in disturbances:
+        for i in range(count):
+            for sign in (1.0, -1.0):
+                row = sign * np.eye(size)[n + r * i]
+                rows.append((row, sign * d[i, 0] - limit, linear, quadratic, q[0] ** 0.5))
+    held, most, violated = [], [], 0
+    for row, missed, linear, quadratic, unit in rows:
+        if abs(missed) <= 1e-9 * unit * (1.0 + 1e3 * (unit == 1.0)):
+            if linear:
+                held.append(row)
+                most.append(linear / 2.0)
+        elif missed > 0.0:
+            violated += 1
+            force = force + row * (linear / 2.0 + quadratic * missed)
+    # In the units of what data and prior say about each unknown.
+    seen = sum((C @ moves[i]).T @ (C @ moves[i]) for i in range(count)).diagonal()
+    spread = 1.0 / np.sqrt(1.0 / units**2 + seen)
+    left = force * spread
+    if held:
+        matrix = (np.array(held) * spread).T
+        left = matrix @ lsq_linear(matrix, -left, (0.0, np.array(most)), tol=1e-14).x + left
+    return np.abs(left).max() / (largest * spread).max(), violated, len(held)
+
+
+@pytest.mark.filterwarnings("ignore::qpmhe.errors.ObserverWarning")
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("name", PENALTIES)
+@pytest.mark.parametrize("of", ["position", "odd units", "seasonal"])
+def test_a_subgradient_of_soft_rows_balances_a_vague_prior(of, name, engine):
+    """The conditions of a minimum, dense, in the first state and the disturbances alone."""
+    model, Y, times = MODELS[of], measured(3), (4, 8)
+    A, C, G, q = model
+    for spread in (1.0, 1e3, 1e6, 1e10):
+        P, scale = prior(model, spread)
+        mhe = qpmhe.MovingHorizonEstimator(
+            qpmhe.System(
+                lambda x: x @ A.T, lambda x: x @ C.T, n=len(A), p=1, disturbance_matrix=G,
+                **soft_sets(name, model, scale),
+            ),
+            qpmhe.Luenberger(np.zeros((len(A), 1))),
+            qpmhe.QuadraticCost.from_covariances(
+                prior=P, disturbance=np.diag(q), noise=np.eye(1)
+            ),
+            horizon=9, initial_state=np.zeros(len(A)), engine=engine, max_qps=5,
+        )
+        rows = [0, 0]
+        for t in range(max(times) + 1):
+            estimate = mhe.update(Y[t])
+            if t not in times:
+                continue
+            left, *counts = unbalanced(name, model, P, scale, Y, estimate.trajectory)
+            assert left <= 1e-9, (spread, t)
+            rows = np.add(rows, counts)
+        assert sum(rows) > 0

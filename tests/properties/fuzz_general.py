@@ -31,8 +31,6 @@ MIXED = {
     "covariance": 0.2, "weights": 0.4, "bounds": 0.4, "sensors": 0.4, "missing": 0.5,
     "outliers": 0.4,
 }
-# The compiled step has no nonlinear constraints, and no soft sets beside noise-free directions.
-COMPILED = MIXED | {"soft": 0.0, "constraint": 0.0}
 
 
 class Liar(Solver):
@@ -136,9 +134,7 @@ def run(steps, seed, engine="python"):
     while counts["steps"] < steps:
         start = int(draw.integers(2**31))
         # Five times as many for an estimator that is compiled.
-        one = Problem(start, MIXED, STEPS) if engine == "python" else Problem(
-            start, COMPILED, 5 * STEPS
-        )
+        one = Problem(start, MIXED, STEPS if engine == "python" else 5 * STEPS)
         options = solver(one, start) if engine == "python" else {}
         mhe, one.largest = one.estimator(engine=engine, **options), 1.0
         for t, sample in enumerate(one.samples):

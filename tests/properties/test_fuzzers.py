@@ -188,6 +188,7 @@ MENDED = {
     21000036: 48,  # second corrections of soft rows
     12000043: 40,  # soft rows beside hard ones and a vague prior
     21000089: None,  # rows whose forces settle slowly
+    70000051: 20,  # Python's exact solution with soft rows was not finite, and raised
 }
 
 

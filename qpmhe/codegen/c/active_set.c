@@ -294,7 +294,9 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
         mhe_compare(q, rows, tolerance, &guess);
         if (limit == 0 && guess.wrong) return UNCONSTRAINED;
         /* Forces are exact enough for a guess; not yet for a solution. */
-        for (int round = 0; !guess.wrong && (open > tolerance || left > precise); round++) {
+        int more = active ? MORE_ROUNDS : 0;
+        for (int round = 0; !guess.wrong; round++) {
+            if (!(open > tolerance || left > precise) && more-- <= 0) break;
             if (open > tolerance && energy > last * (1 - STUCK)) {
                 guess.wrong = mhe_exclude(q, rows, open);
                 if (!guess.wrong) return EXCLUDED;

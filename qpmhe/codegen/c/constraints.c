@@ -5,7 +5,9 @@
 @mhe_trial
     mhe_real values[(MHE_HORIZON + 1) * MHE_G_ROWS]; /* of nonlinear constraints */
 @types
-#define MHE_JOINT (2 * MHE_NX + MHE_NY) /* x, w and v, one below the other */
+/* Their arguments x, w and v, one below the other. */
+#define MHE_V_AT (MHE_NX + (MHE_G_W > 0 ? MHE_G_W : MHE_NX))
+#define MHE_JOINT (MHE_V_AT + MHE_NY)
 @mhe_workspace
     /* Of nonlinear constraints: derivatives by the state and the next one, whether a row has none, and
      * the last QP's forces. */
@@ -13,11 +15,11 @@
     mhe_real next_slopes[MHE_HORIZON * MHE_G_ROWS * MHE_NX];
     mhe_real pushes[(MHE_HORIZON + 1) * MHE_G_ROWS];
     uint8_t unusable[(MHE_HORIZON + 1) * MHE_G_ROWS];
-    int32_t has_pushes, has_bends;
-    /* What their curvature adds to a Hessian: blocks of each state, and of the next one below it. */
-    mhe_real own_bends[(MHE_HORIZON + 1) * MHE_NX * MHE_NX], bends_below[MHE_HORIZON * MHE_NX * MHE_NX];
+    int32_t has_pushes, has_bends, trial_failed;
     mhe_real change[MHE_JOINT * MHE_JOINT], directions_of[MHE_JOINT * MHE_JOINT];
-    mhe_real moved[MHE_JOINT * MHE_NX];
+    mhe_real moved[MHE_JOINT * 2 * MHE_NX];
+@mhe_estimate
+    uint8_t trial_failed; /* whether a constraint has had no value along a trial that led no further */
 @
 /* Step of second derivatives, as a share of the deviations. */
 #define MOVE (sizeof(real) == 8 ? (real)0.000244140625 : (real)0.015625)
@@ -37,11 +39,38 @@ static int mhe_counts(mhe_estimator *e, int i, int r)
 static void mhe_joint(const mhe_estimator *e, int i, const mhe_trial *trial, real *joint)
 {
     const int is_last = i == e->length;
-    for (int j = 0; j < NX; j++) {
-        joint[j] = trial->x[i * NX + j];
-        joint[NX + j] = is_last ? 0 : trial->w[i * NX + j];
+    const real *d = trial->w + i * NX;
+    for (int j = 0; j < NX; j++) joint[j] = trial->x[i * NX + j];
+    for (int j = 0; j < MHE_V_AT - NX; j++) {
+        joint[NX + j] = 0;
+        if (is_last) continue;
+        joint[NX + j] = MHE_G_W ? mhe_dot(NX, e->settings->constraints.through + j * NX, d) : d[j];
     }
-    for (int j = 0; j < NY; j++) joint[2 * NX + j] = is_last ? 0 : trial->v[i * NY + j];
+    for (int j = 0; j < NY; j++) joint[MHE_V_AT + j] = is_last ? 0 : trial->v[i * NY + j];
+}
+
+/* own += slope times the derivative of component c of (x, w, v) by the state, and next by the next one. */
+static void mhe_add_moved(const mhe_estimator *e, const mhe_workspace *k, int i, int c, real slope, real *own,
+                          real *next)
+{
+    if (c < NX) {
+        own[c] += slope;
+        return;
+    }
+    if (c >= MHE_V_AT || !MHE_G_W) {
+        const real *moving = c >= MHE_V_AT ? k->at[i]->h_jacobian + (c - MHE_V_AT) * NX
+                                           : k->at[i]->f_jacobian + (c - NX) * NX;
+        for (int j = 0; j < NX; j++) own[j] -= slope * moving[j];
+        if (c < MHE_V_AT) next[c - NX] += slope;
+        return;
+    }
+    const real *through = e->settings->constraints.through + (c - NX) * NX;
+    for (int l = 0; l < NX; l++) {
+        const real share = slope * through[l];
+        if (share == 0) continue;
+        next[l] += share;
+        for (int j = 0; j < NX; j++) own[j] -= share * k->at[i]->f_jacobian[l * NX + j];
+    }
 }
 
 /* Values along a trial: 0 of rows that do not count, infinite where a number is not finite. */
@@ -109,14 +138,7 @@ static void mhe_linearize_constraints(mhe_estimator *e, mhe_workspace *k, const 
             const int r = mhe_g_row[q], c = mhe_g_column[q];
             const real slope = slopes[q] * s->constraints.factor[r];
             if (is_last && !s->constraints.on_state[r]) continue;
-            if (c < NX) {
-                own[r * NX + c] += slope;
-                continue;
-            }
-            const real *moving = c < 2 * NX ? k->at[i]->f_jacobian + (c - NX) * NX
-                                            : k->at[i]->h_jacobian + (c - 2 * NX) * NX;
-            for (int j = 0; j < NX; j++) own[r * NX + j] -= slope * moving[j];
-            if (c < 2 * NX) next[r * NX + c - NX] += slope;
+            mhe_add_moved(e, k, i, c, slope, own + r * NX, next + r * NX);
         }
         for (int r = 0; r < MHE_G_ROWS; r++) {
             const int usable = isfinite(around->values[i * MHE_G_ROWS + r]) &&
@@ -125,6 +147,12 @@ static void mhe_linearize_constraints(mhe_estimator *e, mhe_workspace *k, const 
             for (int j = 0; j < NX && !usable; j++) own[r * NX + j] = next[r * NX + j] = 0;
         }
     }
+}
+
+/* The derivative of a row of stage i by component j of its state or of the next one. */
+static real mhe_value_slope(const mhe_workspace *k, int i, int r, int following, int j)
+{
+    return (following ? k->next_slopes : k->own_slopes)[(i * MHE_G_ROWS + r) * NX + j];
 }
 
 /* Rows that cannot be linearised have no limits. */
@@ -154,24 +182,6 @@ static void mhe_add_slope_loads(const mhe_estimator *e, const mhe_workspace *k, 
         for (int j = 0; j < NX; j++) out[i * NX + j] += load[r] * k->own_slopes[at + j];
         for (int j = 0; i < e->length && j < NX; j++)
             out[(i + 1) * NX + j] += load[r] * k->next_slopes[at + j];
-    }
-}
-
-/* Panels of stage i += slopes' diag(weight) slopes. */
-static void mhe_add_slope_weights(const mhe_estimator *e, mhe_workspace *k, int i, const real *weight)
-{
-    real *panel = k->panels + i * NX * MHE_PANEL_WIDTH;
-    for (int r = 0; r < MHE_G_ROWS; r++) {
-        const int at = (i * MHE_G_ROWS + r) * NX;
-        const real *own = k->own_slopes + at;
-        if (weight[r] == 0) continue;
-        mhe_add_square(panel, weight[r], own);
-        if (i == e->length || e->settings->constraints.on_state[r]) continue;
-        const real *next = k->next_slopes + at;
-        mhe_add_square(panel + NX * MHE_PANEL_WIDTH, weight[r], next);
-        for (int j = 0; j < NX; j++)
-            for (int l = 0; l < NX; l++)
-                panel[j * MHE_PANEL_WIDTH + NX + l] += weight[r] * own[j] * next[l];
     }
 }
 
@@ -239,7 +249,22 @@ static void mhe_missed_values(mhe_workspace *k, int i, const mhe_trial *best)
 }
 
 /* A new sequence of QPs begins. */
-static void mhe_forget_pushes(mhe_workspace *k) { k->has_pushes = k->has_bends = 0; }
+static void mhe_forget_pushes(mhe_workspace *k)
+{
+    k->has_pushes = k->has_bends = 0;
+    k->trial_failed = 0;
+}
+
+/* Note a trial that leads no further. */
+static void mhe_note_trial(const mhe_estimator *e, mhe_workspace *k, const mhe_trial *trial)
+{
+    if (!mhe_has_values(e, trial)) k->trial_failed = 1;
+}
+
+static void mhe_fill_trial_failed(const mhe_workspace *k, mhe_estimate *out)
+{
+    out->trial_failed = k->trial_failed != 0;
+}
 
 /* Keep the forces of a QP's solution, of its active set or of its interior point. */
 static void mhe_keep_pushes(mhe_estimator *e, mhe_workspace *k, int is_solved, int is_exact)
@@ -295,14 +320,9 @@ static void mhe_bend_group(mhe_estimator *e, mhe_workspace *k, int i, const mhe_
     if (!mhe_each_finite(count * count, M)) return;
     mhe_symmetrise(count, M);
     mhe_eigen(count, M, V);
-    for (int a = 0; a < count; a++) { /* derivatives of the components by the state */
-        const int c = used[a];
-        for (int j = 0; j < NX; j++)
-            k->moved[a * NX + j] = c < NX ? c == j
-                                   : c < 2 * NX ? -k->at[i]->f_jacobian[(c - NX) * NX + j]
-                                                : -k->at[i]->h_jacobian[(c - 2 * NX) * NX + j];
-    }
-    real *own = k->own_bends + i * NX * NX;
+    memset(k->moved, 0, sizeof k->moved);
+    for (int a = 0; a < count; a++) /* derivatives of the components by the states */
+        mhe_add_moved(e, k, i, used[a], 1, k->moved + 2 * a * NX, k->moved + (2 * a + 1) * NX);
     for (int l = 0; l < count; l++) { /* along each direction that is curved upwards */
         const real bend = M[l * count + l];
         real by_state[NX], by_next[NX];
@@ -310,16 +330,12 @@ static void mhe_bend_group(mhe_estimator *e, mhe_workspace *k, int i, const mhe_
         for (int j = 0; j < NX; j++) by_state[j] = by_next[j] = 0;
         for (int a = 0; a < count; a++) {
             const real share = V[l * count + a] / deviations[used[a]];
-            for (int j = 0; j < NX; j++) by_state[j] += share * k->moved[a * NX + j];
-            if (used[a] >= NX && used[a] < 2 * NX) by_next[used[a] - NX] += share;
-        }
-        for (int j = 0; j < NX; j++)
-            for (int m = 0; m < NX; m++) {
-                own[j * NX + m] += bend * by_state[j] * by_state[m];
-                if (i == e->length) continue;
-                k->bends_below[(i * NX + j) * NX + m] += bend * by_next[j] * by_state[m];
-                own[NX * NX + j * NX + m] += bend * by_next[j] * by_next[m];
+            for (int j = 0; j < NX; j++) {
+                by_state[j] += share * k->moved[2 * a * NX + j];
+                by_next[j] += share * k->moved[(2 * a + 1) * NX + j];
             }
+        }
+        mhe_keep_bend(e, k, i, bend, by_state, by_next);
     }
 }
 
@@ -329,26 +345,12 @@ static void mhe_set_bends(mhe_estimator *e, mhe_workspace *k, const mhe_trial *a
     const int32_t *group = e->settings->constraints.group;
     k->has_bends = k->has_pushes;
     if (!k->has_pushes) return;
-    memset(k->own_bends, 0, sizeof k->own_bends);
-    memset(k->bends_below, 0, sizeof k->bends_below);
+    mhe_clear_bends(k);
     for (int i = 0; i < mhe_row_stages(e); i++)
         for (int first = 0, end = 0; first < MHE_G_ROWS; first = end) {
             int pushed = 0;
             for (end = first; end < MHE_G_ROWS && group[end] == group[first]; end++)
                 pushed |= k->pushes[i * MHE_G_ROWS + end] > 0;
             if (pushed) mhe_bend_group(e, k, i, around, first, end);
-        }
-}
-
-/* Panels += curvature. */
-static void mhe_add_bends(const mhe_estimator *e, mhe_workspace *k)
-{
-    if (!k->has_bends) return;
-    for (int i = 0; i <= e->length; i++)
-        for (int r = 0; r < NX; r++) {
-            real *row = k->panels + (i * NX + r) * MHE_PANEL_WIDTH;
-            for (int c = r; c < NX; c++) row[c] += k->own_bends[(i * NX + r) * NX + c];
-            for (int c = 0; i < e->length && c < NX; c++)
-                row[NX + c] += k->bends_below[(i * NX + c) * NX + r];
         }
 }

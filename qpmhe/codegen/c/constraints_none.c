@@ -33,6 +33,12 @@ static void mhe_linearize_constraints(mhe_estimator *e, mhe_workspace *k, const 
     (void)e; (void)k; (void)around;
 }
 
+static real mhe_value_slope(const mhe_workspace *k, int i, int r, int following, int j)
+{
+    (void)k; (void)i; (void)r; (void)following; (void)j;
+    return 0;
+}
+
 static void mhe_leave_out(const mhe_workspace *k, int i, real *high)
 {
     (void)k; (void)i; (void)high;
@@ -80,6 +86,16 @@ static void mhe_missed_values(mhe_workspace *k, int i, const mhe_trial *best)
 static void mhe_forget_pushes(mhe_workspace *k)
 {
     (void)k;
+}
+
+static void mhe_note_trial(const mhe_estimator *e, mhe_workspace *k, const mhe_trial *trial)
+{
+    (void)e; (void)k; (void)trial;
+}
+
+static void mhe_fill_trial_failed(const mhe_workspace *k, mhe_estimate *out)
+{
+    (void)k; (void)out;
 }
 
 static void mhe_keep_pushes(mhe_estimator *e, mhe_workspace *k, int is_solved, int is_exact)

@@ -15,7 +15,8 @@
 /* Rows of a least-squares problem, and the reflections that turn them into `rank` rows, each with zeros
  * before its column `lead`; the first `free` of these are of disturbances. Columns are padded. */
 #define MHE_COLUMNS ((MHE_FREE + MHE_NX + 3) / 4 * 4)
-#define MHE_EQUATIONS (MHE_FREE + 2 * MHE_NX + MHE_NY + MHE_STAGE_ROWS)
+#define MHE_BENDS (MHE_G_ROWS > 0 ? 2 * MHE_NX : 0) /* rows of the curvature of constraints */
+#define MHE_EQUATIONS (MHE_FREE + 2 * MHE_NX + MHE_NY + MHE_BENDS + MHE_STAGE_ROWS)
 typedef struct {
     mhe_real rows[MHE_EQUATIONS * MHE_COLUMNS];
     mhe_real mirrors[MHE_COLUMNS * MHE_EQUATIONS], share[MHE_COLUMNS];
@@ -281,6 +282,7 @@ static void mhe_add_inequalities(const mhe_estimator *e, mhe_workspace *k, int i
         for (int r = 0; r < MHE_X_ROWS; r++)
             mhe_add_row(b, at + NX + r, weights[NX + r], MHE_FREE, NX, s->states.rows + r * NX, 1);
     }
+    mhe_add_value_rows(e, k, i, b);
     (void)at; (void)weights;
 }
 
@@ -318,6 +320,7 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
             for (int r = 0; r < NY; r++)
                 for (int c = 0; c < MHE_FREE; c++) b->rows[(MHE_FREE + r) * COLUMNS + c] = 0;
             b->count += NY;
+            mhe_add_bend_rows(e, k, i, b);
             if (weighted) mhe_add_inequalities(e, k, i);
             for (int j = later->free; j < later->rank; j++) {
                 real *row = b->rows + b->count++ * COLUMNS;
@@ -329,8 +332,10 @@ static int mhe_factorise(mhe_estimator *e, mhe_workspace *k, int weighted)
                 }
             }
         }
-        else if (MHE_X_SET && weighted)
-            mhe_add_inequalities(e, k, i);
+        else {
+            mhe_add_bend_rows(e, k, i, b);
+            if (MHE_END_ROWS && weighted) mhe_add_inequalities(e, k, i);
+        }
         for (int c = 0; c < MHE_FREE + NX && b->rank < b->count; c++) {
             b->rank += mhe_reflect(b, b->rank, c);
             if (c < MHE_FREE) b->free = b->rank;
@@ -411,6 +416,7 @@ static void mhe_set_targets(mhe_estimator *e, mhe_workspace *k, const real *step
     mhe_solve_transposed(NX, k->prior_root, k->first_target);
     if (step)
         for (int j = 0; j < NX; j++) k->first_target[j] -= mhe_dot(NX, k->prior_root + j * NX, step);
+    mhe_set_bend_targets(e, k, step);
 }
 
 /* The increments that come closest to the targets and to the loads of inequalities, or with `push` to
@@ -419,15 +425,19 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
 {
     const mhe_settings *s = e->settings;
     const int count = e->length;
+    real pull[NX] = {0};
+    (void)pull; /* no row pulls */
     for (int i = count; i >= 0; i--) {
         const mhe_block *b = k->blocks + i, *later = b + 1;
         const real *drift = k->drift + i * NX, *target = k->targets + i * (MHE_FREE + NY);
         real *side = k->sides_of + i * EQUATIONS;
         int at = 0;
         for (; i < count && at < MHE_FREE + NY; at++) side[at] = push ? 0 : target[at];
+        at = mhe_bend_sides(k, i, push, at, side);
         for (int j = 0; j < b->inequalities; j++, at++) {
             const int row = b->source[j];
             side[at] = k->rows.load[row] / b->root[j];
+            if (!push) side[at] -= b->root[j] * mhe_value_drift(e, k, row);
             if (MHE_W_SET) {
                 const int r = row - i * ROWS;
                 if (push || r >= W_COUNT) continue;
@@ -442,6 +452,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
                 side[at] -= mhe_entry(later, j, MHE_FREE + l) * drift[l];
         }
         mhe_apply(b, side);
+        mhe_pull_side(e, k, i, side, pull);
     }
     const mhe_block *start = &k->start, *data = k->blocks;
     real side[2 * NX], first[NX];
@@ -449,6 +460,7 @@ static int mhe_solve(mhe_estimator *e, mhe_workspace *k, int push, real *out)
     for (int j = data->free; j < data->rank; j++) side[at++] = k->sides_of[j];
     for (int j = 0; j < NX; j++) side[at++] = push ? 0 : k->first_target[j];
     mhe_apply(start, side);
+    mhe_pull_first(k, side, pull);
     for (int j = NX - 1; j >= 0; j--) {
         real sum = side[j];
         for (int c = j + 1; c < NX; c++) sum -= start->rows[j * COLUMNS + c] * first[c];
@@ -506,6 +518,7 @@ static real mhe_largest_force(mhe_estimator *e, mhe_workspace *k)
 {
     const real *F = e->settings->elimination.free;
     real worst = 0;
+    mhe_add_bend_forces(e, k, k->residual);
     for (int i = e->length - 1; i >= 0; i--) {
         const real *later = k->residual + (i + 1) * NX, *A = k->at[i]->f_jacobian;
         const real *C = k->at[i]->h_jacobian, *target = k->targets + i * (MHE_FREE + NY);
@@ -537,6 +550,7 @@ static real mhe_largest_force(mhe_estimator *e, mhe_workspace *k)
 static int mhe_solve_free(mhe_estimator *e, mhe_workspace *k, const real *offset, int nearest)
 {
     mhe_assemble(e, k, offset);
+    mhe_use_bends(k, nearest);
     if (!mhe_factorise(e, k, 0)) return 0;
     mhe_set_targets(e, k, 0, nearest);
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);

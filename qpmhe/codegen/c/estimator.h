@@ -46,6 +46,7 @@ typedef $real mhe_real;
 #define MHE_V_ROWS $v_rows
 #define MHE_X_ROWS $x_rows
 #define MHE_G_ROWS $g_rows  /* rows of nonlinear constraints at each stage */
+#define MHE_G_W $g_w     /* components of the w that they are functions of; 0 if it is x(t+1) - f */
 #define MHE_END_ROWS $end_rows /* whether the state behind the last sample has rows */
 #define MHE_LOSS $loss    /* whether a term of the cost has a loss that is not quadratic */
 #define MHE_OWN_LOSSES $own_losses /* users' functions: 1 of the prior, 2 of w, 4 of v */

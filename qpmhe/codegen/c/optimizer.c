@@ -73,6 +73,7 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
         o->events |= MHE_UNCONVERGED;
         return 0;
     }
+    mhe_note_trial(e, k, o->spare);
     const real rounding = isfinite(before) ? mhe_rounding_cost(e, k, o->best) : -1;
     if (!is_damped && solved && promised <= mhe_max(rounding, MHE_STALLED * negligible)) {
         o->events |= MHE_CONVERGED;

@@ -5,11 +5,15 @@
 /* Reflections bear more than what rounding leaves of sums. */
 #define STIFFER STIFFNESS
 
+/* A round more than the tolerance asks for: of a soft row, each miss costs its linear penalty. */
+#define MORE_ROUNDS 1
+
 /* Whether a row of a stage is one on a direction that has no disturbance in any trial. */
 static int mhe_is_eliminated(const mhe_settings *s, int r)
 {
     const mhe_w_set *set = &s->disturbances;
-    return r < NX ? set->lower[r] == set->upper[r] : r < W_COUNT && set->row_fixed[r - NX];
+    if (r < NX) return set->lower[r] == set->upper[r] && !mhe_is_soft(s, r);
+    return r < W_COUNT && set->row_fixed[r - NX];
 }
 
 /* Limits are about these disturbances. */
@@ -26,6 +30,8 @@ static void mhe_stage_curvature(mhe_estimator *e, const mhe_workspace *k, int i,
         for (int j = 0; j < NX; j++)
             diagonal[j] = k->factors[i] * mhe_scaled(mhe_disturbance_weight(
                 s, mhe_stage_at(e, i - 1))[j * NX + j], k->at[i - 1]->disturbance_scale, j);
+    mhe_add_missed_curvature(e, k, i, diagonal);
+    mhe_add_bend_curvature(k, i, diagonal);
     if (i == e->length) return;
     const mhe_terms *t = k->at[i];
     const real *Q = mhe_disturbance_weight(s, mhe_stage_at(e, i));
@@ -52,21 +58,26 @@ static int mhe_factorise_weighted(mhe_estimator *e, mhe_workspace *k, const real
                                   int active)
 {
     mhe_assemble(e, k, offset);
+    mhe_use_bends(k, nearest);
     if (nearest) memset(k->gradient, 0, sizeof k->gradient);
     if (active) mhe_set_stiffness(e, k);
     return mhe_factorise(e, k, active);
 }
 
-/* The increments that minimise the QP with the rows' loads, or these alone. */
+/* The increments that minimise the QP with the rows' loads. */
 static int mhe_solve_loaded(mhe_estimator *e, mhe_workspace *k, int nearest, int active)
 {
-    (void)active; /* there are no rows without weights */
     mhe_set_targets(e, k, 0, nearest);
-    return mhe_solve(e, k, 0, k->step);
+    if (active) mhe_set_pulls(e, k);
+    const int solved = mhe_solve(e, k, 0, k->step);
+    mhe_forget_pulls(k);
+    return solved;
 }
 
+/* What the active rows' new forces add to them; those of missed rows are all in the solution. */
 static int mhe_solve_loads(mhe_estimator *e, mhe_workspace *k)
 {
+    mhe_unload_missed(e, k);
     return mhe_solve(e, k, 1, k->direction);
 }
 
@@ -75,6 +86,36 @@ static real mhe_size(const mhe_estimator *e, const mhe_workspace *k, const real 
 {
     (void)e; (void)k; (void)d;
     return 0;
+}
+
+/* Twice the objective of the QP at its solution, which starts where no disturbance is as a roll-out has
+ * it: forces that keep to the roll-out are not known. */
+static real mhe_twice_objective(mhe_estimator *e, const mhe_workspace *k)
+{
+    real objective = 0, first[NX];
+    for (int r = 0; r < NX; r++) {
+        first[r] = 0;
+        for (int c = r; c < NX; c++) first[r] += k->prior_root[r * NX + c] * k->step[c];
+        objective += first[r] * first[r] + 2 * k->prior_gradient[r] * k->step[r];
+    }
+    for (int i = 0; i < e->length; i++) {
+        const mhe_terms *t = k->at[i];
+        const real *Q = mhe_disturbance_weight(e->settings, mhe_stage_at(e, i));
+        const real *R = mhe_stage_at(e, i)->noise_weight, *own = k->step + i * NX;
+        real w[NX], v[NY], sum = 0;
+        for (int j = 0; j < NX; j++) w[j] = own[NX + j] - mhe_dot(NX, t->f_jacobian + j * NX, own);
+        for (int j = 0; j < NY; j++) v[j] = -mhe_dot(NX, t->h_jacobian + j * NX, own);
+        for (int r = 0; r < NX; r++)
+            for (int c = 0; c < NX; c++)
+                sum += w[r] * mhe_scaled(Q[r * NX + c], t->disturbance_scale, r) *
+                       ((1 + k->damping) * w[c] + 2 * k->around->w[i * NX + c]);
+        for (int r = 0; r < NY; r++)
+            for (int c = 0; c < NY; c++)
+                sum += v[r] * mhe_scaled(R[r * NY + c], t->noise_scale, r) *
+                       (v[c] + 2 * k->around->v[i * NY + c]);
+        objective += k->factors[i + 1] * sum;
+    }
+    return objective + mhe_bend_objective(e, k);
 }
 
 /* The same steps of the interior point. */

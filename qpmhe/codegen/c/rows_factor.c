@@ -12,6 +12,9 @@
  * sums have lost to them. */
 #define STIFFER (sizeof(real) == 8 ? (real)1e3 : (real)1e2)
 
+/* Rounds beside those: the size of a change says when they are done. */
+#define MORE_ROUNDS 0
+
 /* No row is one on a direction that has no disturbance in any trial. */
 static int mhe_is_eliminated(const mhe_settings *s, int r)
 {
@@ -176,6 +179,15 @@ static real mhe_size(const mhe_estimator *e, const mhe_workspace *k, const real 
     for (int j = 0; j < (e->length + 1) * NX; j++)
         sum += k->diagonal[j] * d[j] * d[j];
     return sqrt(sum);
+}
+
+/* Twice the objective of the QP at its solution: g'd - force'c(d), with H d + g + c' force = 0. */
+static real mhe_twice_objective(const mhe_estimator *e, const mhe_workspace *k)
+{
+    const mhe_rows *q = &k->rows;
+    real objective = mhe_dot((e->length + 1) * NX, k->gradient, k->step);
+    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) objective -= mhe_whole_force(q, i) * q->value[i];
+    return objective;
 }
 
 /* The same steps of the interior point. */

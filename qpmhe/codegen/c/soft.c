@@ -176,14 +176,11 @@ static real mhe_whole_force(const mhe_rows *q, int i)
     return q->force[i] + q->bend[i] * (q->value[i] - mhe_limit_of(q, i));
 }
 
-/* The decrease of J that the QP promises. With H d + g + c' force = 0, twice its objective is
- * g'd - force'c(d). */
-static real mhe_promised(const mhe_estimator *e, const mhe_workspace *k, const mhe_outcome *o)
+/* The decrease of J that the QP promises. */
+static real mhe_promised(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 {
-    const mhe_rows *q = &k->rows;
-    real objective = mhe_dot((e->length + 1) * NX, k->gradient, k->step);
-    for (int i = 0; i < mhe_row_stages(e) * ROWS; i++) objective -= mhe_whole_force(q, i) * q->value[i];
-    return mhe_max(o->best->penalty - objective - mhe_linear_penalty(e, q), 0);
+    const real objective = mhe_twice_objective(e, k);
+    return mhe_max(o->best->penalty - objective - mhe_linear_penalty(e, &k->rows), 0);
 }
 
 /* Second-order corrections: soft rows have a margin by the shifts of their limits alone, where
@@ -258,16 +255,19 @@ static real mhe_push_miss(const mhe_rows *q, const mhe_side *p, int i, real targ
     return (target - p->miss_correction[i]) / p->miss[i] - force;
 }
 
-/* Weights of rows whose limits give way; the sum of the products of misses and their duals. */
+/* Weights of rows whose limits give way, none of which rounding makes negative; the sum of the products
+ * of misses and their duals. */
 static real mhe_soften_weights(mhe_rows *q, int rows)
 {
     real products = 0;
+    for (int i = 0; i < rows; i++)
+        if (mhe_is_elastic(q, i)) q->weight[i] = 0;
     for (int side = 0; side < 2; side++) {
         const mhe_side *p = q->sides + side;
         for (int i = 0; i < rows; i++) {
             if (!mhe_gives_way(q, p, i)) continue;
             const real stiff = p->dual[i] * p->inverse[i], soft = mhe_resistance(q, p, i);
-            q->weight[i] -= stiff * (stiff / (soft + stiff));
+            q->weight[i] += stiff * (soft / (soft + stiff));
             products += p->miss[i] * p->pull[i];
         }
     }

@@ -58,7 +58,7 @@ static int mhe_give_way(mhe_rows *q, int i, real gap, real little)
 }
 
 /* The decrease of J that the QP promises. */
-static real mhe_promised(const mhe_estimator *e, const mhe_workspace *k, const mhe_outcome *o)
+static real mhe_promised(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
 {
     (void)o;
     return fabs(mhe_dot((e->length + 1) * NX, k->gradient, k->step));

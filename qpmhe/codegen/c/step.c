@@ -100,6 +100,7 @@ static void mhe_fill(mhe_estimator *e, const mhe_workspace *k, const mhe_outcome
     mhe_fill_sensors(e, out);
     mhe_fill_dropped(k, o->rows_dropped, out);
     mhe_fill_missed(k, o, out);
+    mhe_fill_trial_failed(k, out);
     (void)k;
 }
 

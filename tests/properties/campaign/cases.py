@@ -191,7 +191,9 @@ class Case:
         w = self.sets["w"]
         # Whether all directions have disturbances.
         self.is_everywhere = self.G is None and (w is None or not len(w.fixed_components))
-        if (self.engine == "python" or self.is_everywhere) and r.random() < 0.25:
+        if self.engine == "compiled" and not self.is_everywhere:
+            r = np.random.default_rng([self.seed, 16])  # other draws are what they were before
+        if r.random() < 0.25:
             self._soften(r)
 
     def _soften(self, r):
@@ -218,7 +220,7 @@ class Case:
         self.constraint = None
         if self.engine == "compiled":  # other draws are what they were before C had constraints
             r = np.random.default_rng([self.seed, 15])
-        if not (self.engine == "python" or self.is_everywhere) or r.random() >= 0.15:
+        if r.random() >= 0.15:
             return
         units, radius, R = 1.0 / self.x_units, 2.0 + np.sum(self.model.start**2), np.sqrt(
             np.diag(self.R)
