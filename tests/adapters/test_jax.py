@@ -284,6 +284,7 @@ def test_steps_that_jax_does_not_compute_are_those_of_the_rate(options):
             )
 
 
+@pytest.mark.slow
 def test_an_implicit_step_of_a_rate_without_an_expression():
     """Values and derivatives by JAX's programs alone, through an estimator and a copy."""
     def rate(x):

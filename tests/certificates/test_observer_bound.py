@@ -175,6 +175,7 @@ def test_no_point_of_the_set_is_farther(n):
         assert float(bound.farthest(b, np.zeros(n))) == pytest.approx(reach, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_is_beyond_the_region_does_not_count(four):
     four, z = four[0], np.array([0.4, -0.4, 0.0, 0.0])
     np.testing.assert_array_equal(four.around(1e6, z), (-0.5 * np.ones(4), 0.5 * np.ones(4)))

@@ -213,6 +213,7 @@ def symbols(path, *options):
     return {line.split()[-1] for line in done.stdout.splitlines()}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("nm") is None, reason="there is no nm")
 def test_exports_its_public_names_and_needs_libm_only(tmp_path):
     public = {f"reactor_{name}" for name in (

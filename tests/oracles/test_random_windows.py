@@ -11,7 +11,7 @@ from examples.studies.random_windows import STATIONARY, Program, compared
 
 MODELS = qpmhe.models.catalogue()
 # Programs of these take Ipopt seconds to build.
-LARGE = "quadrotor", "chain_of_masses"
+LARGE = "quadrotor", "chain_of_masses", "cstr"
 NAMES = [
     pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name for name in MODELS
 ]
@@ -32,6 +32,7 @@ def test_converged_cost_is_that_of_the_best(name):
     check(name, range(10))
 
 
+@pytest.mark.slow
 def test_with_damping():
     """Undamped steps alone end above the minimum of the others, at 2.7 times its J."""
     check("cstr", [162])

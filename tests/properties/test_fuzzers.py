@@ -98,7 +98,8 @@ def test_every_step_is_what_it_says(pytestconfig, source, writing):
 
 @pytest.mark.shortened
 @pytest.mark.parametrize(
-    ("source", "writing", "seed"), [("numpy", "batched", 4), ("casadi", "compiled", 2)]
+    ("source", "writing", "seed"),
+    [("numpy", "batched", 4), pytest.param("casadi", "compiled", 2, marks=pytest.mark.slow)],
 )
 def test_states_are_held_as_the_formulas_say(pytestconfig, source, writing, seed):
     pytest.importorskip(source)
