@@ -5,6 +5,8 @@
 #define STALL 4
 #define SHARE (real)0.8
 #define SMALL (real)1e-3
+/* Products at the start of the way to the nearest point, in squares of the miss. */
+#define GENEROUS (real)1e4
 
 /* The sign of a row's value in the slack of one of its sides. */
 static real mhe_sign(int side) { return side ? -1 : 1; }
@@ -185,8 +187,10 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     (void)offset;
     const real outside = mhe_row_violation(e, k, k->step);
     const real scale = mhe_max(promise, outside * outside);
-    /* Generous products: from smaller ones it creeps on some QPs. */
-    const int sides = mhe_start(q, rows, missed, reach, mhe_max(scale, EPSILON * EPSILON));
+    /* Generous products: from smaller ones it creeps on some QPs. The way to the nearest point promises
+     * nothing, and may cost much more than the square of the miss. */
+    const real product = (nearest ? GENEROUS : 1) * mhe_max(scale, EPSILON * EPSILON);
+    const int sides = mhe_start(q, rows, missed, reach, product);
     if (!sides) return STOPPED;
     for (*iterations = 0;; ++*iterations) {
         real infeasible, length = 1, target = 0;
