@@ -54,8 +54,8 @@ from x̂ of the set around z that holds the true state, at the time of the worst
 `certificate.bound(run)`; the estimator has two QPs a sample. *Guarded x̂*: with a guard in
 `Monitor`, the bound that is known before any measurement; the worst error is that of hostile
 estimates, far beyond the observer's state as seen from the truth, in the same runs. Lengths are
-Euclidean, in the units of the states; *CPU time* is that of `certify`, and of finding the gain where
-it was synthesised (†).
+Euclidean, in the units of the states; *CPU time* is that of `certify`, and of finding the gain
+where it was synthesised (†).
 
 | system | Lyapunov: N | bound | worst | paper's theorem: N | bound | region's diameter |
 |---|---|---|---|---|---|---|
