@@ -44,7 +44,7 @@ bounds for disturbances |w| and noises |v| up to the sizes given, and the larges
 adversary found who knows the model, chooses every disturbance and every noise anew, and starts the
 observer at the true state. `make certificates` makes it.
 
-| system | region | \\|w\\|, \\|v\\| | time | observer: bound | worst | factor \
+| system | region | \\|w\\|, \\|v\\| | CPU time | observer: bound | worst | factor \
 | around it: x̂ within | worst | factor | guarded x̂ in advance: bound | worst | factor |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|
 {first}
@@ -54,8 +54,8 @@ from x̂ of the set around z that holds the true state, at the time of the worst
 `certificate.bound(run)`; the estimator has two QPs a sample. *Guarded x̂*: with a guard in
 `Monitor`, the bound that is known before any measurement; the worst error is that of hostile
 estimates, far beyond the observer's state as seen from the truth, in the same runs. Lengths are
-Euclidean, in the units of the states; *time* is that of `certify`, and of finding the gain where it
-was synthesised (†).
+Euclidean, in the units of the states; *CPU time* is that of `certify`, and of finding the gain
+where it was synthesised (†).
 
 | system | Lyapunov: N | bound | worst | paper's theorem: N | bound | region's diameter |
 |---|---|---|---|---|---|---|
@@ -116,7 +116,7 @@ class Row:
 
     case: Case
     certificate: Certificate
-    seconds: float
+    seconds: float  # of the processor
     bound: float
     observed: float = 0.0
     around: float = np.nan
@@ -166,8 +166,8 @@ def cases() -> list[Case]:
 
 
 def prepared(case: Case) -> Row:
-    """The certificate, with the time it took."""
-    began, system, sizes = time.perf_counter(), case.system, case.sizes
+    """The certificate, with the processor time it took."""
+    began, system, sizes = time.process_time(), case.system, case.sizes
     observer = case.observer or synthesise_gain(
         system, case.region, inputs=case.inputs, sizes=(sizes.disturbance, sizes.noise),
         seconds=SECONDS,
@@ -181,7 +181,7 @@ def prepared(case: Case) -> Row:
         system, observer, cost, horizon=case.horizon, region=case.region, inputs=case.inputs,
         sizes=sizes, seconds=SECONDS,
     )
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     proved = certificate.observer_bound
     assert proved is not None
     settled = proved.settled

@@ -228,6 +228,15 @@ def test_what_cannot_be_enclosed_is_sampled_with_its_name_and_the_remedy(monkeyp
     assert "given up" in found.notes[0]
 
 
+def test_an_implicit_step_is_sampled_and_called_that():
+    system = qpmhe.System.from_ode(
+        lambda x: -x - x**3, lambda x: x, dt=0.1, n=1, p=1, method="midpoint")
+    found = certify_observer(system, qpmhe.Luenberger([[0.3]]), unit_box(1), rho=0.8)
+    assert found.evidence is Evidence.SAMPLED
+    assert "it is an implicit step, which solves equations); the inequality holds at" in (
+        found.notes[0])
+
+
 def test_a_mode_is_called_unseen_only_where_it_is():
     hidden = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
     for side in (1e-6, 1e6):  # the sizes of the states alone decide nothing either way
