@@ -200,7 +200,7 @@ class ImplicitStep:
             if iteration == 0:
                 side[at] = found.side[:, :1]
             # Another solution for z is no stage of this step.
-            lost = ~np.isfinite(length) | (done & (found.side != side[at]).any(axis=1))
+            lost = np.isnan(length) | (done & (found.side != side[at]).any(axis=1))
             scale = np.abs(W[at]) + np.abs(moves)
             scale[..., :n] = np.abs(x[at])[:, None] + scale[..., :n]
             before, factor = share(moves, scale), np.ones(len(at))
