@@ -84,7 +84,8 @@ def _row(estimator: MovingHorizonEstimator) -> tuple[str, ...]:
 
 def _steps(estimator: MovingHorizonEstimator) -> list[tuple[str, ...]]:
     """Method, substeps, error and the largest one that does no harm; others if it does harm."""
-    system, rows = estimator.system, []
+    system = estimator.system
+    rows: list[tuple[str, ...]] = []
     for how, error in step_errors(
         system, estimator.cost, estimator.observer.initial_covariance(), estimator.initial_state,
         np.zeros(system.m),
