@@ -5,7 +5,8 @@ measure one voltage and the difference of the angles, a tachometer one speed. Al
 Radau IIA step of order 5 a sample and have the same weights, horizon and record. do-mpc solves
 each window with Ipopt. Prior and disturbance of do-mpc differ (see the page on do-mpc), so that
 errors compare only roughly. Samples take turns; times are medians of one run, on one thread, and
-count once the windows are full.
+count once the windows are full. Last come steps of models without stiffness by Radau IIA, in times
+of a Runge-Kutta step.
 """
 
 from __future__ import annotations
@@ -189,6 +190,74 @@ def step_times(model: qpmhe.System, x: Any, u: Any) -> dict[str, float]:
     return found
 
 
+def pendulum(x: Any, u: Any) -> Any:
+    """A damped pendulum."""
+    return np.stack([x[..., 1], u[..., 0] - np.sin(x[..., 0]) - 0.1 * x[..., 1]], -1)
+
+
+def reactor(x: Any, u: Any) -> Any:
+    """The reactor of van de Vusse: two concentrations, two temperatures."""
+    a, b, inner, jacket = (x[..., i] for i in range(4))
+    first = 1.287e12 * np.exp(-9758.3 / (inner + 273.15))
+    second = 9.043e9 * np.exp(-8560.0 / (inner + 273.15))
+    heat = first * a * 4.2 - first * b * 11.0 - second * a * a * 41.85
+    return np.stack([
+        u[..., 0] * (5.1 - a) - first * a - second * a * a, first * (a - b) - u[..., 0] * b,
+        u[..., 0] * (130.0 - inner) + 30.8 * (jacket - inner) - heat / 2.81,
+        86.7 * (inner - jacket) - 113.0,
+    ], -1)
+
+
+def chain(x: Any, u: Any) -> Any:
+    """Cells in a row that exchange and decay."""
+    left = np.concatenate([u[..., :1], x[..., :-1]], -1)
+    right = np.concatenate([x[..., 1:], x[..., -1:]], -1)
+    return 3.0 * (left - 2.0 * x + right) - 0.5 * x**3
+
+
+#: Rates, steps, and usual states with their deviations.
+MILD = {
+    "pendulum, n = 2": (pendulum, 0.1, np.zeros(2), 1.0),
+    "reactor, n = 4": (reactor, 0.005, np.array([1.2, 0.9, 134.0, 130.0]), 0.03),
+    "chain, n = 8": (chain, 0.05, np.zeros(8), 1.0),
+    "chain, n = 20": (chain, 0.05, np.zeros(20), 1.0),
+}
+
+
+def linearized(made: qpmhe.System, x: Any, u: Any, folder: str) -> Callable[[Any], Any]:
+    """A call of f and its Jacobian in C at all of these states."""
+    file, pointer, shape = Path(folder, "model.c"), ctypes.c_void_p, x.shape
+    file.write_text(model_files(made.symbolic)["model.c"], encoding="ascii")
+    library = ctypes.CDLL(str(compile_library(file)))
+    out, slopes = np.zeros(shape), np.zeros((*shape, shape[1]))
+    return lambda _: library.mhe_jacobians(
+        ctypes.c_int64(len(x)), pointer(x.ctypes.data), pointer(u.ctypes.data), None,
+        ctypes.c_double(made.dt), pointer(out.ctypes.data), None, pointer(slopes.ctypes.data), None,
+    )
+
+
+def radau_times() -> dict[str, dict[str, float]]:
+    """Microseconds of f and its Jacobian in C, by a step of rk4, of midpoint and of radau."""
+    generator, found, count = np.random.default_rng(0), {}, 400
+    for name, (rate, dt, usual, deviation) in MILD.items():
+        n = len(usual)
+        size = np.where(usual == 0.0, 1.0, usual) * deviation
+        x = np.ascontiguousarray(usual + size * generator.standard_normal((count, n)))
+        u = np.full((count, 1), 0.4)
+        times: dict[str, list[float]] = {"rk4": [], "midpoint": [], "radau": []}
+        with tempfile.TemporaryDirectory() as folder:
+            calls = {
+                method: linearized(qpmhe.System.from_ode(
+                    rate, lambda x: x[..., :1], dt=dt, n=n, p=1, m=1, method=method
+                ), x, u, folder) for method in times
+            }
+        for _ in range(40):
+            for method, call in calls.items():
+                times[method].append(timed(call, None)[1] / count)
+        found[name] = {one: 1e6 * float(np.median(values)) for one, values in times.items()}
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=150)
@@ -251,9 +320,16 @@ def main() -> None:
         f"f and its Jacobian in C: qpmhe {steps['qpmhe']:.3g} us, CasADi's fast_newton "
         f"{steps['fast_newton']:.3g} us, {steps['fast_newton'] / steps['qpmhe']:.3g} times as long"
     )
+    mild = radau_times()
+    for name, one in mild.items():
+        Console().print(
+            f"{name}: rk4 {one['rk4']:.3g} us, midpoint {one['midpoint'] / one['rk4']:.2g} and "
+            f"radau {one['radau'] / one['rk4']:.2g} times as long"
+        )
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "algebraic.json").write_text(json.dumps({
         "environment": environment(("qpmhe", "casadi", "do-mpc")), "rows": rows, "steps": steps,
+        "mild": mild,
     }, indent=1), encoding="utf-8")
 
 

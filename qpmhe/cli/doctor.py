@@ -21,7 +21,7 @@ from ..codegen.folders import cache_directory, cache_folders, refusal
 from ..costs import QuadraticCost
 from ..errors import QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
-from ..estimation.step_length import step_error
+from ..estimation.step_length import step_errors
 from ..models import catalogue
 from ..observers import Luenberger
 from ..records.record_model import load_record_model
@@ -59,7 +59,8 @@ def doctor(
                 continue
             table.add_row(escape(model), *_row(estimator))
             if estimator.system.dt is not None:
-                steps.add_row(escape(model), *_step(estimator))
+                for row in _steps(estimator):
+                    steps.add_row(escape(model), *row)
     console.print(table)
     if steps.row_count:
         console.print()
@@ -81,18 +82,20 @@ def _row(estimator: MovingHorizonEstimator) -> tuple[str, ...]:
     return str(system.n), form, f"[{color}]{engine}[/]", escape(reason)
 
 
-def _step(estimator: MovingHorizonEstimator) -> tuple[str, ...]:
-    """Method, substeps, error and the largest one that does no harm."""
+def _steps(estimator: MovingHorizonEstimator) -> list[tuple[str, ...]]:
+    """Method, substeps, error and the largest one that does no harm; others if it does harm."""
     system = estimator.system
-    error = step_error(
+    rows: list[tuple[str, ...]] = []
+    for how, error in step_errors(
         system, estimator.cost, estimator.observer.initial_covariance(), estimator.initial_state,
         np.zeros(system.m),
-    )
-    found = f"{system.method}", f"{system.steps}"
-    if error is None:
-        return (*found, "unknown", "")
-    color = "yellow" if error.deviations > error.most else "default"
-    return (*found, f"[{color}]{error.deviations:.2g}[/]", f"at most {error.most:g}")
+    ):
+        color = "default" if error.is_harmless else "yellow"
+        rows.append((
+            how.method, str(how.steps), f"[{color}]{error.deviations:.2g}[/]",
+            f"at most {error.most:g}",
+        ))
+    return rows or [(f"{system.method}", f"{system.steps}", "unknown", "")]
 
 
 def _machine() -> Table:

@@ -22,6 +22,7 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.traces import warn_of
 from ..observers import Observer
+from .branches import check_branches
 from .conditions import ConditionReader, Conditions
 from .contracts import check_correction, check_observer, check_prior
 from .engines import EngineChangeError, engine_for
@@ -222,10 +223,11 @@ class MovingHorizonEstimator(EstimatorMemory):
             check_correction(
                 self._own_system, observer, cost, self._initial_state, self._usual_input
             )
-            check_step(
-                self._own_system, cost, observer.initial_covariance(), self._initial_state,
-                self._usual_input, 3,
-            )
+            for check in check_step, check_branches:
+                check(
+                    self._own_system, cost, observer.initial_covariance(), self._initial_state,
+                    self._usual_input, 3,
+                )
             self._own_system = compared(
                 self._own_system, cost, observer.initial_covariance(), self._initial_state,
                 self._usual_input, horizon,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -49,6 +49,11 @@ class StepError:
     point: Array
     most: float
 
+    @property
+    def is_harmless(self) -> bool:
+        """Whether it is at most that large."""
+        return self.deviations <= self.most
+
 
 class StepComparison:
     """Steps of an ODE compared with others, at the initial state and at points of the prior.
@@ -81,29 +86,41 @@ class StepComparison:
         f = system.timed.f.batch
         return self._largest(f(self._points, step), f(f(self._points, half), half))
 
-    def remedies(self) -> list[str]:
-        """Discretisations whose error is small enough, as arguments; none without an expression."""
-        system, found = self._system, []
-        model = system.symbolic
+    def others(self) -> Iterator[tuple[Discretization, StepError]]:
+        """Other discretisations and their errors, for each method up to the first fine one.
+
+        None without an expression.
+        """
+        model = self._system.symbolic
         if model is None or model.how is None:
-            return []
+            return
         own: list[tuple[str, tuple[int, ...]]] = [("radau", _IMPLICIT)]
         if not model.how.is_implicit:
             own.insert(0, (model.how.method, _EXPLICIT))
 
-        def stepped(how: Discretization) -> Callable[[], Array]:
+        def stepped(how: Discretization) -> Array:
             evaluator = Evaluator(machine(replace(model, how=how), False))
-            return lambda: evaluator.one("f", self._points, self._inputs)
+            return evaluator.one("f", self._points, self._inputs)
 
         for method, counts in own:
             for steps in counts:
                 one, other = (stepped(Discretization(method, k)) for k in (steps, 2 * steps))
-                error = self._largest(one(), other())
-                if error is not None and error.deviations <= _most(method):
-                    texts = [f"method={method!r}"] if method != model.how.method else []
-                    texts += [f"steps={steps}"] if steps > 1 else []
-                    found.append(" with ".join(texts))
+                error = self._largest(one, other)
+                if error is None:
+                    continue
+                error = replace(error, most=_most(method))
+                yield Discretization(method, steps), error
+                if error.is_harmless:
                     break
+
+    def remedies(self) -> list[str]:
+        """Discretisations whose error is small enough, as arguments."""
+        found = []
+        for how, error in self.others():
+            if error.is_harmless:
+                texts = [f"method={how.method!r}"] if how.method != self._system.method else []
+                texts += [f"steps={how.steps}"] if how.steps > 1 else []
+                found.append(" with ".join(texts))
         return [one for one in found if one]
 
     def _largest(self, one: Array, other: Array) -> StepError | None:
@@ -130,6 +147,20 @@ def step_error(
     return None if comparison is None else comparison[1]
 
 
+def step_errors(
+    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
+) -> list[tuple[Discretization, StepError]]:
+    """The errors of its own discretisation, and of others if that is too long; see `step_error`."""
+    found = _comparison(system, cost, covariance, state, u)
+    if found is None or system.origin.how is None:
+        return []
+    errors = [(system.origin.how, found[1])]
+    if not found[1].is_harmless:
+        with suppress(Exception), np.errstate(all="ignore"):
+            errors += found[0].others()
+    return errors
+
+
 def check_step(
     system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, level: int
 ) -> None:
@@ -138,7 +169,7 @@ def check_step(
     Other arguments are those of `StepComparison`.
     """
     found = _comparison(system, cost, covariance, state, u)
-    if found is None or found[1].deviations <= found[0].most:
+    if found is None or found[1].is_harmless:
         return
     comparison, error = found
     remedies: list[str] = []
@@ -151,7 +182,7 @@ def check_step(
     )
     differs = (
         f"differs from that of half the length by {error.deviations:.2g} standard deviations of "
-        f"the disturbance in state {error.component} (expected at most {comparison.most:g})"
+        f"the disturbance in state {error.component} (expected at most {error.most:g})"
         if np.isfinite(error.deviations) else
         f"and that of half the length are not both finite in state {error.component}"
     )

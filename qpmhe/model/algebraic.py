@@ -29,6 +29,8 @@ SMALL = 1e-7
 ROUNDING = 4e-16
 #: How far the equations may be from linear along a step, as a share of it.
 CURVED = 0.5
+#: Parts of a way along which a solution is followed.
+FOLLOWED = 16
 #: Factors that shorten a step along which they are less linear: the least and the largest.
 LESS = 0.1, 0.5
 
@@ -103,6 +105,19 @@ class AlgebraicStates:
             self._iterate(w, u, x.shape[1], solved)
         return w, solved
 
+    def followed(self, w: Array, x: Array, u: Array) -> Array:
+        """The solution w (n + k,) as x moves to others (K, n) in parts; NaN beyond folds."""
+        n = x.shape[1]
+        at, solved = np.repeat(w[None], len(x), axis=0), np.ones(len(x), np.bool_)
+        with np.errstate(all="ignore"):
+            for share in np.linspace(0.0, 1.0, FOLLOWED + 1)[1:]:
+                at[:, :n] = w[:n] + share * (x - w[:n])
+                found = np.zeros(len(x), np.bool_)
+                self._iterate(at, u, n, found)
+                solved &= found
+        at[~solved, n:] = np.nan
+        return at
+
     def _iterate(self, w: Array, u: Array, n: int, solved: Mask) -> None:
         """Newton's iteration in place."""
         at, last = np.arange(len(w)), np.full(len(w), np.inf)
@@ -114,7 +129,7 @@ class AlgebraicStates:
             scale = np.abs(z) + np.abs(step)
             before = share(step, scale)
             done = converged(length, last)
-            lost, factor = ~np.isfinite(length), np.ones(len(at))
+            lost, factor = np.isnan(length), np.ones(len(at))
             trial = w[at]
             for _ in range(MOST_HALVINGS):
                 trial[:, n:] = z + factor[:, None] * step
@@ -231,7 +246,10 @@ def shorter(curved: Array, factor: Array, before: Array) -> Array:
 
 
 def share(step: Array, size: Array) -> Array:
-    """The largest share (K,) that a correction (K, ...) has of sizes that broadcast to it."""
+    """The largest share (K,) that a correction (K, ...) has of sizes that broadcast to it.
+
+    Infinity where one leads to 0.
+    """
     shares = np.abs(step) / size
     shares[(step == 0.0) & (size == 0.0)] = 0.0  # a state that stays 0
     found: Array = shares.reshape(len(shares), -1).max(axis=1)

@@ -7,7 +7,8 @@ states, z_i:
 
 The start is Z = 0 and the algebraic states at x, so that the step is a function of x, u and h
 alone. The implicit function theorem gives its derivative, from the Jacobians at the converged
-stages: exact, whatever the iteration did.
+stages: exact, whatever the iteration did. C first tries a simplified iteration with one Jacobian,
+from the same start (`stages_kept.c`), which has the same limit where it converges fast.
 """
 
 from __future__ import annotations
@@ -200,7 +201,7 @@ class ImplicitStep:
             if iteration == 0:
                 side[at] = found.side[:, :1]
             # Another solution for z is no stage of this step.
-            lost = ~np.isfinite(length) | (done & (found.side != side[at]).any(axis=1))
+            lost = np.isnan(length) | (done & (found.side != side[at]).any(axis=1))
             scale = np.abs(W[at]) + np.abs(moves)
             scale[..., :n] = np.abs(x[at])[:, None] + scale[..., :n]
             before, factor = share(moves, scale), np.ones(len(at))

@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import qpmhe
-from qpmhe.estimation.step_length import step_error
+from qpmhe.cli import doctor
+from qpmhe.estimation.step_length import step_error, step_errors
 from qpmhe.models import catalogue
 
 
@@ -167,3 +168,34 @@ def test_the_remedies_are_remedies(method):
             STIFF, h, dt=0.2, n=2, p=1, method=name or method, steps=int(steps or 1)
         )
         build(system, *parts[1:])
+
+
+@pytest.mark.parametrize("rate", [STIFF, MILD])
+def test_a_table_has_the_own_step_and_where_it_is_too_long_finer_ones(rate):
+    """Each error is that of `step_error` of a system with this discretisation."""
+    system, _, cost, options = made(rate)
+    point = None, np.array(options["initial_state"]), np.zeros(0)
+    errors = step_errors(system, cost, *point)
+    assert [how.method for how, _ in errors[:1]] == ["rk4"]
+    if rate is MILD:
+        assert len(errors) == 1
+        return
+    assert [tuple(how) for how, _ in errors] == [
+        ("rk4", 1), ("rk4", 2), ("rk4", 4), ("rk4", 8), ("radau", 1), ("radau", 2)
+    ]
+    assert [error.is_harmless for _, error in errors] == 3 * [False] + [True, False, True]
+    for how, error in errors:
+        other = qpmhe.System.from_ode(rate, h, dt=0.1, n=2, p=1, method=how.method, steps=how.steps)
+        expected = step_error(other, cost, *point)
+        assert error.deviations == pytest.approx(expected.deviations, rel=1e-6)
+
+
+def test_doctor_shows_the_table():
+    system, observer, cost, options = made()
+    with pytest.warns(qpmhe.ModelWarning, match="too long"):
+        mhe = build(system, observer, cost, options)
+    rows = doctor._steps(mhe)
+    assert [row[:2] for row in rows][::3] == [("rk4", "1"), ("rk4", "8")]
+    assert rows[0][2].startswith("[yellow]")
+    assert rows[-1][2].startswith("[default]")
+    assert {row[3] for row in rows} == {"at most 0.1"}

@@ -1,6 +1,7 @@
 """Systems with algebraic states: steps, derivatives, start values, the estimator, bad input."""
 
 import pickle
+import warnings
 from functools import cache
 
 import numpy as np
@@ -690,6 +691,42 @@ def test_an_initial_state_without_algebraic_states_is_an_error(algebraic, guess,
     observer, cost = weights(2, 1)
     with pytest.raises(ModelError, match="(?s)" + words), np.errstate(all="ignore"):
         MovingHorizonEstimator(system, observer, cost, horizon=3, initial_state=[0.5, 0.2])
+
+
+@pytest.mark.parametrize("guess", [1.0, -3e-5])
+def test_a_solution_that_is_zero_is_found_from_another_guess(guess):
+    """A current at rest: nothing else in its equation has a size."""
+    system = System.from_dae(
+        lambda x, z: z, lambda x, z: z + z**3 + 2.0 * x, lambda x, z: z, dt=0.1, n=1, k=1, p=1,
+        algebraic_guess=[guess],
+    )
+    assert system.algebraic_states([0.0]) == 0.0
+    assert system.f(np.zeros(1)) == pytest.approx(0.0, abs=1e-15 * abs(guess))
+
+
+@pytest.mark.parametrize(("guess", "deviation", "found"), [
+    (0.0, 10.0, True), (0.0, 2.0, False), (-10.0, 10.0, False),
+])
+def test_an_estimator_says_where_the_guess_leads_to_another_branch(guess, deviation, found):
+    """Roots of z at x, x + 10 and x + 20: the guess 0 leads to the first, or to the last."""
+    def cubic(x, z):
+        away = z - x
+        return away * (away - 10.0) * (away - 20.0)
+
+    system = System.from_dae(
+        lambda x, z: -z, cubic, lambda x, z: z, dt=0.1, n=1, k=1, p=1, algebraic_guess=[guess]
+    )
+    assert system.algebraic_states([0.0]) == pytest.approx(0.0, abs=1e-12)
+    terms = {"disturbance": [[1.0]], "noise": [[1.0]]}
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        MovingHorizonEstimator(
+            system, ExtendedKalman(prior=[[deviation**2]], **terms),
+            QuadraticCost.from_covariances(**terms), horizon=3, initial_state=[0.0],
+        )
+    texts = [str(one.message) for one in seen if "two branches" in str(one.message)]
+    assert len(texts) == found
+    assert not found or "at x = [-10.], a point of the prior" in texts[0]
 
 
 @pytest.mark.parametrize("make", [

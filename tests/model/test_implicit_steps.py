@@ -174,6 +174,17 @@ def test_the_compiled_step_keeps_a_jacobian_and_has_the_same_values(method):
     assert (np.abs(slopes - expected) < 1e-9 * sizes).all()
 
 
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+def test_the_compiled_step_moves_what_linear_equations_leave_at_zero():
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    functions = (
+        ca.Function("rate", [x, u], [ca.vertcat(x[1] ** 2, u)]), ca.Function("h", [x, u], [x[0]])
+    )
+    model = qpmhe.from_casadi(*functions, dt=0.5, method="radau", compiled=True).model()
+    found = model.step(np.zeros((1, 2)), np.array([[2.0]]))
+    np.testing.assert_allclose(found, [[4.0 * 0.5**3 / 3.0, 1.0]], rtol=1e-14)
+
+
 def test_steps_of_other_lengths_and_inputs():
     made = system(pendulum, 2, 1, dt=0.5, method="radau", steps=2)
     x, u = np.array([1.0, 0.3]), np.array([0.2])

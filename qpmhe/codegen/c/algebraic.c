@@ -124,7 +124,7 @@ static int mhe_complete(const real *x, const real *u, real *w, mhe_reduced *last
         real factor = 1;
         int good = 0;
         const real length = mhe_algebraic_share(r, w + NX, sizes, r->step);
-        if (!isfinite(length)) return 0;
+        if (isnan(length)) return 0;
         const int done = mhe_converged(length, last);
         for (int i = 0; i < NZ; i++) scale[i] = (real)(fabs(w[NX + i]) + fabs(r->step[i]));
         const real before = mhe_share(NZ, r->step, scale);

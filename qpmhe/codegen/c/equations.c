@@ -24,13 +24,13 @@ static real mhe_shorter(real curved, real factor, real before)
     return factor * (predicted < (real)$most ? mhe_max(predicted, $least) : (real)$most);
 }
 
-/* The largest share that a correction has of some sizes. */
+/* The largest share that a correction has of some sizes: infinity where one leads to 0. */
 static real mhe_share(int size, const real *step, const real *sizes)
 {
     real length = 0;
     for (int i = 0; i < size; i++) {
         const real share = step[i] != 0 ? (real)fabs(step[i]) / sizes[i] : 0;
-        if (!isfinite(share)) return NAN;
+        if (isnan(share)) return NAN;
         length = mhe_max(share, length);
     }
     return length;

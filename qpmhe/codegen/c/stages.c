@@ -84,7 +84,7 @@ static real mhe_stage_moves(const mhe_reduced *r, const real *W, const real *siz
             moves[i * NW + a] = step[i * NX + a];
         }
         const real share = mhe_move_algebraic(r + i, W + i * NW, sizes, moves + i * NW);
-        if (!isfinite(share)) return NAN;
+        if (isnan(share)) return NAN;
         length = mhe_max(share, length);
     }
     return length;
@@ -129,7 +129,7 @@ static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, 
         mhe_solve_equations(MHE_UNKNOWNS, M, pivot, step);
         mhe_stage_sizes(w, h, W, step, r, sizes);
         const real length = mhe_stage_moves(r, W, sizes, step, moves);
-        if (!isfinite(length)) return 0;
+        if (isnan(length)) return 0;
         const int done = mhe_converged(length, last);
         real factor = 1, before = NAN;
         if (damped) {

@@ -174,6 +174,8 @@ static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_red
             for (int i = 0; i < MHE_STAGE_VALUES; i++) share[i] *= part;
         }
         for (int i = 0; i < MHE_STAGE_VALUES; i++) {
+            /* What stays 0 in linear equations has no size. */
+            if (!(sizes[i] > 0) && share[i] != 0) return 0;
             length = mhe_max((real)fabs(share[i]), length);
             square += share[i] * share[i];
             W[i] += share[i] * sizes[i];
