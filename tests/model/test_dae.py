@@ -182,6 +182,41 @@ def test_the_step_against_idas():
     )
 
 
+def test_cells_of_a_battery_against_the_circuit_solved_by_hand():
+    """Parallel cells: each has a charge and a polarisation; the currents share one voltage."""
+    c = 8
+    inner, pair = 1.0 + 0.1 * np.arange(c), 10.0 ** -np.linspace(0.0, 3.0, c)
+
+    def source(x):
+        return 3.0 + x[..., :c] + 0.2 * np.tanh(3.0 * x[..., :c]) - x[..., c : 2 * c]
+
+    def rate(x, z):
+        return np.concatenate((-0.01 * z[..., :c], (z[..., :c] - x[..., c:]) / pair), axis=-1)
+
+    def circuit(x, z, u):
+        drop = source(x) - inner * z[..., :c] - z[..., c:]
+        total = z[..., :c].sum(axis=-1, keepdims=True) - u
+        return np.concatenate((drop, total), axis=-1)
+
+    def currents(x, u):
+        voltage = ((source(x) / inner).sum() - u[0]) / (1.0 / inner).sum()
+        return (source(x) - voltage) / inner, voltage
+
+    system = System.from_dae(
+        rate, circuit, lambda x, z: z[..., c:], dt=1.0, n=2 * c, k=c + 1, p=1, m=1, steps=4,
+        algebraic_guess=[*np.zeros(c), 3.0],
+    )
+    x, u = np.concatenate((np.linspace(0.3, 0.8, c), np.zeros(c))), np.array([2.0])
+    expected = solve_ivp(
+        lambda t, x: rate(x, currents(x, u)[0]), (0.0, 1.0), x, method="Radau", rtol=1e-12,
+        atol=1e-14,
+    ).y[:, -1]
+    found = system.f(x, u)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=3e-5)
+    z = system.algebraic_states(found, u)
+    np.testing.assert_allclose(z, np.append(*currents(found, u)), rtol=0, atol=1e-12)
+
+
 def in_complex_numbers(functions, guess, x, u, dt):
     """x+ and y by one step of Radau IIA, all unknowns at once, and their complex-step slopes."""
     rate, algebraic, output = functions

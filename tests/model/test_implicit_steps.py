@@ -31,6 +31,19 @@ def van_der_pol(x):
     return np.stack([x[..., 1], 1e3 * (1.0 - x[..., 0] ** 2) * x[..., 1] - x[..., 0]], -1)
 
 
+def penicillin(x):
+    """The fed-batch fermentation of Cuthrell and Biegler, at a feed of 10 g/h."""
+    biomass, product, substrate, volume = (x[..., i] for i in range(4))
+    size, diluting = np.abs(substrate), 10.0 / (500.0 * volume)
+    growing = 0.11 * substrate / (0.006 * biomass + size) * biomass
+    making = 0.0055 * substrate / (1e-4 + size * (1.0 + size / 0.1)) * biomass
+    used = growing / 0.47 + making / 1.2 + 0.029 * substrate / (1e-4 + size) * biomass
+    return np.stack([
+        growing - diluting * biomass, making - (0.01 + diluting) * product,
+        (500.0 - substrate) * diluting - used, 10.0 / 500.0 + 0.0 * volume,
+    ], -1)
+
+
 def system(rate, n, m=0, **options):
     return qpmhe.System.from_ode(rate, lambda x: x[..., :1], n=n, p=1, m=m, **options)
 
@@ -67,7 +80,8 @@ def test_the_error_falls_with_the_order(method):
     (robertson, [1.0, 0.0, 0.0], 1.0, 4, 1e-7),  # the first millisecond is not resolved
     (robertson, [0.7, 1e-5, 0.3], 40.0, 2, 1e-7),
     (van_der_pol, [2.0, 0.0], 1.0, 4, 1e-7),
-], ids=["robertson", "robertson, long", "van der Pol"])
+    (penicillin, [20.0, 2.0, 0.02, 8.0], 1.0, 4, 1e-6),
+], ids=["robertson", "robertson, long", "van der Pol", "penicillin"])
 def test_stiff_problems(kind, rate, x, dt, steps, within):
     """Against SciPy's Radau at 1e-12, per component; one explicit step does not survive."""
     made = system(rate if kind == "traced" else untraced(rate), len(x), dt=dt, method="radau",
