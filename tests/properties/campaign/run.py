@@ -313,7 +313,7 @@ class Run:
     def _at_times(self, y, inputs, given):
         """Interrupts, and arguments that must be refused as a whole."""
         case, r = self.case, self.r
-        if self.twin and case.writing == "opaque" and r.random() < 0.02:
+        if self.twin and case.writing == "opaque" and r.random() < 0.15:
             before, case.alarm.left = plain(self.mhe.state_dict()), int(r.integers(12))
             try:
                 self.mhe.update(*copy.deepcopy((y, *inputs)), **copy.deepcopy(given))
