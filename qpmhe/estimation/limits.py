@@ -35,9 +35,10 @@ CORRECTIONS = 2
 #: left by a step without damping.
 DAMPING, MORE_DAMPING, LESS_DAMPING, OLD_DAMPING = 1e-4, 4.0, 1.0 / 3.0, 0.1
 
-#: A rejected step leaves this share of its length to the region in which a QP is trusted, an accepted
-#: one at most this many times its length. J falls well, or poorly, where it falls by more, or by less,
-#: than this share of what is predicted. At most this many shorter steps are tried.
+#: The region in which a QP is trusted: the share of its length that a rejected step leaves to it,
+#: and how many times its length an accepted one, where J falls well, by more than this share of
+#: what is predicted; where it falls poorly, by less than the next, its length. At most this many
+#: shorter steps are tried.
 SMALLER_REGION, LARGER_REGION, WELL, POOR, SHORTER = 1.0 / 3.0, 4.0, 0.75, 0.25, 30
 
 #: With more damping than this, a step is rounding beside the one without.

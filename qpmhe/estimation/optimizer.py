@@ -124,9 +124,10 @@ class Outcome:
 class Optimizer:
     """Gauss-Newton steps from the candidate, each judged by the true problem.
 
-    A step that does not lower J below the best so far is shortened, and rejected if no length
-    helps; the next QP is damped then (Levenberg and Marquardt), more and more until its step lowers
-    J. So J of the result is never above the candidate's, whatever the solver returns.
+    A step that does not lower J below the best so far is shortened (see `Region`, without
+    inequalities), and rejected if no length helps; the next QP is damped then (Levenberg and
+    Marquardt), more and more until its step lowers J. So J of the result is never above the
+    candidate's, whatever the solver returns.
 
     Where the candidate satisfies all rows, so does the result. Where it does not, the result is
 

@@ -118,7 +118,7 @@ class Region:
 
 
 class Dogleg:
-    """The path from no step by the Cauchy point, the minimum along steepest descent, to a QP's step.
+    """The path to a QP's step by the Cauchy point, the minimum along steepest descent.
 
     Parameters
     ----------

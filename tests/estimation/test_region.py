@@ -63,21 +63,33 @@ def test_the_dogleg_is_powells(sets):
     np.testing.assert_allclose(path.step(path.length)[0], step, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
-@pytest.mark.parametrize(("name", "form"), [
-    ("BoxBOD", "set"), ("Rat43", "small"), ("MGH17", "set"), ("Eckerle4", "small"),
-])
-def test_both_engines_decide_alike(name, form):
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+
+
+def agree(found, expected):
+    seen = ~Status.SOLVER_STOPPED
+    assert (found.status & seen, found.qps) == (expected.status & seen, expected.qps)
+    np.testing.assert_allclose(found.filtered, expected.filtered, rtol=1e-5)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-6)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["Eckerle4", "BoxBOD", "MGH17"])
+def test_both_engines_decide_alike(name):
     """Along a sequence of QPs of which some have shorter steps, wherever a cap ends it."""
     data = regression(name)
     for max_qps in (1, 2, 3, 5, 9, 14):
-        expected, found = (
-            data.fit(data.start, form, max_qps, engine) for engine in ("python", "compiled")
-        )
-        seen = ~Status.SOLVER_STOPPED
-        assert (found.status & seen, found.qps) == (expected.status & seen, expected.qps)
-        np.testing.assert_allclose(found.filtered, expected.filtered, rtol=1e-5)
-        assert found.cost == pytest.approx(expected.cost, rel=1e-5)
+        agree(*(data.fit(data.start, "set", max_qps, one) for one in ("compiled", "python")))
+
+
+@needs_compiler
+@pytest.mark.parametrize("sets", [None, NO_WIDTH], ids=["all disturbed", "a constant"])
+@pytest.mark.parametrize("max_qps", [2, None])
+def test_both_engines_shorten_alike(sets, max_qps):
+    """Also where disturbances are part of the metric."""
+    found, expected = (estimator(one, sets=sets, max_qps=max_qps) for one in ("compiled", "python"))
+    for y in samples():
+        agree(found.update(y), expected.update(y))
 
 
 def test_a_usual_sequence_has_no_region(monkeypatch):
