@@ -6,7 +6,8 @@
  * none lowers the cost by more than rounding. Nor is a damped one. */
 static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real promised, int useless)
 {
-    const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
+    static const real lengths[] = MHE_LENGTHS;
+    const int count = (int)(sizeof lengths / sizeof *lengths);
     const real target = mhe_target(o);
     const int shorten = !useless && !(o->present > 0);
     (void)promised;
@@ -14,7 +15,7 @@ static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real p
     if (o->spare->cost < target) return;
     if (mhe_try_curved(e, k, o, target, useless)) return;
     for (int i = 0; i < count && shorten; i++) {
-        mhe_try(e, k, o, mhe_lengths[i]);
+        mhe_try(e, k, o, lengths[i]);
         if (o->spare->cost < target) return;
     }
     if (shorten) mhe_try_along(e, k, o, target);
