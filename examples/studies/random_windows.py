@@ -1,9 +1,10 @@
 """Converged sequences of QPs against Ipopt and Levenberg-Marquardt, from the same candidates.
 
-``python -m examples.studies.random_windows`` prints the table of docs/explanation/idea.md. A window
-lies anywhere in a record of a model of the zoo. Its observer starts 1 to 10 standard deviations of
-the prior away from the true state; the observer's states are the candidate, from which all three
-begin. The peers get the same J from here, written down for CasADi by its definition.
+``python -m examples.studies.random_windows`` prints the table of docs/how-to/failing-qps.md. A
+window lies anywhere in a record of a model of the zoo. Its observer starts 1 to 10 standard
+deviations of the prior away from the true state; the observer's states are the candidate, from
+which all three begin. The peers get the same J from here, written down for CasADi by its
+definition.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ from ..observers.roots import least_share
 from ..terms.base import TermForm
 from ..terms.prior import PriorWeights
 from ..terms.rows import Rows
+from ..terms.soft import SOFT
 from .directions import Directions
 
 SET_NAMES = ("disturbances", "noises", "states")
@@ -120,6 +121,8 @@ class Layout:
     #: Components of the w that they are functions of, where it is not d; else 0.
     constraints_w: int = 0
     constrains_end: bool = False
+    #: Whether there are other rows than those of noise-free directions.
+    has_inequalities: bool = False
     #: States that are held where the window does not see them.
     held: int = 0
     #: The terms of J that not every estimator has, by their names in C.
@@ -170,6 +173,9 @@ class Layout:
             constraints=0 if functions is None else functions.size,
             constraints_w=0 if functions is None else functions.of_directions,
             constrains_end=functions is not None and bool(functions.on_state.any()),
+            has_inequalities=(
+                directions.constraints.has_inequalities or any(term.name == SOFT for term in terms)
+            ),
             terms=tuple(term.name for term in terms),
             numbers_of=tuple(
                 (name, tuple(

@@ -587,6 +587,7 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
         "trial", "damping", factor, *blocks, "outcome", _or_none("budget", layout.clock), "trials",
         *((*rows, _or_none("restoring", layout.restores), "outside") if constrained
           else ["sets_none"]),
+        "lengths" if layout.has_inequalities else "region",
         "optimizer", _or_none("graduated", layout.widened), _or_none("quiet", layout.quiet),
         "improve", _or_none("restarting", layout.restarts),
     )

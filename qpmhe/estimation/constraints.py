@@ -90,6 +90,12 @@ class Constraints:
     def __bool__(self) -> bool:
         return any((self.states, self.disturbances, self.noises, self.constraints))
 
+    @property
+    def has_inequalities(self) -> bool:
+        """Whether there are other rows than those of noise-free directions."""
+        others = any((self.states, self.noises, self.constraints))
+        return others or (self.disturbances is not None and not self.disturbances.fixed.all())
+
     def _parts(
         self, trajectory: Array, residuals: Array, measurements: Array, values: Array | None
     ) -> Iterator[tuple[Rows, Array, Array]]:

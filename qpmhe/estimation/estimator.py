@@ -75,9 +75,9 @@ class MovingHorizonEstimator(EstimatorMemory):
         QPs per sample, the paper's i; 0 gives the observer. None iterates to convergence; it
         ends before, with `Status.UNCONVERGED`, at 100 QPs, and without a cap on iterations or time
         at three in a row that the backend has not solved to its tolerance. Where a QP's step does
-        not lower J at any length, the next QP is damped, and counts. If inequalities are
-        dropped, or the candidate is restored into the sets, at least one QP is solved after that,
-        even beyond the cap.
+        not lower J at any length, which happens with inequalities, the next QP is damped, and
+        counts. If inequalities are dropped, or the candidate is restored into the sets, at least
+        one QP is solved after that, even beyond the cap.
     max_solver_iterations : int or None
         Cap on the solver's own iterations in each QP; None leaves the solver's default, or the
         cap of the solver given as ``backend``.

@@ -35,6 +35,12 @@ CORRECTIONS = 2
 #: left by a step without damping.
 DAMPING, MORE_DAMPING, LESS_DAMPING, OLD_DAMPING = 1e-4, 4.0, 1.0 / 3.0, 0.1
 
+#: The region in which a QP is trusted: the share of its length that a rejected step leaves to it,
+#: and how many times its length an accepted one, where J falls well, by more than this share of
+#: what is predicted; where it falls poorly, by less than the next, its length. At most this many
+#: shorter steps are tried.
+SMALLER_REGION, LARGER_REGION, WELL, POOR, SHORTER = 1.0 / 3.0, 4.0, 0.75, 0.25, 30
+
 #: With more damping than this, a step is rounding beside the one without.
 MOST_DAMPING = 1e16
 
@@ -91,7 +97,8 @@ def c_definitions(prefix: str, real: str) -> str:
         "IN_RANGE": IN_RANGE, "GROWTH": GROWTH, "VAGUE": VAGUE, "DAMPING": DAMPING,
         "MOST_DAMPING": MOST_DAMPING, "MORE_DAMPING": MORE_DAMPING,
         "LESS_DAMPING": LESS_DAMPING, "OLD_DAMPING": OLD_DAMPING, "TOWARDS": TOWARDS,
-        "LEAST_DISCOUNT": LEAST_DISCOUNT,
+        "LEAST_DISCOUNT": LEAST_DISCOUNT, "SMALLER_REGION": SMALLER_REGION,
+        "LARGER_REGION": LARGER_REGION, "WELL": WELL, "POOR": POOR,
     }
     if real == "float":
         values |= _SINGLE
@@ -101,6 +108,7 @@ def c_definitions(prefix: str, real: str) -> str:
     lines.append(f"#define {prefix}_LONGEST {LONGEST}")
     lines.append(f"#define {prefix}_NEAREST_POINTS {NEAREST_POINTS}")
     lines.append(f"#define {prefix}_RESTORING {RESTORING}")
+    lines.append(f"#define {prefix}_SHORTER {SHORTER}")
     for name, lengths in (("LENGTHS", LENGTHS), ("ALONG", ALONG)):
         listed = ", ".join(f"({real}){length!r}" for length in lengths)
         lines.append(f"#define {prefix}_{name} {{{listed}}}")

@@ -30,10 +30,12 @@ from .limits import (
     OLD_DAMPING,
     RESTORING,
     ROUNDING,
+    SHORTER,
     STALLED,
     TOWARDS,
 )
 from .problem import Problem
+from .region import Dogleg, Region
 from .settings import Settings
 from .subproblem import Subproblem
 
@@ -122,9 +124,10 @@ class Outcome:
 class Optimizer:
     """Gauss-Newton steps from the candidate, each judged by the true problem.
 
-    A step that does not lower J below the best so far is shortened, and rejected if no length
-    helps; the next QP is damped then (Levenberg and Marquardt), more and more until its step lowers
-    J. So J of the result is never above the candidate's, whatever the solver returns.
+    A step that does not lower J below the best so far is shortened (see `Region`, without
+    inequalities), and rejected if no length helps; the next QP is damped then (Levenberg and
+    Marquardt), more and more until its step lowers J. So J of the result is never above the
+    candidate's, whatever the solver returns.
 
     Where the candidate satisfies all rows, so does the result. Where it does not, the result is
 
@@ -148,6 +151,8 @@ class Optimizer:
         # Most estimators have no soft rows and no nonlinear constraints.
         self._extended = subproblem.extended
         self._solution = self._softened_solution if self._extended else self._solve
+        # Without inequalities, a region in place of lengths along the step.
+        self._has_region = not subproblem.has_inequalities
 
     def improve(
         self,
@@ -318,7 +323,7 @@ class Optimizer:
         outcome.unsolved = 0
         if outcome.events:
             outcome.events &= ~Status.UNCONVERGED
-        damping, growth, qp = 0.0, MORE_DAMPING, None
+        damping, growth, qp, region = 0.0, MORE_DAMPING, None, Region()
         # Second-order corrections and searches for feasible points overwrite a QP with rows.
         kept = not (problem.constrained or self._extended)
         for _ in range(limit):
@@ -354,7 +359,12 @@ class Optimizer:
             # At a minimum no step lowers J by more than rounding: it is not shortened.
             useless, target = solved and predicted <= negligible, _target(best)
             shorten = not (useless or damping)
-            for trial in self._trials(problem, qp, outcome, step, not useless, shorten):
+            bounded = shorten and self._has_region
+            trials = (
+                self._trials_within(region, problem, qp, best, step, predicted) if bounded
+                else self._trials(problem, qp, outcome, step, not useless, shorten)
+            )
+            for trial in trials:
                 if trial.cost < target:
                     break
             if not trial.cost < target:
@@ -375,12 +385,20 @@ class Optimizer:
                 damping = max(outcome.damping, DAMPING)
                 continue
             outcome.trial, before, best = trial, best, trial
+            decrease = before.cost - best.cost
+            if bounded and region.surprises(decrease):
+                if region.radius == math.inf:
+                    metric = region.scaled(self._subproblem.metric(problem, before))
+                    region.accept(decrease, math.sqrt(metric.square(step)))
+                else:
+                    region.accept(decrease)
             if damping:
-                outcome.damping = damping * _share_left(before.cost - best.cost, predicted)
+                region = Region()
+                outcome.damping = damping * _share_left(decrease, predicted)
                 outcome.message, damping, growth = "", 0.0, MORE_DAMPING
                 continue
             outcome.damping *= OLD_DAMPING
-            if solved and before.cost - best.cost <= negligible:
+            if solved and decrease <= negligible and not (bounded and region.shortened):
                 outcome.events |= Status.CONVERGED
                 return
             if self._patience and outcome.unsolved >= self._patience:
@@ -481,6 +499,35 @@ class Optimizer:
                 yield self._feasible_near(problem, outcome, trial)
             else:  # no hard set: back to the soft rows
                 yield self._correct(problem, qp, outcome, trial)
+
+    def _trials_within(
+        self, region: Region, problem: Problem, qp: QP, best: Trial, step: Array, predicted: float
+    ) -> Iterator[Trial]:
+        """The trials of a QP without inequalities, one after the other until one is accepted.
+
+        First the full step where it is in the region; then shorter ones along Powell's dogleg.
+        """
+        path = None
+        if region.radius < math.inf:
+            path = self._path(region, problem, qp, best, step, predicted)
+        if path is None or path.length <= region.radius:
+            region.whole(predicted, 0.0 if path is None else path.length)
+            yield self._trial(problem, best, step)
+            if path is None:
+                path = self._path(region, problem, qp, best, step, predicted)
+            region.reject(path.length)
+        for _ in range(SHORTER):
+            shorter = region.part(path)
+            if not region.predicted > ROUNDING * best.cost:
+                return
+            yield self._trial(problem, best, shorter)
+            region.reject(region.radius)
+
+    def _path(
+        self, region: Region, problem: Problem, qp: QP, best: Trial, step: Array, predicted: float
+    ) -> Dogleg:
+        metric = region.scaled(self._subproblem.metric(problem, best))
+        return Dogleg(metric, qp, step, predicted)
 
     def _correct(self, problem: Problem, qp: QP, outcome: Outcome, trial: Trial) -> Trial:
         """Second-order corrections of a trial that curvature takes out of a set."""

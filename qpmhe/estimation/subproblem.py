@@ -24,6 +24,7 @@ from ..terms.sum import rows_of_first, weight_of_first
 from .constraints import Constraints
 from .elimination import SINGULAR, Around, Eliminated, Elimination
 from .problem import Problem
+from .region import Metric
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,8 @@ class Subproblem:
         self._around: Around  # what that reads of the present QP
         self._eliminated: Eliminated | None = None  # the last QP without them
         self._functions = system.constraints
+        #: Whether QPs have inequalities.
+        self.has_inequalities: bool = constraints.has_inequalities or penalties is not None
         #: Whether there are soft rows or nonlinear constraints.
         self.extended: bool = self._functions is not None or penalties is not None
         # Multipliers of the nonlinear constraints in the last QP of the sequence, (K + 1, T).
@@ -140,16 +143,23 @@ class Subproblem:
 
     def _damping_band(self, problem: Problem, trial: Trial) -> Array:
         """The band that a damping of 1 adds."""
+        n, (a, q, _, information) = self._n, self.metric(problem, trial)
+        weighted = q @ a
+        columns = np.concatenate((a.transpose(0, 2, 1) @ weighted, -weighted), axis=1)
+        band = np.zeros((len(a) + 1, n, 2 * n))
+        band[:-1] = band_of(columns)
+        band[1:] += band_of(q)
+        self._information = information
+        band[0, :, 0] += information
+        return band
+
+    def metric(self, problem: Problem, trial: Trial) -> Metric:
+        """The metric of the damping of the QP that is around a trial."""
         n, minus = self._n, self._minus_jacobian
         count = len(minus)
         weights = np.broadcast_to(trial.weights, (count, *trial.weights.shape[-2:]))
         a, c, q = -minus[:, :n], minus[:, n:], weights[:, :n, :n]
-        weighted = q @ a
-        columns = np.concatenate((a.transpose(0, 2, 1) @ weighted, -weighted), axis=1)
-        band = np.zeros((count + 1, n, 2 * n))
-        band[:-1] = band_of(columns)
-        band[1:] += band_of(q)
-        basis = problem.constraints.basis
+        basis, spread = problem.constraints.basis, np.full((count, n, n), np.nan)
         information = weight_of_first(problem.terms, trial).diagonal()
         with suppress(np.linalg.LinAlgError):
             eyes = np.broadcast_to(basis.T, (count, *basis.T.shape))
@@ -158,9 +168,7 @@ class Subproblem:
             found = information + window_information(a, seen, spread).diagonal()
             if np.isfinite(found).all():
                 information = found
-        self._information = information
-        band[0, :, 0] += information
-        return band
+        return Metric(a, q, spread, information)
 
     def nearest_point(self, problem: Problem, trial: Trial) -> QP | None:
         """The QP for the nearest trajectory that satisfies the linearised sets; None as in `at`.

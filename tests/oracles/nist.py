@@ -265,14 +265,19 @@ class Regression(NamedTuple):
         return float(np.max(np.abs(b - self.certified) / unit))
 
     def estimator(self, start, form, max_qps, engine):
-        """Constant parameters as states, fitted to a window of all measurements."""
+        """Constant parameters as states, fitted to a window of all measurements.
+
+        With a wide form, the states have bounds that are far away.
+        """
         k, f = len(start), MODELS[self.name]
 
         def h(b, u):
             return f([b[..., j] for j in range(k)], u[..., 0])[..., None]
 
         options, disturbance = {}, np.eye(k)
-        if form == "set":
+        if form.startswith("wide"):
+            options["states"] = qpmhe.Box(-1e3 * self.prior(start), 1e3 * self.prior(start))
+        if form.endswith("set"):
             options["disturbances"] = qpmhe.Box(np.zeros(k), np.zeros(k))
         else:  # a thousandth of the certified deviations in the whole window
             disturbance = np.diag((1e-3 * self.deviations) ** 2 / len(self.y))

@@ -1,7 +1,5 @@
 /* Steps that curvature takes out of a set. */
 
-static const real mhe_along[] = MHE_ALONG;
-
 /* Shift the limits by what the linearisation missed at the spare trial, and a little beyond:
  * a second-order correction. */
 static void mhe_bend(mhe_estimator *e, mhe_workspace *k, const mhe_outcome *o)
@@ -116,7 +114,8 @@ static int mhe_try_curved(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, re
     memcpy(k->bent.x, k->step, sizeof k->step); /* other QPs overwrite it */
     if (o->is_curved) {
         const int nearly = o->spare->violation <= MHE_NEARLY;
-        if (nearly) mhe_try(e, k, o, mhe_lengths[0]);
+        static const real lengths[] = MHE_LENGTHS;
+        if (nearly) mhe_try(e, k, o, lengths[0]);
         /* If the shortened step leaves the set, too, curvature is the reason. */
         if (!(o->spare->cost < target) && !useless) {
             if (nearly) mhe_try(e, k, o, 1);
@@ -139,11 +138,12 @@ static int mhe_try_curved(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, re
  * proportion, and how far it leaves the set by the square. */
 static void mhe_try_along(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real target)
 {
-    const int along = (int)(sizeof mhe_along / sizeof *mhe_along);
+    static const real lengths[] = MHE_ALONG;
+    const int along = (int)(sizeof lengths / sizeof *lengths);
     const int is_bent = mhe_is_bent(o); /* of the shortest step so far */
     for (int i = 0; i < along && (o->is_curved || is_bent); i++) {
         memcpy(k->step, k->bent.x, sizeof k->step);
-        mhe_try(e, k, o, mhe_along[i]);
+        mhe_try(e, k, o, lengths[i]);
         if (!o->is_curved) mhe_correct(e, k, o);
         else if (!isfinite(o->spare->cost)) mhe_feasible_near(e, k, o, o->spare);
         if (o->spare->cost < target) return;

@@ -226,6 +226,24 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
     }
 }
 
+/* An entry of the diagonal of the first state's weight, without the data; and its form. */
+static real mhe_first_diagonal(const mhe_workspace *k, int j)
+{
+    real square = 0;
+    for (int r = 0; r <= j; r++) square += k->prior_root[r * NX + j] * k->prior_root[r * NX + j];
+    return square;
+}
+
+static real mhe_first_form(const mhe_workspace *k, const real *d)
+{
+    real square = 0;
+    for (int r = 0; r < NX; r++) {
+        const real one = mhe_dot(NX - r, k->prior_root + r * NX + r, d + r);
+        square += one * one;
+    }
+    return square;
+}
+
 /* Another row of an inequality. */
 static void mhe_add_row(mhe_block *b, int at, real weight, int first, int n, const real *row, real sign)
 {

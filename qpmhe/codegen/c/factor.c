@@ -10,7 +10,7 @@
 @mhe_workspace
     mhe_real panels[(MHE_HORIZON + 1) * MHE_NX * MHE_PANEL_WIDTH];
     mhe_real inverse_pivots[(MHE_HORIZON + 1) * MHE_NX];
-    mhe_real prior_diagonal[MHE_NX];  /* of the first state's weight, without the data */
+    mhe_real first_weight[MHE_NX * MHE_NX]; /* of the first state, without the data */
     int32_t has_ridge;                /* on the diagonal of the panels */
 @
 #define WIDTH MHE_PANEL_WIDTH
@@ -86,12 +86,20 @@ static real mhe_free_direction(const mhe_settings *s, int row, int column)
     return row == column;
 }
 
+/* An entry of the diagonal of the first state's weight, without the data; and its form. */
+static real mhe_first_diagonal(const mhe_workspace *k, int j) { return k->first_weight[j * NX + j]; }
+
+static real mhe_first_form(const mhe_workspace *k, const real *d)
+{
+    return mhe_form(NX, k->first_weight, d);
+}
+
 /* Add damping to the panels. */
 static void mhe_damp(mhe_estimator *e, mhe_workspace *k)
 {
     const real mu = k->damping;
     for (int r = 0; r < NX; r++)
-        k->panels[r * WIDTH + r] += mu * (k->prior_diagonal[r] + k->seen[r]);
+        k->panels[r * WIDTH + r] += mu * (k->first_weight[r * NX + r] + k->seen[r]);
     for (int i = 0; i < e->length; i++) {
         const mhe_terms *t = k->at[i];
         const real *Q = mhe_disturbance_weight(e->settings, mhe_stage_at(e, i));
@@ -134,7 +142,8 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
             mhe_prior_force(&k->prior, offset, g);
             for (int j = 0; j < NX; j++) g[j] *= mhe_scaled(factor, scale, j);
             mhe_add_further(e, k, factor, k->panels, WIDTH);
-            for (int j = 0; j < NX; j++) k->prior_diagonal[j] = panel[j * WIDTH + j];
+            for (int r = 0; r < NX; r++)
+                for (int c = 0; c < NX; c++) k->first_weight[r * NX + c] = panel[r * WIDTH + c];
         } else {
             for (int j = 0; j < NX; j++) g[j] = factor * k->at[i - 1]->following[j];
         }

@@ -1,23 +1,5 @@
 /* The sequence of QPs; only what the true cost approves is accepted. */
 
-/* Make the spare trial the first one along the step whose cost is below the best so far, or the
- * last one. A useless step, whose promised decrease is negligible, is not shortened: at a minimum
- * none lowers the cost by more than rounding. Nor is a damped one. */
-static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int useless)
-{
-    const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
-    const real target = mhe_target(o);
-    const int shorten = !useless && !(o->present > 0);
-    mhe_try(e, k, o, 1);
-    if (o->spare->cost < target) return;
-    if (mhe_try_curved(e, k, o, target, useless)) return;
-    for (int i = 0; i < count && shorten; i++) {
-        mhe_try(e, k, o, mhe_lengths[i]);
-        if (o->spare->cost < target) return;
-    }
-    if (shorten) mhe_try_along(e, k, o, target);
-}
-
 /* The share of a damping that is left after a step that has lowered the cost. */
 static real mhe_damping_left(real lowered, real promised)
 {
@@ -53,19 +35,22 @@ static int mhe_improve_once(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o)
     /* Where the cost is infinite, no decrease is negligible. */
     const real negligible = isfinite(before) ? e->settings->tolerance * before : -1;
     const real promised = mhe_promised(e, k, o);
-    mhe_lower(e, k, o, solved && promised <= negligible);
+    const int useless = solved && promised <= negligible;
+    mhe_lower(e, k, o, promised, useless);
     if (o->spare->cost < target) {
         const real lowered = before - o->spare->cost;
+        if (!useless && !is_damped) mhe_follow_region(e, k, o, lowered);
         mhe_take(k, o);
         if (is_damped) {
             o->damping = o->present * mhe_damping_left(lowered, promised);
             o->present = 0;
             o->growth = MHE_MORE_DAMPING;
             o->has_seen = 0;
+            mhe_forget_region(k, o);
             return 1;
         }
         o->damping *= MHE_OLD_DAMPING;
-        if (solved && lowered <= negligible) {
+        if (solved && lowered <= negligible && !o->is_shortened) {
             o->events |= MHE_CONVERGED;
             return 0;
         }
@@ -120,6 +105,7 @@ static void mhe_descend(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int 
     o->present = 0;
     o->growth = MHE_MORE_DAMPING;
     o->has_seen = 0;
+    mhe_forget_region(k, o);
     int is_open = 1;
     while (is_open && limit-- > 0) is_open = !mhe_is_late(k, o) && mhe_improve_once(e, k, o);
     if (is_open && o->present > 0 && !e->settings->uncapped) o->events |= MHE_CAP_REACHED;

@@ -16,6 +16,9 @@ typedef struct {
     real damping;   /* with which a search for a shorter step begins, at least */
     real present, growth; /* that of the present QP, and what it is multiplied with next */
     int has_seen;   /* its scale is known */
+    real radius;    /* of the region of steps, infinite where there is none */
+    real tried, expected; /* length of the last step tried, and the decrease of J promised for it */
+    int is_shortened; /* it is not that of the QP */
     int rolled_out; /* the candidate's cost is that of its roll-out */
     int is_curved;   /* the last whole step leaves the sets, as curvature may have it */
     int factorised; /* the QP's matrix, with its active rows, is in the panels */

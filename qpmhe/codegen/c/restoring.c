@@ -12,7 +12,8 @@
 static mhe_trial *mhe_approach(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o,
                                mhe_trial *around)
 {
-    const int count = (int)(sizeof mhe_lengths / sizeof *mhe_lengths);
+    static const real lengths[] = MHE_LENGTHS;
+    const int count = (int)(sizeof lengths / sizeof *lengths);
     for (int i = 0; i < MHE_RESTORING && (around == o->candidate || !isfinite(around->cost)); i++) {
         mhe_trial *ahead = around == o->spare ? o->other : o->spare;
         int is_nearer = 0;
@@ -21,7 +22,7 @@ static mhe_trial *mhe_approach(mhe_estimator *e, mhe_workspace *k, mhe_outcome *
         o->nearest_points++;
         if (status == FAILED) break;
         for (int j = 0; j < count && !is_nearer; j++) {
-            const real length = j ? mhe_lengths[j] : 1;
+            const real length = j ? lengths[j] : 1;
             mhe_step_from(e, k, around, length, ahead);
             is_nearer = ahead->violation < (1 - MHE_TOWARDS * length) * around->violation;
         }

@@ -27,18 +27,6 @@ static void mhe_fill_missed(const mhe_workspace *k, const mhe_outcome *o, mhe_es
     (void)k; (void)o; (void)out;
 }
 
-static int mhe_try_curved(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real target,
-                          int useless)
-{
-    (void)e; (void)k; (void)o; (void)target; (void)useless;
-    return 0;
-}
-
-static void mhe_try_along(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real target)
-{
-    (void)e; (void)k; (void)o; (void)target;
-}
-
 static void mhe_restore(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, int before)
 {
     (void)e; (void)k; (void)o; (void)before;

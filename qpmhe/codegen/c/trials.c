@@ -1,7 +1,5 @@
 /* Trials, and the QPs around them. */
 
-static const real mhe_lengths[] = MHE_LENGTHS;
-
 /* Make a trial, and judge it: another one + length * step. */
 static void mhe_step_from(mhe_estimator *e, mhe_workspace *k, const mhe_trial *around, real length,
                           mhe_trial *trial)

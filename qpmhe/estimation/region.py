@@ -1,0 +1,169 @@
+"""The region in which a QP's model of J is trusted, and the path of steps in it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qpmhe_solvers import QP
+
+from .limits import LARGER_REGION, POOR, SMALLER_REGION, WELL
+
+Array = NDArray[np.float64]
+
+
+class Metric(NamedTuple):
+    """The metric of damping, |d(0)|_D^2 + sum |d(i+1) - A d(i)|_Q^2, of the QP around a trial.
+
+    Attributes
+    ----------
+    transitions, weights, spreads : (K, n, n) array
+        A, Q, and the covariance of the disturbances where these are free, stage by stage.
+    information : (n,) array
+        The diagonal D.
+    """
+
+    transitions: Array
+    weights: Array
+    spreads: Array
+    information: Array
+
+    def square(self, step: Array) -> float:
+        """The square of a step's length."""
+        moved = step[1:] - np.matmul(self.transitions, step[:-1, :, None])[:, :, 0]
+        first = float(self.information @ np.square(step[0]))
+        return first + float(np.einsum("ki,kij,kj->", moved, self.weights, moved))
+
+    def descent(self, gradient: Array) -> Array:
+        """The direction of steepest descent in this metric, along free disturbances."""
+        force, step = gradient.copy(), np.empty_like(gradient)
+        for i in range(len(self.transitions) - 1, -1, -1):
+            force[i] += self.transitions[i].T @ force[i + 1]
+        step[0] = -force[0] / self.information
+        for i, a in enumerate(self.transitions):
+            step[i + 1] = a @ step[i] - self.spreads[i] @ force[i + 1]
+        return step
+
+
+class Region:
+    """The steps that are not longer than a radius, which follows from how J fell before.
+
+    Its length is that of `Metric`, with the largest D of the sequence so far, which makes it the
+    scale of More (The Levenberg-Marquardt algorithm, LNM 630, 1978). A step that is longer than
+    the radius bends towards steepest descent (Powell's dogleg, in Rabinowitz, Numerical Methods for
+    Nonlinear Algebraic Equations, 1970). Without rejected steps, and as long as J falls about as
+    predicted, there is no radius.
+
+    Attributes
+    ----------
+    radius : float
+        The radius, infinite where there is none.
+    shortened : bool
+        Whether the last step tried is not that of the QP.
+    """
+
+    radius: float = math.inf
+    shortened: bool = False
+    _largest: Array | None = None
+    _length: float = 0.0
+    _predicted: float = 0.0
+
+    def scaled(self, metric: Metric) -> Metric:
+        """A metric with the largest D so far."""
+        if self._largest is None:
+            self._largest = metric.information
+        self._largest = np.maximum(self._largest, metric.information)
+        return metric._replace(information=self._largest)
+
+    def whole(self, predicted: float, length: float = 0.0) -> None:
+        """The step of the QP is tried."""
+        self.shortened, self._predicted, self._length = False, predicted, length
+
+    def part(self, path: Dogleg) -> Array:
+        """The step at the radius, which is tried."""
+        step, self._predicted = path.step(self.radius)
+        self.shortened, self._length = True, self.radius
+        return step
+
+    @property
+    def predicted(self) -> float:
+        """The decrease of J that the QP predicts for the step that is tried."""
+        return self._predicted
+
+    def reject(self, length: float) -> None:
+        """The step that was tried, of this length, has not lowered J."""
+        self.radius = SMALLER_REGION * length
+
+    def surprises(self, decrease: float) -> bool:
+        """Whether the step that was tried asks for another radius, or for a first one."""
+        if self.radius < math.inf:
+            return True
+        return not POOR * self._predicted <= decrease <= self._predicted / POOR
+
+    def accept(self, decrease: float, length: float | None = None) -> None:
+        """The step that was tried has lowered J by this much."""
+        if length is None:
+            length = self._length
+        share = decrease / self._predicted if self._predicted > 0.0 else math.inf
+        larger = LARGER_REGION * length
+        if share < POOR:
+            self.radius = min(self.radius, length)
+        elif share > WELL:
+            self.radius = larger if self.radius == math.inf else max(self.radius, larger)
+        elif self.radius == math.inf:
+            self.radius = length
+
+
+class Dogleg:
+    """The path to a QP's step by the Cauchy point, the minimum along steepest descent.
+
+    Parameters
+    ----------
+    metric : Metric
+        Of lengths.
+    qp : QP
+        The QP, without inequalities.
+    step : (K + 1, n) array
+        Its solution.
+    predicted : float
+        The decrease of J that it predicts for that.
+    """
+
+    def __init__(self, metric: Metric, qp: QP, step: Array, predicted: float) -> None:
+        self._end, self._predicted = step, predicted
+        #: The length of the QP's step.
+        self.length = math.sqrt(metric.square(step))
+        # In the metric, products with the direction of descent are those with the gradient.
+        with np.errstate(all="ignore"):
+            descent = metric.descent(qp.gradient)
+            self._slope = -float(np.vdot(qp.gradient, descent))
+            curvature = float(np.vdot(descent, qp.hessian_times(descent)))
+            self._far = self._slope / curvature if curvature > 0.0 else math.nan
+        self._descent, self._curvature = descent, curvature
+
+    def step(self, radius: float) -> tuple[Array, float]:
+        """The step of this length, and the decrease of J that is predicted for it."""
+        slope, far, end = self._slope, self._far, self._predicted
+        if not 0.0 < far * slope < math.inf:  # no direction of descent: a part of the QP's step
+            along, share = 0.0, radius / self.length
+        elif far * math.sqrt(slope) >= radius:
+            along, share = radius / math.sqrt(slope), 0.0
+        else:
+            # |c + s (d - c)| = radius, c the Cauchy point.
+            square, across = far * far * slope, far * end
+            gap = max(self.length * self.length - 2.0 * across + square, 0.0)
+            half = across - square
+            root = math.sqrt(max(half * half + gap * (radius * radius - square), 0.0))
+            share = (radius * radius - square) / (half + root) if half + root > 0.0 else 1.0
+            share = min(share, 1.0)
+            along = (1.0 - share) * far
+        step = share * self._end
+        if along > 0.0:
+            step += along * self._descent
+        gained = 2.0 * (along * slope + share * end) - share * share * end
+        if along > 0.0:
+            gained -= along * (along * self._curvature + 2.0 * share * slope)
+        return step, gained
