@@ -389,7 +389,7 @@ class Optimizer:
             if bounded and region.surprises(decrease):
                 if region.radius == math.inf:
                     metric = region.scaled(self._subproblem.metric(problem, before))
-                    region.accept(decrease, math.sqrt(metric.square(step)))
+                    region.accept(decrease, metric.length(step))
                 else:
                     region.accept(decrease)
             if damping:
@@ -510,7 +510,7 @@ class Optimizer:
         path = None
         if region.radius < math.inf:
             path = self._path(region, problem, qp, best, step, predicted)
-        if path is None or path.length <= region.radius:
+        if path is None or not path.length > region.radius:
             region.whole(predicted, 0.0 if path is None else path.length)
             yield self._trial(problem, best, step)
             if path is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,13 @@ class Metric(NamedTuple):
     spreads: Array
     information: Array
 
-    def square(self, step: Array) -> float:
-        """The square of a step's length."""
-        moved = step[1:] - np.matmul(self.transitions, step[:-1, :, None])[:, :, 0]
-        first = float(self.information @ np.square(step[0]))
-        return first + float(np.einsum("ki,kij,kj->", moved, self.weights, moved))
+    def length(self, step: Array) -> float:
+        """The length of a step; NaN or infinite where it is lost in rounding or range."""
+        with np.errstate(all="ignore"):
+            moved = step[1:] - np.matmul(self.transitions, step[:-1, :, None])[:, :, 0]
+            square = self.information @ np.square(step[0])
+            square += np.einsum("ki,kij,kj->", moved, self.weights, moved)
+            return float(np.sqrt(square))
 
     def descent(self, gradient: Array) -> Array:
         """The direction of steepest descent in this metric, along free disturbances."""
@@ -112,8 +114,8 @@ class Region:
         if share < POOR:
             self.radius = min(self.radius, length)
         elif share > WELL:
-            self.radius = larger if self.radius == math.inf else max(self.radius, larger)
-        elif self.radius == math.inf:
+            self.radius = max(self.radius, larger) if self.radius < math.inf else larger
+        elif not self.radius < math.inf:
             self.radius = length
 
 
@@ -135,35 +137,43 @@ class Dogleg:
     def __init__(self, metric: Metric, qp: QP, step: Array, predicted: float) -> None:
         self._end, self._predicted = step, predicted
         #: The length of the QP's step.
-        self.length = math.sqrt(metric.square(step))
+        self.length = metric.length(step)
         # In the metric, products with the direction of descent are those with the gradient.
         with np.errstate(all="ignore"):
             descent = metric.descent(qp.gradient)
-            self._slope = -float(np.vdot(qp.gradient, descent))
-            curvature = float(np.vdot(descent, qp.hessian_times(descent)))
-            self._far = self._slope / curvature if curvature > 0.0 else math.nan
+            self._slope = -np.vdot(qp.gradient, descent)
+            curvature = np.vdot(descent, qp.hessian_times(descent))
+            self._far = self._slope / curvature if curvature > 0.0 else np.float64(np.nan)
         self._descent, self._curvature = descent, curvature
 
     def step(self, radius: float) -> tuple[Array, float]:
-        """The step of this length, and the decrease of J that is predicted for it."""
+        """The step of this length, and the decrease of J that is predicted for it.
+
+        NaN where the path has no length, or its numbers are lost in rounding or range.
+        """
+        with np.errstate(all="ignore"):
+            along, share = self._at(np.float64(radius))
+            step = share * self._end
+            if along > 0.0:
+                step += along * self._descent
+            slope, end = self._slope, self._predicted
+            gained = 2.0 * (along * slope + share * end) - share * share * end
+            if along > 0.0:
+                gained -= along * (along * self._curvature + 2.0 * share * slope)
+            return step, float(gained)
+
+    def _at(self, radius: Any) -> tuple[Any, Any]:
+        """How far along the descent, and which share of the QP's step, a step of this length is."""
         slope, far, end = self._slope, self._far, self._predicted
         if not 0.0 < far * slope < math.inf:  # no direction of descent: a part of the QP's step
-            along, share = 0.0, radius / self.length
-        elif far * math.sqrt(slope) >= radius:
-            along, share = radius / math.sqrt(slope), 0.0
-        else:
-            # |c + s (d - c)| = radius, c the Cauchy point.
-            square, across = far * far * slope, far * end
-            gap = max(self.length * self.length - 2.0 * across + square, 0.0)
-            half = across - square
-            root = math.sqrt(max(half * half + gap * (radius * radius - square), 0.0))
-            share = (radius * radius - square) / (half + root) if half + root > 0.0 else 1.0
-            share = min(share, 1.0)
-            along = (1.0 - share) * far
-        step = share * self._end
-        if along > 0.0:
-            step += along * self._descent
-        gained = 2.0 * (along * slope + share * end) - share * share * end
-        if along > 0.0:
-            gained -= along * (along * self._curvature + 2.0 * share * slope)
-        return step, gained
+            return 0.0, radius / self.length
+        if far * np.sqrt(slope) >= radius:
+            return radius / np.sqrt(slope), 0.0
+        # |c + s (d - c)| = radius, c the Cauchy point.
+        square, across = far * far * slope, far * end
+        gap = max(self.length * self.length - 2.0 * across + square, 0.0)
+        half = across - square
+        root = np.sqrt(max(half * half + gap * (radius * radius - square), 0.0))
+        share = (radius * radius - square) / (half + root) if half + root > 0.0 else 1.0
+        share = min(share, 1.0)
+        return (1.0 - share) * far, share

@@ -21,6 +21,17 @@ def qp_around(sets):
     return subproblem.at(problem, trial), subproblem.metric(problem, trial)
 
 
+def test_a_path_without_length_or_numbers_promises_nothing():
+    """As where the QP's step is rounding, or weights and steps are beyond the range of numbers."""
+    qp, metric = qp_around(None)
+    none = np.zeros((len(metric.transitions) + 1, 3))
+    lost = metric._replace(spreads=np.full_like(metric.spreads, np.nan))
+    for one, end in ((lost, none), (lost, none * np.nan), (lost, none + 1e200)):
+        path = Dogleg(one, qp, end, 1.0)
+        for radius in (path.length / 3.0, np.nan):
+            assert not path.step(radius)[1] > 0.0
+
+
 @pytest.mark.parametrize("sets", [None, NO_WIDTH], ids=["all disturbed", "a constant"])
 def test_the_dogleg_is_powells(sets):
     """By dense matrices, in d(0) and the disturbances that are free."""
@@ -52,7 +63,7 @@ def test_the_dogleg_is_powells(sets):
     assert short < path.length
     for radius in (0.3 * short, short, 0.7 * short + 0.3 * path.length, path.length):
         found, gained = path.step(radius)
-        lengths.append(np.sqrt(metric.square(found)))
+        lengths.append(metric.length(found))
         assert gained == pytest.approx(-2.0 * qp.objective(found), rel=1e-6)
         if radius <= short:
             expected = follow @ cauchy * (radius / short)

@@ -140,7 +140,7 @@ static void mhe_lower(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, real p
         mhe_set_dogleg(e, k, promised, &path);
         is_set = 1;
     }
-    if (!is_set || path.length <= o->radius) {
+    if (!is_set || !(path.length > o->radius)) {
         o->expected = promised;
         o->tried = is_set ? path.length : 0;
         mhe_try(e, k, o, 1);
