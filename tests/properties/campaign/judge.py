@@ -129,7 +129,9 @@ def _judged(case, x, window, mean, with_prior):
     noise = np.array([
         _seen_weight(one.noise, there) for one, there in zip(window, seen, strict=True)
     ])
-    lost = EPS * max((np.linalg.cond(one.noise) for one in window if not one.seen.all()), default=0.0)
+    lost = EPS * max(
+        (np.linalg.cond(one.noise) for one in window if not one.seen.all()), default=0.0
+    )
     for name, s, of, error in (("w", w, disturbance, w_error), ("v", v, noise, v_error)):
         value, moved = _losses(case.losses[name], s, of, error)
         J, slack = J + float(shares @ value), slack + float(shares @ moved)
