@@ -274,8 +274,8 @@ class Run:
                 self.fault("a twin whose arrays nobody touched differs",
                            (estimate.cost, other.cost, estimate.status, other.status))
             if not same:
-                self.twin.forget_warm_start()
-                self.mhe.load_state_dict(self.twin.state_dict())
+                self.mhe.forget_warm_start()
+                self.twin.load_state_dict(self.mhe.state_dict())
         self._stand_beside("update", estimate, lambda one, change: one.update(
             y if y is None else change(y), *inputs, **given
         ))
