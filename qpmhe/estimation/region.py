@@ -65,13 +65,15 @@ class Region:
         The radius, infinite where there is none.
     shortened : bool
         Whether the last step tried is not that of the QP.
+    predicted : float
+        The decrease of J that the QP predicts for the last step tried.
     """
 
     radius: float = math.inf
     shortened: bool = False
+    predicted: float = 0.0
     _largest: Array | None = None
     _length: float = 0.0
-    _predicted: float = 0.0
 
     def scaled(self, metric: Metric) -> Metric:
         """A metric with the largest D so far."""
@@ -82,18 +84,13 @@ class Region:
 
     def whole(self, predicted: float, length: float = 0.0) -> None:
         """The step of the QP is tried."""
-        self.shortened, self._predicted, self._length = False, predicted, length
+        self.shortened, self.predicted, self._length = False, predicted, length
 
     def part(self, path: Dogleg) -> Array:
         """The step at the radius, which is tried."""
-        step, self._predicted = path.step(self.radius)
+        step, self.predicted = path.step(self.radius)
         self.shortened, self._length = True, self.radius
         return step
-
-    @property
-    def predicted(self) -> float:
-        """The decrease of J that the QP predicts for the step that is tried."""
-        return self._predicted
 
     def reject(self, length: float) -> None:
         """The step that was tried, of this length, has not lowered J."""
@@ -103,13 +100,13 @@ class Region:
         """Whether the step that was tried asks for another radius, or for a first one."""
         if self.radius < math.inf:
             return True
-        return not POOR * self._predicted <= decrease <= self._predicted / POOR
+        return not POOR * self.predicted <= decrease <= self.predicted / POOR
 
     def accept(self, decrease: float, length: float | None = None) -> None:
         """The step that was tried has lowered J by this much."""
         if length is None:
             length = self._length
-        share = decrease / self._predicted if self._predicted > 0.0 else math.inf
+        share = decrease / self.predicted if self.predicted > 0.0 else math.inf
         larger = LARGER_REGION * length
         if share < POOR:
             self.radius = min(self.radius, length)

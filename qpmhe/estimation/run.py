@@ -153,6 +153,10 @@ class Run:
 
     source: RunSource | None = None
     index: pandas.Index | None = None
+    # What a run that was pickled before there was this does not have.
+    _elapsed: Array | None = None
+    _time_unit: str = "s"
+    _labels: Sequence[str] | None = None
 
     #: Draws a run for a notebook; whoever can draw sets it.
     page: ClassVar[Callable[[Run], str] | None] = None
@@ -296,8 +300,8 @@ class Run:
         if self.has_costs:
             found["mean J"] = f"{self.costs.mean():.6g}"
             found["mean J of the candidate"] = f"{self.candidate_costs.mean():.6g}"
-        if len(self) and self.elapsed is not None:
-            first, last = self.elapsed[[0, -2]]
+        if len(self) and (elapsed := self.elapsed) is not None:
+            first, last = elapsed[[0, -2]]
             found["samples from"] = f"{first:.6g} to {last:.6g} {self.time_unit}"
         if len(self):
             found["median step"] = f"{1e6 * np.median(self.times):.3g} us"
@@ -315,9 +319,9 @@ class Run:
         Returns
         -------
         pandas.DataFrame
-            Indexed by the time of the state: t = 0, ..., T, or `index`. ``time`` is `elapsed`, if
-            known, in the unit ``frame.attrs["time_unit"]``. ``x1``, ``x2``, ... is the estimate of
-            x(t) from the measurements before t, ``std1``, ... its standard deviations, if
+            Indexed by the time of the state: t = 0, ..., T, or `index`. ``elapsed`` is there if it
+            is known, in the unit ``frame.attrs["time_unit"]``. ``x1``, ``x2``, ... is the estimate
+            of x(t) from the measurements before t, ``std1``, ... its standard deviations, if
             covariances were requested; ``filtered1``, ... is the estimate of x(t) that has used
             y(t); ``smoothed1``, ... and ``smoothed_std1``, ... are those of `smoothed`. ``J``,
             ``J_candidate``, ``status``, ``qps``, ``solver_iterations``, ``seconds`` and
@@ -338,7 +342,8 @@ class Run:
             blocks["smoothed"] = self.smoothed
         if self.smoothed_covariances is not None:
             blocks["smoothed_std"] = deviations(self.smoothed_covariances)
-        columns: dict[str, Any] = {} if self.elapsed is None else {"time": self.elapsed}
+        elapsed = self.elapsed
+        columns: dict[str, Any] = {} if elapsed is None else {"elapsed": elapsed}
         columns |= {
             f"{name}{i + 1}": values[:, i]
             for name, values in blocks.items() for i in range(values.shape[1])
@@ -356,7 +361,7 @@ class Run:
         )
         if self.index is not None:
             table = table.set_axis(self.index)
-        if self.elapsed is not None:
+        if elapsed is not None:
             table.attrs["time_unit"] = self.time_unit
         return table
 

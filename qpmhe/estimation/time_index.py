@@ -182,6 +182,8 @@ def _filled(
     if len(ys):
         step_time = pandas.NaT if steps.usual is None else pandas.Timedelta(steps.usual * unit, "s")
         index = index.append(times[-1:] + step_time)
+    else:
+        index = index.insert(0, pandas.NaT)
     index.name = times.name
     is_row = np.array(rows, np.intp)
     measured = np.where((is_row >= 0)[:, None], ys[is_row], np.nan) if len(ys) else ys

@@ -9,6 +9,7 @@ from qpmhe.codegen.compiler import find_compiler
 from qpmhe.estimation.region import Dogleg
 from tests.estimation.test_damping import NO_WIDTH, estimator, samples
 from tests.oracles.nist import regression
+from tests.solvers.problems import registered
 
 
 def qp_around(sets):
@@ -118,3 +119,23 @@ def test_a_usual_sequence_has_no_region(monkeypatch):
     for y in measurements:
         estimate = mhe.update(y)
         assert estimate.cost <= estimate.candidate_cost
+
+
+def test_a_step_without_length_is_not_shortened():
+    """A solver that stops where it starts, at J = 0: there is no direction of descent either."""
+    class Still(qpmhe.solvers.Solver):
+        def _solve(self, qp, start):
+            return qpmhe.solvers.RawSolution(np.zeros(qp.size), False)
+
+    zero = np.zeros(1)
+    system = qpmhe.System(lambda x: 0.9 * x, lambda x: x, n=1, p=1)
+    cost = qpmhe.QuadraticCost.from_covariances(prior=[[1.0]], disturbance=[[1.0]], noise=[[1.0]])
+    with registered(qpmhe.solvers.Backend("still", Still, "none at all")):
+        mhe = qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger([[0.0]]), cost, horizon=3, initial_state=zero,
+            backend="still", max_qps=2,
+        )
+        for _ in range(4):
+            estimate = mhe.update(zero)
+            assert (estimate.cost, estimate.filtered) == (0.0, 0.0)
+            assert estimate.status & Status.SOLVER_STOPPED

@@ -190,7 +190,7 @@ def test_a_run_keeps_its_unit_of_time_and_its_names_without_its_source(kind, tmp
         np.testing.assert_allclose(one.elapsed, expected, rtol=1e-12)
         assert (one.time_unit, one.labels) == (name, ["pressure (bar)", "level"])
         table = one.to_frame()
-        np.testing.assert_array_equal(table["time"], one.elapsed)
+        np.testing.assert_array_equal(table["elapsed"], one.elapsed)
         assert table.attrs["time_unit"] == name
         assert one.facts()["samples from"] == (
             f"{expected[0]:.6g} to {expected[-2]:.6g} {name}")
@@ -215,8 +215,26 @@ def test_a_run_of_an_older_file_counts_samples(tmp_path):
                       if name not in ("elapsed", "time_unit", "labels")})
     old = qpmhe.load_run(path)
     assert (old.elapsed, old.time_unit, old.labels) == (None, "s", None)
-    assert "time" not in old.to_frame()
+    assert "elapsed" not in old.to_frame()
     assert qpmhe.plots.costs(old).get_xlabel() == "time t (samples)"
+    state = {name: one for name, one in vars(run).items() if name[0] != "_" and name != "source"}
+    pickled = qpmhe.Run.__new__(qpmhe.Run)
+    pickled.__dict__.update(state)
+    assert (pickled.elapsed, pickled.time_unit, pickled.labels) == (None, "s", None)
+    assert repr(pickled) == repr(old)
+
+
+@pytest.mark.parametrize("name", INDEXES)
+def test_an_index_may_be_named_time_or_be_empty(name, tmp_path):
+    for count in (0, 5):
+        y, u = record(INDEXES[name][:count].rename("time"))
+        run = estimator(of_ode(1.0)).run(y, u, time_unit=INDEXES[name][1] - INDEXES[name][0])
+        assert len(run.index) == len(run.elapsed) == count + 1
+        table = run.to_frame().reset_index()
+        assert table.columns[:2].tolist() == ["time", "elapsed"]
+        run.save(tmp_path / "run.npz")
+        read = qpmhe.load_run(tmp_path / "run.npz")
+        np.testing.assert_array_equal(read.elapsed, run.elapsed)
 
 
 def test_what_does_not_match_is_refused_by_name():
@@ -248,5 +266,5 @@ def test_what_does_not_match_is_refused_by_name():
             estimator(discrete()).run(y, u, time_unit=unit)
     for few in (0, 1):
         run = estimator(discrete()).run(y.iloc[:few], u.iloc[:few])
-        assert len(run.index) == (2 if few else 0)
+        assert len(run.index) == few + 1
         assert len(run) == few
