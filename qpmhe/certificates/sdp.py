@@ -32,11 +32,8 @@ _FLOOR = 1e-6  # of what noises count
 _SLACK = 1e-7
 _DIGITS = 4  # of a gain, after the first
 _PRINTED, _NOTHING = 8, 1e-6  # of weights: as they are verified, so they are printed
-# Of Clarabel. Near the smallest feasible rate it may break down with its own, and seldom does with
-# others; what it finds is verified.
-_SETTINGS: tuple[dict[str, Any], ...] = (
-    {}, {"static_regularization_constant": 1e-7}, {"equilibrate_enable": False}
-)
+# Of SCS, where Clarabel breaks down; what is not solved by then seldom is by ten times as many.
+_SPLITTING = {"eps": 1e-9, "max_iters": 10_000}
 _LEAST = 1e-3  # seconds for a solver, for which zero may mean no limit
 # What a noise counts as at least, of the largest one, in the sizes of states and outputs.
 _SMALLEST_NOISE = 1e-4
@@ -176,14 +173,17 @@ class SemidefiniteProgram:
         """Solve one of the problems, and fill its form in; without its measure."""
         problem = self._problem(squares)
         self._margin.value, self._rest.value = margin, max(rate * rate - margin, 0.0)
-        deadline, failure = Deadline(max(seconds, _LEAST)), ""
-        for settings in _SETTINGS:
-            left = max(deadline.left, _LEAST)
-            limit = {"time_limit": left} if math.isfinite(left) else {}
+        limit = max(seconds, _LEAST) if math.isfinite(seconds) else None
+        failure = ""
+        for solver, options in (
+            ("CLARABEL", {} if limit is None else {"time_limit": limit}),
+            # Slower, but it ends where an interior point breaks down; what it finds is verified.
+            ("SCS", _SPLITTING if limit is None else {**_SPLITTING, "time_limit_secs": limit}),
+        ):
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    problem.solve(solver="CLARABEL", **limit, **settings)
+                    problem.solve(solver=solver, **options)
                 break
             except Exception as error:  # a solver may raise anything
                 failure = failure or f"the solver raised {type(error).__name__}"

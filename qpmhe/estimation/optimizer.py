@@ -353,13 +353,15 @@ class Optimizer:
             negligible = self._tolerance * best.cost if best.cost < math.inf else -1.0
             # The decrease of J that the QP predicts: its objective is J/2.
             if self._extended:
-                predicted = self._subproblem.predicted(qp, best, step)
+                predicted = slope = self._subproblem.predicted(qp, best, step)
             else:
-                predicted = abs(float(np.vdot(qp.gradient, step)))
+                slope = -float(np.vdot(qp.gradient, step))
+                predicted = abs(slope)
             # At a minimum no step lowers J by more than rounding: it is not shortened.
             useless, target = solved and predicted <= negligible, _target(best)
             shorten = not (useless or damping)
-            bounded = shorten and self._has_region
+            # An iterate that leads upwards gives no path: the solver's steps are judged, not ours.
+            bounded = shorten and self._has_region and slope > 0.0
             trials = (
                 self._trials_within(region, problem, qp, best, step, predicted) if bounded
                 else self._trials(problem, qp, outcome, step, not useless, shorten)

@@ -228,15 +228,6 @@ def test_what_cannot_be_enclosed_is_sampled_with_its_name_and_the_remedy(monkeyp
     assert "given up" in found.notes[0]
 
 
-def test_an_implicit_step_is_sampled_and_called_that():
-    system = qpmhe.System.from_ode(
-        lambda x: -x - x**3, lambda x: x, dt=0.1, n=1, p=1, method="midpoint")
-    found = certify_observer(system, qpmhe.Luenberger([[0.3]]), unit_box(1), rho=0.8)
-    assert found.evidence is Evidence.SAMPLED
-    assert "it is an implicit step, which solves equations); the inequality holds at" in (
-        found.notes[0])
-
-
 def test_a_mode_is_called_unseen_only_where_it_is():
     hidden = linear(np.diag([1.1, 0.5]), [[0.0, 1.0]])
     for side in (1e-6, 1e6):  # the sizes of the states alone decide nothing either way
@@ -279,31 +270,6 @@ def test_solvers_that_lie_or_raise_prove_nothing(monkeypatch, lie, dimension):
         with pytest.raises(NotCertifiedError):
             QUESTIONS[which](scalar(lambda x: 0.9 * np.sin(x)), unit_box(1), seconds=2.0)
     assert all(0.0 < each <= 2.0 for each in limits)
-
-
-def test_a_solver_that_breaks_down_is_asked_again_with_other_settings(monkeypatch):
-    cvxpy = pytest.importorskip("cvxpy")
-    solve, system = cvxpy.Problem.solve, linear([[0.97, 0.2], [-0.2, 0.97]], [[1.0, 0.0]])
-
-    def certified():
-        return certify_observer(
-            system, qpmhe.Luenberger([[0.2], [0.0]]), unit_box(2), rho=0.99, sizes=(0.01, 0.02))
-
-    expected, kinds = certified(), []
-
-    def breaking(problem, *, solver, time_limit, **settings):
-        kinds.append(settings)
-        assert 0.0 < time_limit <= 30.0
-        if not settings:
-            raise cvxpy.SolverError("insufficient progress")
-        return solve(problem, solver=solver, time_limit=time_limit, **settings)
-
-    monkeypatch.setattr(cvxpy.Problem, "solve", breaking)
-    found = certified()
-    assert found.evidence is Evidence.PROVED
-    assert not kinds[0]
-    assert kinds[1]
-    np.testing.assert_allclose(found.P, expected.P, rtol=1e-4)
 
 
 def test_proofs_end_with_the_time(monkeypatch):

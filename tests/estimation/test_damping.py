@@ -163,7 +163,6 @@ class Upwards(Solver):
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_steps_of_a_solver_that_lead_upwards_end_before_the_cap(bounded):
-    """Without inequalities, J falls along the dogleg, whose first part the solver has no say in."""
     wide = qpmhe.Box(np.full(3, -1e9), np.full(3, 1e9)) if bounded else None
     system = qpmhe.System(move, output, n=3, p=2, states=wide)
     cost = qpmhe.QuadraticCost.from_covariances(
@@ -175,9 +174,6 @@ def test_steps_of_a_solver_that_lead_upwards_end_before_the_cap(bounded):
     )
     for y in samples(5):
         estimate = mhe.update(y)
-        if not bounded:
-            assert estimate.cost < estimate.candidate_cost
-            continue
         seen = estimate.status & ~Status.SOLVER_STOPPED  # its residuals are checked
         assert seen == Status.CANDIDATE | Status.NO_DECREASE
         assert 2 < estimate.qps < 20
