@@ -405,7 +405,7 @@ class Run:
                 texts["labels"] = arrays["labels"].tolist()
             run = cls(**arrays | texts)
             lengths = {len(arrays[name]) for name in _PER_STEP}
-            stages = {len(arrays[name]) for name in ("states", "elapsed") if name in arrays}
+            stages = {len(one) for one in (run.states, run.elapsed, index) if one is not None}
             if lengths != {len(run)} or stages != {len(run) + 1}:
                 raise ShapeError("its arrays are not of the same steps")
         except (
