@@ -187,16 +187,16 @@ class ImplicitStep:
             inverses = inverse(newton_matrix(self._method.A, h[at], found.jacobian))
             moves = self._correction(found, inverses, h[at], W[at])
             step, k = moves[..., :n], W.shape[2] - n
-            # What rounding of the states and of their flows amounts to in each equation.
+            # What rounding of the states and of their flows amounts to in each equation, or what
+            # the inverse leaves of it in the stages, if that is less.
             size = np.abs(x[at]) + np.abs(W[at, :, :n] + step).max(axis=1)
-            flows = h[at, None] * (np.abs(found.jacobian).max(axis=1) @ size[..., None])[..., 0]
-            length = share(step, (size + flows)[:, None])
+            size += h[at, None] * (np.abs(found.jacobian).max(axis=1) @ size[..., None])[..., 0]
+            sizes = np.repeat(size[:, None], len(self._method.A), axis=1)
+            sizes = np.minimum(sizes, _times(np.abs(inverses), sizes))
+            length = share(step, sizes)
             if k:
-                sizes = algebraic_sizes(
-                    found, np.repeat((size + flows)[:, None], len(self._method.A), axis=1),
-                    np.abs(W[at, :, n:] + moves[..., n:]),
-                )
-                length = np.maximum(length, share(moves[..., n:], sizes))
+                behind = algebraic_sizes(found, sizes, np.abs(W[at, :, n:] + moves[..., n:]))
+                length = np.maximum(length, share(moves[..., n:], behind))
             done = converged(length, last)
             if iteration == 0:
                 side[at] = found.side[:, :1]

@@ -189,6 +189,26 @@ def test_the_compiled_step_keeps_a_jacobian_and_has_the_same_values(method):
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("unit", [1.0, 1e-60])
+def test_a_short_correction_of_a_very_stiff_state_is_no_rounding(unit):
+    """Newton's steps have one length here, which is little beside h |df/dx| |x|."""
+    x, share, power, dt = ca.SX.sym("x"), 0.03, 4.0, 0.4
+    functions = (
+        ca.Function("rate", [x], [unit * share * (ca.exp(-power * x / unit) - 1.0)]),
+        ca.Function("h", [x], [x]),
+    )
+    states = -np.array([2.0, 5.0, 8.0])
+    # The stage is the root of Z - h/2 f(x + Z), which increases.
+    expected = [x + 2.0 * brentq(
+        lambda Z, x=x: Z - 0.5 * dt * share * (np.exp(-power * (x + Z)) - 1.0), 0.0, 2.0 - x,
+        xtol=1e-15, rtol=1e-14) for x in states]
+    for compiled in True, False:
+        model = qpmhe.from_casadi(*functions, dt=dt, method="midpoint", compiled=compiled).model()
+        found = model.step(unit * states[:, None], np.zeros((3, 0)))[:, 0]
+        np.testing.assert_allclose(found / unit, expected, rtol=1e-9)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 def test_the_compiled_step_moves_what_linear_equations_leave_at_zero():
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
     functions = (

@@ -48,11 +48,12 @@ static int mhe_stage_factor(real h, const mhe_reduced *r, real *M, int *pivot)
     return mhe_factor_equations(MHE_UNKNOWNS, M, pivot);
 }
 
-/* What rounding of the states and of their flows amounts to in each equation. */
+/* What rounding of the states and of their flows amounts to in each equation, or what the inverse of M
+ * leaves of it in the stages, if that is less. */
 static void mhe_stage_sizes(const real *x, real h, const real *W, const real *step,
-                            const mhe_reduced *r, real *sizes)
+                            const mhe_reduced *r, const real *M, const int *pivot, real *sizes)
 {
-    real states[NX];
+    real states[NX], equations[NX], inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
     for (int a = 0; a < NX; a++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++)
@@ -60,13 +61,22 @@ static void mhe_stage_sizes(const real *x, real h, const real *W, const real *st
         states[a] = (real)fabs(x[a]) + most;
     }
     for (int a = 0; a < NX; a++) {
-        sizes[a] = states[a];
+        equations[a] = states[a];
         for (int b = 0; b < NX; b++) {
             real most = 0;
             for (int i = 0; i < MHE_STAGES; i++)
                 most = mhe_max((real)fabs(r[i].jacobian[a * NX + b]), most);
-            sizes[a] += h * most * states[b];
+            equations[a] += h * most * states[b];
         }
+    }
+    for (int i = 0; i < MHE_UNKNOWNS * MHE_UNKNOWNS; i++)
+        inverse[i] = i / MHE_UNKNOWNS == i % MHE_UNKNOWNS;
+    mhe_solve_columns(MHE_UNKNOWNS, M, pivot, MHE_UNKNOWNS, inverse);
+    for (int i = 0; i < MHE_UNKNOWNS; i++) {
+        real left = 0;
+        for (int j = 0; j < MHE_UNKNOWNS; j++)
+            left += (real)fabs(inverse[i * MHE_UNKNOWNS + j]) * equations[j % NX];
+        sizes[i] = left < equations[i % NX] ? left : equations[i % NX];
     }
 }
 
@@ -80,10 +90,10 @@ static real mhe_stage_moves(const mhe_reduced *r, const real *W, const real *siz
         for (int a = 0; a < NX; a++) {
             const real moved = (real)fabs(step[i * NX + a]);
             if (!isfinite(moved)) return NAN;
-            if (moved > 0) length = mhe_max(moved / sizes[a], length);
+            if (moved > 0) length = mhe_max(moved / sizes[i * NX + a], length);
             moves[i * NW + a] = step[i * NX + a];
         }
-        const real share = mhe_move_algebraic(r + i, W + i * NW, sizes, moves + i * NW);
+        const real share = mhe_move_algebraic(r + i, W + i * NW, sizes + i * NX, moves + i * NW);
         if (isnan(share)) return NAN;
         length = mhe_max(share, length);
     }
@@ -114,7 +124,8 @@ static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, 
 {
     mhe_reduced both[2][MHE_STAGES];
     real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], moves[MHE_STAGES * NW], trial[MHE_STAGES * NW];
-    real M[MHE_UNKNOWNS * MHE_UNKNOWNS], scale[MHE_STAGES * NW], sizes[NX], last = INFINITY;
+    real M[MHE_UNKNOWNS * MHE_UNKNOWNS], scale[MHE_STAGES * NW], sizes[MHE_UNKNOWNS];
+    real last = INFINITY;
     int pivot[MHE_UNKNOWNS], now = 0;
     for (int i = 0; i < MHE_STAGES; i++)
         for (int j = 0; j < NW; j++) W[i * NW + j] = j < NX ? 0 : w[j];
@@ -127,7 +138,7 @@ static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, 
         for (int i = 0; i < MHE_UNKNOWNS; i++) rates[i] = r[i / NX].rate[i % NX];
         mhe_stage_residual(rates, h, W, step);
         mhe_solve_equations(MHE_UNKNOWNS, M, pivot, step);
-        mhe_stage_sizes(w, h, W, step, r, sizes);
+        mhe_stage_sizes(w, h, W, step, r, M, pivot, sizes);
         const real length = mhe_stage_moves(r, W, sizes, step, moves);
         if (isnan(length)) return 0;
         const int done = mhe_converged(length, last);

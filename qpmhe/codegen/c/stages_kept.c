@@ -122,11 +122,12 @@ static void mhe_kept_moves(const real *x, const real *u, real h, const mhe_reduc
     }
 }
 
-/* The sizes of a stage's unknowns, behind the first corrections, and how small a share of what
- * rounding amounts to in the equations these are. */
-static void mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const real *moves,
-                           real *sizes, real *shares)
+/* The sizes of a stage's unknowns, behind the first corrections, and how small a share these are of what
+ * rounding amounts to in the equations, or what the real inverse leaves of it, if that is less. */
+static void mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const mhe_modes *modes,
+                           const real *moves, real *sizes, real *shares)
 {
+    real equations[NX];
     for (int j = 0; j < NW; j++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++)
@@ -134,8 +135,14 @@ static void mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const re
         sizes[j] = (real)fabs(w[j]) + most;
     }
     for (int a = 0; a < NX; a++) {
-        shares[a] = sizes[a];
-        for (int b = 0; b < NX; b++) shares[a] += h * (real)fabs(r->jacobian[a * NX + b]) * sizes[b];
+        equations[a] = $real * sizes[a];
+        for (int b = 0; b < NX; b++)
+            equations[a] += h * (real)fabs(r->jacobian[a * NX + b]) * sizes[b];
+    }
+    for (int a = 0; a < NX; a++) {
+        real left = 0;
+        for (int b = 0; b < NX; b++) left += (real)fabs(modes->one[b * NX + a]) * equations[b];
+        shares[a] = left < equations[a] ? left : equations[a];
     }
     mhe_algebraic_sizes(r, sizes + NX, shares, shares + NX);
     for (int j = 0; j < NW; j++) shares[j] = shares[j] > 0 ? sizes[j] / shares[j] : 1;
@@ -154,7 +161,7 @@ static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_red
         real *share = made[k], length = 0, square = 0;
         mhe_kept_moves(w, u, h, r, &modes, W, k == 0, moves);
         if (k == 0) {
-            mhe_kept_sizes(w, h, r, moves, sizes, rounding);
+            mhe_kept_sizes(w, h, r, &modes, moves, sizes, rounding);
             for (int i = 0; i < MHE_STAGE_VALUES; i++) {
                 sizes[i] = sizes[i % NW];
                 per[i] = sizes[i] > 0 ? 1 / sizes[i] : 1;
