@@ -145,7 +145,8 @@ class LikelihoodLibrary(FilterLibrary):
         common = ctypes.byref(record), samples, length, _at(points), _at(kept)
         self._library.mhe_filter_record(*common, _at(costs))
         chosen = np.ascontiguousarray(weights, np.float64)
-        total = float(costs @ chosen)
+        used = chosen != 0.0  # others may be infinite
+        total = float(costs[used] @ chosen[used])
         if np.isfinite(total):
             self._library.mhe_filter_record_back(*common, _at(chosen), *map(_at, by))
         return total, by[0], by[1], by[2], by[3]

@@ -233,6 +233,8 @@ class _Filter:
 
         def fault(library: LikelihoodLibrary) -> str:
             expected = self._adjoint_in_casadi(weights, first, chosen)
+            if not np.isfinite(expected[0]):
+                return "the likelihood of the first samples is not finite, and cannot be compared"
             self._library = library
             found = self._adjoint_in_c(weights, first, chosen)
             self._library = None
