@@ -559,7 +559,10 @@ STEP_LIES = {
     "prior": "s/cost += factors\\[0\\] \\*/cost += 0 */",
     "missing components": "s/R\\[i \\* NY + j\\] -= share/R[i * NY + j] += share/",
     "a noise weight": "s/stage->has_own_noise ? stage->own_noise_weight : //",
-    "the verdict": "s/if (o->spare->cost < target) {/if (1) {/;s/= -k->gradient/= k->gradient/",
+    "the verdict": (  # of a step that leads upwards, without shorter ones
+        "s/if (o->spare->cost < target) {/if (1) {/;s/= -k->gradient/= k->gradient/;"
+        "s/if (!mhe_try_part(e, k, o, &path)) return;/return;/"
+    ),
 }
 
 
