@@ -17,7 +17,7 @@ static void mhe_factor_innovation(const mhe_settings *s, const mhe_stage *stage,
                                   const mhe_seen *seen, const real *P, const real *root,
                                   int count, const int *at, real *rows)
 {
-    real given[LINES * WIDE] = {0}, noise[NY * NY], factor[NY * NY], outputs[DEVIATIONS * NY];
+    real given[LINES * WIDE] = {0}, noise[NY * NY] = {0}, factor[NY * NY], outputs[DEVIATIONS * NY];
     real states[DEVIATIONS * NX];
     mhe_predict_deviations(s, stage, seen, P, root, outputs, states);
     for (int i = 0; i < count; i++)
