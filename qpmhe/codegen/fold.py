@@ -28,7 +28,8 @@ def folded(text: str, value: Callable[[str], bool | None]) -> str:
         text = _without_calls(text, name, number)
     for pattern, left in _SIMPLER:
         text = pattern.sub(left, text)
-    return _without_branches(text, value)
+    # An alternative of nothing but such calls goes, too.
+    return re.sub(r"\n *else \{\n *\}\n", "\n", _without_branches(text, value))
 
 
 def _without_calls(text: str, name: str, number: str) -> str:
