@@ -50,12 +50,12 @@ def test_constraints_are_traced_again_only_where_they_have_changed(monkeypatch):
     ])
     assert len(traces) == 2
     functions = codegen.system_of(mhe).constraints
-    values, numbers = functions.expression()(np.zeros(7), 0.0), functions.numbers()
+    values, numbers = functions.expression()(np.zeros(7), 0.0, []), functions.numbers()
     assert len(traces) == 2
     assert values[0] == -1.0
     assert numbers["touched"].tolist() == [0, 1]
     limit[0] = 2.0
-    assert codegen.system_of(mhe).constraints.expression()(np.zeros(7), 0.0)[0] == -2.0
+    assert codegen.system_of(mhe).constraints.expression()(np.zeros(7), 0.0, [])[0] == -2.0
     assert len(traces) == 4
 
 
