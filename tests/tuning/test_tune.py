@@ -486,11 +486,11 @@ def test_the_initial_state_is_the_records_or_the_systems_where_none_is_given():
 def test_a_search_that_was_stopped_resumes(tmp_path, monkeypatch):
     path, real, calls = tmp_path / "search.json", search.search_likelihood, []
 
-    def stopped(likelihood, begin, note):
+    def stopped(likelihood, begin, note, *known):
         calls.append(begin)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return real(likelihood, begin, note)
+        return real(likelihood, begin, note, *known)
 
     monkeypatch.setattr(search, "search_likelihood", stopped)
     with pytest.raises(KeyboardInterrupt):
