@@ -64,7 +64,7 @@ class Region:
     radius : float
         The radius, infinite where there is none.
     shortened : bool
-        Whether the last step tried is not that of the QP.
+        Whether the last step that was tried differs from the QP's own.
     predicted : float
         The decrease of J that the QP predicts for the last step tried.
     """
