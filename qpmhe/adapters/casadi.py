@@ -32,7 +32,7 @@ from ..model.evaluation import (
 from ..model.expressions import CasadiModel, casadi_model, import_casadi, integrated
 from ..model.functions import Trusted
 from ..model.model import Origin
-from ..model.ode import checked_method
+from ..model.ode import check_length, checked_method
 from ..model.sets import ConvexSet
 from ..model.system import System
 from ..model.system_arguments import SystemOptions, checked_scales, checked_set, timed_options
@@ -100,13 +100,10 @@ def from_casadi(
     if not (compiled is None or isinstance(compiled, bool)):
         raise OptionError(f"compiled is {compiled!r}; expected True, False or None.")
     how, allowed = checked_method(method, steps, tolerance)
+    check_length(how, dt)
     model = casadi_model(f, h, n=n, p=p, m=m, dt=dt, how=how)
     chosen: Choice | None = None
-    if how.method == AUTO:
-        if model.dt is None:
-            raise OptionError(
-                "method is 'auto', but dt is missing, so that f is the step; pass dt and the rate."
-            )
+    if how.method == AUTO and model.dt is not None:
         chosen = _chosen(model, model.dt, options, allowed)
         how = chosen.how
         model = replace(model, how=how)

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import dimension, need, positive
-from ..errors import OptionError
 from ..model.augmentation import Augmentation
-from ..model.discretize import AUTO, EXPLICIT, Discretization
+from ..model.discretize import EXPLICIT, Discretization
 from ..model.functions import Trusted, takes_input
 from ..model.model import Origin
-from ..model.ode import checked_method, made_from_ode
+from ..model.ode import check_length, checked_method, made_from_ode
 from ..model.points import FEW, points
 from ..model.system import System
 from ..model.system_arguments import SystemOptions, checked_set, timed_options
@@ -89,7 +88,7 @@ def from_jax(
         If JAX cannot trace a function, or the function returns the wrong shape or less than double
         precision, or indexes out of range at one of a few points in the set X.
     OptionError
-        If a size or dt is out of range, the method unknown, or ``"auto"`` without dt.
+        If a size or dt is out of range, the method unknown, or given without dt where it needs one.
     SetError
         If a set has the wrong dimension.
 
@@ -131,10 +130,7 @@ def from_jax(
     n, p, m = dimension("n", n, 1), dimension("p", p, 1), dimension("m", m, 0)
     length = None if dt is None else positive("dt", dt)
     how, allowed = checked_method(method, steps, tolerance)
-    if length is None and (method == AUTO or how.is_implicit):
-        raise OptionError(
-            f"method is {method!r}, but dt is missing, so that f is the step; pass dt and the rate."
-        )
+    check_length(how, length)
     probes = points(FEW, n, m, checked_set("states", options.get("states"), n))
     arguments = {"f": f, "h": h, "n": n, "p": p, "m": m, "dt": dt}
     if length is not None and how not in _STEPS:

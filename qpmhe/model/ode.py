@@ -46,6 +46,15 @@ def checked_method(
     return how, TOLERANCE if tolerance is None else tolerance
 
 
+def check_length(how: Discretization, dt: float | None) -> None:
+    """Refuse a discretisation of a step that has no length; the usual one is no request."""
+    if dt is None and (how.steps != 1 or how.method == AUTO or how.is_implicit):
+        given = f"steps is {how.steps}" if how.steps != 1 else f"method is {how.method!r}"
+        raise OptionError(
+            f"{given}, but dt is missing, so that f is the step; pass dt and the rate."
+        )
+
+
 def made_from_ode(
     cls: type[System], rate: Function | Trusted, h: Function | Trusted, *, dt: float, n: int,
     p: int, m: int, how: Discretization, rate_jacobian: Function | Trusted | None,

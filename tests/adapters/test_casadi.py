@@ -51,7 +51,6 @@ def test_ways_of_writing(way):
     with pytest.raises((ValueError, ShapeError)):  # not broadcast
         system.f(np.zeros(N - 1), np.zeros(M))
 
-
 @pytest.mark.parametrize("compiled", BOTH)
 def test_matrix_functions_that_cannot_be_expanded(compiled):
     x, u = ca.MX.sym("x", 3), ca.MX.sym("u", 1)
@@ -388,6 +387,8 @@ def test_auto_chooses_once_and_a_pickle_has_the_choice():
 
 @pytest.mark.parametrize(("options", "words"), [
     ({"method": "auto"}, "method is 'auto', but dt is missing"),
+    ({"method": "radau"}, "method is 'radau', but dt is missing"),
+    ({"steps": 3}, "steps is 3, but dt is missing"),
     ({"method": "auto", "dt": 0.1, "steps": 2}, "method='auto' chooses steps"),
     ({"dt": 0.1, "tolerance": 1e-6}, "tolerance is 1e-06, but method is 'rk4'"),
 ])

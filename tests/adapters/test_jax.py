@@ -317,6 +317,7 @@ def test_an_implicit_step_of_a_rate_without_an_expression():
 @pytest.mark.parametrize(("options", "words"), [
     ({"method": "radau"}, "method is 'radau', but dt is missing"),
     ({"method": "auto"}, "method is 'auto', but dt is missing"),
+    ({"steps": 3}, "steps is 3, but dt is missing"),
     ({"dt": 0.1, "method": "auto", "steps": 2}, "leave steps out"),
     ({"dt": 0.1, "tolerance": 1e-3}, "tolerance is 0.001, but method is 'rk4'"),
 ])
