@@ -146,11 +146,12 @@ class _Module(types.ModuleType):
     """A module in which a thread that traces finds stand-ins."""
 
     def __getattribute__(self, name: str) -> Any:
-        found = super().__getattribute__(name)
+        # Not by `super`, which fails if the trace of another thread ends during this lookup.
+        found = types.ModuleType.__getattribute__(self, name)
         record = getattr(_tracing, "record", None)
         if record is None or record.closed:
             return found
-        stand_in = _STAND_INS.get((super().__getattribute__("__name__"), name))
+        stand_in = _STAND_INS.get((types.ModuleType.__getattribute__(self, "__name__"), name))
         return stand_in if stand_in and _is_looked_up(sys._getframe(1), name) else found
 
 

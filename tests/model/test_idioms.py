@@ -10,6 +10,7 @@ import pytest
 
 import qpmhe
 from qpmhe.codegen.compiler import find_compiler
+from qpmhe.model import stand_ins
 from qpmhe.model.tracing import traced
 from tests.estimation import spoil
 from tests.estimation.same import Interruption
@@ -146,6 +147,14 @@ def test_other_threads_find_numpy_as_it_is_during_a_trace():
     thread.join()
     assert found.function is not None, found.reason
     assert tuple(seen) == (*own, 3, 1)
+
+
+def test_a_lookup_goes_on_where_the_trace_of_another_thread_has_ended():
+    """It began while NumPy's class was another, and ends when it is a module again."""
+    look = stand_ins._Module.__getattribute__
+    assert type(np) is not stand_ins._Module
+    assert look(np, "zeros") is np.zeros
+    assert look(math, "pi") == math.pi
 
 
 def test_python_and_scipy_are_themselves_after_a_trace():
