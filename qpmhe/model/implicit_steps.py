@@ -8,7 +8,7 @@ states, z_i:
 The start is Z = 0 and the algebraic states at x, so that the step is a function of x, u and h
 alone. The implicit function theorem gives its derivative, from the Jacobians at the converged
 stages: exact, whatever the iteration did. C first tries a simplified iteration with one Jacobian,
-from the same start (`stages_kept.c`), which has the same limit where it converges fast.
+from the same start (`stages_kept.c`). Where there are several solutions, it may find another one.
 """
 
 from __future__ import annotations

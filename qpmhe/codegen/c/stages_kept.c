@@ -1,8 +1,8 @@
 /* The stages of an implicit step by the simplified Newton method: one Jacobian for all stages and
  * iterations, that at x, with rank-one corrections by what the rate did along each step (Broyden's
  * method in scaled unknowns; Kelley, Iterative Methods for Linear and Nonlinear Equations, section
- * 7.3). It goes on only while each correction is a small part of the one before: then it has the
- * same limit as Newton's method, from the same start. */
+ * 7.3). It goes on only while each correction is a small part of the one before. Where the equations
+ * have several solutions, it may still end at another one than Newton's method does. */
 
 /* By the eigenvectors of the inverse of A, Newton's equations fall apart into real ones,
  * (a - h J) w = r, and, for three stages, complex ones, (a + c - h J) w = r with a complex c. Their
