@@ -28,6 +28,7 @@ from .limits import (
     NEAREST_POINTS,
     NEARLY,
     OLD_DAMPING,
+    POOR,
     RESTORING,
     ROUNDING,
     SHORTER,
@@ -388,12 +389,14 @@ class Optimizer:
                 continue
             outcome.trial, before, best = trial, best, trial
             decrease = before.cost - best.cost
-            if bounded and region.surprises(decrease):
+            # As long as J falls about as predicted, there is no radius.
+            if bounded and (
+                region.radius < math.inf or not POOR * predicted <= decrease <= predicted / POOR
+            ):
                 if region.radius == math.inf:
                     metric = region.scaled(self._subproblem.metric(problem, before))
-                    region.accept(decrease, metric.length(step))
-                else:
-                    region.accept(decrease)
+                    region.length = metric.length(step)
+                region.accept(decrease)
             if damping:
                 region = Region()
                 outcome.damping = damping * _share_left(decrease, predicted)
@@ -513,7 +516,8 @@ class Optimizer:
         if region.radius < math.inf:
             path = self._path(region, problem, qp, best, step, predicted)
         if path is None or not path.length > region.radius:
-            region.whole(predicted, 0.0 if path is None else path.length)
+            region.shortened, region.predicted = False, predicted
+            region.length = 0.0 if path is None else path.length
             yield self._trial(problem, best, step)
             if path is None:
                 path = self._path(region, problem, qp, best, step, predicted)

@@ -67,13 +67,15 @@ class Region:
         Whether the last step that was tried differs from the QP's own.
     predicted : float
         The decrease of J that the QP predicts for the last step tried.
+    length : float
+        The length of that step, where there is a radius.
     """
 
     radius: float = math.inf
     shortened: bool = False
     predicted: float = 0.0
+    length: float = 0.0
     _largest: Array | None = None
-    _length: float = 0.0
 
     def scaled(self, metric: Metric) -> Metric:
         """A metric with the largest D so far."""
@@ -82,30 +84,19 @@ class Region:
         self._largest = np.maximum(self._largest, metric.information)
         return metric._replace(information=self._largest)
 
-    def whole(self, predicted: float, length: float = 0.0) -> None:
-        """The step of the QP is tried."""
-        self.shortened, self.predicted, self._length = False, predicted, length
-
     def part(self, path: Dogleg) -> Array:
         """The step at the radius, which is tried."""
         step, self.predicted = path.step(self.radius)
-        self.shortened, self._length = True, self.radius
+        self.shortened, self.length = True, self.radius
         return step
 
     def reject(self, length: float) -> None:
         """The step that was tried, of this length, has not lowered J."""
         self.radius = SMALLER_REGION * length
 
-    def surprises(self, decrease: float) -> bool:
-        """Whether the step that was tried asks for another radius, or for a first one."""
-        if self.radius < math.inf:
-            return True
-        return not POOR * self.predicted <= decrease <= self.predicted / POOR
-
-    def accept(self, decrease: float, length: float | None = None) -> None:
+    def accept(self, decrease: float) -> None:
         """The step that was tried has lowered J by this much."""
-        if length is None:
-            length = self._length
+        length = self.length
         share = decrease / self.predicted if self.predicted > 0.0 else math.inf
         larger = LARGER_REGION * length
         if share < POOR:
