@@ -111,7 +111,7 @@ static int mhe_try_part(mhe_estimator *e, mhe_workspace *k, mhe_outcome *o, cons
     o->tried = radius;
     o->expected = promised;
     o->is_shortened = 1;
-    if (!(promised > MHE_ROUNDING * o->best->cost)) return 0;
+    if (!(promised > MHE_ROUNDING * mhe_best_cost(o))) return 0;
     for (int j = 0; j < (e->length + 1) * NX; j++) {
         real step = share * k->step[j];
         if (along > 0) step += along * k->descent[j];

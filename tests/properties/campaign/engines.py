@@ -2,12 +2,13 @@
 
 A difference is explained, in this order: by the tolerance of the sequence, where both have
 converged and J is the same up to it; by a fall, where J is 1e-11 of the candidate's, or the
-estimates differ by so much of the step from it; by a flat J, where the J of two trajectories agree
-to 11 digits; by rounding, where an engine differs as much from
-itself when its memory and its data change in their last digits; by the tolerance of QPs, where one
-step follows the other once it solves them to 1e-12; by the rounding of the Hessian, where the
-Python step differs as much from itself when the QPs change in their last digits; by a cap or by a
-QP that a method has not solved, mostly since it has no feasible point. What is left is a fault.
+estimates differ by so much of the step from it; by lost digits, where the candidate is 1e12 of its
+units away, so that numbers keep less than four digits of a unit; by a flat J, where the J of two
+trajectories agree to 11 digits; by rounding, where an engine differs as much from itself when its
+memory and its data change in their last digits; by the tolerance of QPs, where one step follows
+the other once it solves them to 1e-12; by the rounding of the Hessian, where the Python step
+differs as much from itself when the QPs change in their last digits; by a cap or by a QP that a
+method has not solved, mostly since it has no feasible point. What is left is a fault.
 `docs/how-to/speed.md` lists these reasons.
 """
 
@@ -29,6 +30,7 @@ from .judge import nudged
 CLOSE = 1e-6  # of two estimates in units, and of their J as a share
 CONVERGED = 1e-9  # the default of `tolerance`
 FALL = 1e-11
+LOST = 1e12
 STOPPED = Status.SOLVER_STOPPED
 # Fields of the memory in C that are no data.
 _KEPT = ("metric", "damping", "u")
@@ -188,6 +190,8 @@ class Beside:
             return "tolerance of the sequence"
         if kind != "candidate" and self._is_fall(estimate, other):
             return "a fall of 12 digits"
+        if np.abs(estimate.candidate / self.case.x_units).max() > LOST:
+            return "lost digits"
         if kind == "memory" and J <= FALL and self._observers_agree():
             return "flat J"
         engine = self.compiled._engine
