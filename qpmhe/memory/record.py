@@ -36,6 +36,7 @@ class Mark(NamedTuple):
     own: dict[int, Any]
     slots: tuple[Any, ...]
     rows: dict[str, Array] | None
+    newest: tuple[bool, Array] | None
 
 
 class MemoryRecord:
@@ -189,6 +190,8 @@ class MemoryRecord:
             self.own.copy() if self.own else {},
             tuple([slot.state for slot in self.slots.values()]) if self.slots else (),
             self.copies() if whole else None,
+            # A step that finds the newest covariance vague begins with writing its root.
+            None if self.root is None else (self.is_vague[self.end], self.root[self.end].copy()),
         )
 
     def roll_back(self, mark: Mark) -> None:
@@ -201,6 +204,8 @@ class MemoryRecord:
             slot.state = state
         if mark.rows is not None:
             self._write(mark.rows, self.start)
+        if mark.newest is not None and self.root is not None:
+            self.is_vague[self.end], self.root[self.end] = mark.newest
         if unusual:
             self._make_usual(self.end)
 

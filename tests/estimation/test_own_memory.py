@@ -204,3 +204,19 @@ def test_an_interrupt_leaves_no_missing_components_behind_the_window(missing):
         mhe.update([missing, 1.0])
     for y in ([1.0, 1.0], [1.0, np.nan]):
         assert_same(mhe.update(y), twin.update(y))
+
+
+@pytest.mark.parametrize("observer", [qpmhe.ExtendedKalman, qpmhe.UnscentedKalman])
+def test_an_interrupted_step_leaves_no_root_of_a_covariance(observer):
+    near = 1.0 - 1e-10  # two states that are known to be nearly equal
+    given = {"disturbance": 1e-12 * np.eye(2), "noise": np.eye(1)}
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(lambda x: 1.0 * x, lambda x: x @ [[1.0], [1.0]], n=2, p=1),
+        observer(prior=np.array([[1.0, near], [near, 1.0]]), **given),
+        qpmhe.QuadraticCost.from_covariances(prior=qpmhe.ObserverPrior(), **given),
+        horizon=3, initial_state=np.zeros(2), engine="python",
+    )
+    generator = np.random.default_rng(0)
+    for y in (1.0, 3.0):
+        interrupted(mhe, lambda one, y=y: one.update([y]), generator, 60)
+    assert mhe._engine._window.is_vague[:3].all()
