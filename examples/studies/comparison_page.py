@@ -47,10 +47,10 @@ so that they differ in time, and in how much a cap costs.
 ![Error and cost against the cap]({prefix}-anytime.png)
 
 First-order methods (osqp, scs) need a few iterations before they come near the converged cost, ecos
-about five before it brings anything of use, and qpalm brings nothing at a cap of one. Until then the
-true cost rejects the iterates, so that J is never above the observer's, the dashed line. The error
-has no such bound: an iterate can lower J and estimate worse. The answers above name configurations
-whose error is larger than the observer's.
+about five before it brings anything of use, and qpalm brings nothing at a cap of one. Until then
+the true cost rejects the iterates, so that J is never above the observer's, the dashed line. The
+error has no such bound: an iterate can lower J and estimate worse. The answers above name
+configurations whose error is larger than the observer's.
 
 ![Time per step]({prefix}-step-times.png)
 
