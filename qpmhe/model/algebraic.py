@@ -33,6 +33,8 @@ CURVED = 0.5
 FOLLOWED = 16
 #: Factors that shorten a step along which they are less linear: the least and the largest.
 LESS = 0.1, 0.5
+# By how many powers of 2 equations without a size come below the others, and the largest power.
+_NO_SIZE, _LARGEST_EXPONENT = 100.0, 900.0
 
 
 class Eliminated(NamedTuple):
@@ -93,7 +95,7 @@ class AlgebraicStates:
         """Derivatives by x (K, p, n), of those by w (K, p, n + k) at w = (x, z(x, u))."""
         n = w.shape[1] - self.guess.size
         with np.errstate(all="ignore"):
-            of_z = eliminated(np.zeros_like(w), self._jacobian(w, u), n).slope
+            of_z = eliminated(np.zeros_like(w), self._jacobian(w, u), w, n).slope
         found: Array = slope[..., :n] + slope[..., n:] @ of_z
         return found
 
@@ -123,21 +125,22 @@ class AlgebraicStates:
         at, last = np.arange(len(w)), np.full(len(w), np.inf)
         values, J = self._joint(w, u), self._jacobian(w, u)
         for _ in range(MOST_ITERATIONS):
-            found = eliminated(values, J, n)
-            x, z, step = w[at, :n], w[at, n:], found.step
+            start = w[at]
+            found = eliminated(values, J, start, n)
+            x, z, step = start[:, :n], start[:, n:], found.step
             length = share(step, algebraic_sizes(found, np.abs(x), np.abs(z + step)))
             scale = np.abs(z) + np.abs(step)
             before = share(step, scale)
             done = converged(length, last)
             lost, factor = np.isnan(length), np.ones(len(at))
-            trial = w[at]
+            trial = start.copy()
             for _ in range(MOST_HALVINGS):
                 trial[:, n:] = z + factor[:, None] * step
                 values, slopes = self._joint(trial, u[at]), self._jacobian(trial, u[at])
-                again = eliminated(values, J, n).step
+                again = eliminated(values, J, start, n).step
                 curved = share(again - (1.0 - factor[:, None]) * step, scale)
                 # Beyond a fold, how far off the equations are says nothing.
-                curved[np.linalg.slogdet(slopes[:, n:, n:])[0] != found.side] = np.nan
+                curved[sides(slopes, trial, n) != found.side] = np.nan
                 good = straight(curved, factor, before, length)
                 outside = ~(good | done | lost)
                 if not outside.any():
@@ -175,7 +178,7 @@ def converged(length: Array, last: Array) -> Mask:
     return found
 
 
-def eliminated(values: Array, J: Array, n: int) -> Eliminated:
+def eliminated(values: Array, J: Array, w: Array, n: int) -> Eliminated:
     """The linearised rate of x alone, of joint values (..., n + k) and Jacobians at some w."""
     lead, k = J.shape[:-2], J.shape[-1] - n
     if k == 0:
@@ -184,14 +187,14 @@ def eliminated(values: Array, J: Array, n: int) -> Eliminated:
         return Eliminated(values, J, nothing[..., 0], nothing, side, nothing, nothing[..., :0])
     own = J[..., n:, n:].reshape(-1, k, k)
     right = np.concatenate((J[..., n:, :n], values[..., n:, None]), axis=-1)
-    inverses = inverse(own)
+    inverses = inverse(own, equation_sizes(J, w, n).reshape(-1, k))
     found = -solved(own, right.reshape(-1, k, n + 1), inverses).reshape(*lead, k, n + 1)
     slope, step, by_algebraic = found[..., :n], found[..., n], J[..., :n, n:]
     spread = np.abs(inverses).reshape(*lead, k, k)
     return Eliminated(
         values[..., :n] + (by_algebraic @ step[..., None])[..., 0],
         J[..., :n, :n] + by_algebraic @ slope, step, slope,
-        np.linalg.slogdet(own)[0].reshape(lead),
+        sides(J, w, n),
         spread @ np.abs(J[..., n:, :n]), spread @ np.abs(J[..., n:, n:]),
     )
 
@@ -204,8 +207,43 @@ def algebraic_sizes(found: Eliminated, states: Array, algebraic: Array) -> Array
     return sizes
 
 
-def inverse(matrix: Array) -> Array:
-    """The inverses (K, d, d); NaN of those that are singular or not finite."""
+def equation_sizes(J: Array, w: Array, n: int) -> Array:
+    """How large the terms (..., k) of the algebraic equations are, by their Jacobians at w."""
+    sizes: Array = (np.abs(J[..., n:, :]) @ np.abs(w)[..., None])[..., 0]
+    return sizes
+
+
+def sides(J: Array, w: Array, n: int) -> Array:
+    """The sign (...) of det(dg/dz), by Jacobians (..., n + k, n + k) at w."""
+    rows = reciprocals(equation_sizes(J, w, n))
+    found: Array = np.linalg.slogdet(rows[..., None] * J[..., n:, n:])[0]
+    return found
+
+
+def reciprocals(sizes: Array) -> Array:
+    """Powers of 2 (..., d) that bring sizes of equations near 1, so that no unit picks a pivot.
+
+    An equation without a size contains only unknowns without one, and is solved for these: its
+    factor is the largest by far.
+    """
+    there = np.isfinite(sizes) & (sizes > 0.0)
+    exponents = np.log2(sizes, where=there, out=np.full(sizes.shape, np.inf))
+    least = np.min(exponents, axis=-1, keepdims=True, initial=_LARGEST_EXPONENT)
+    exponents = np.clip(
+        np.where(there, exponents, least - _NO_SIZE), -_LARGEST_EXPONENT, _LARGEST_EXPONENT
+    )
+    found: Array = np.exp2(-np.round(exponents))
+    return found
+
+
+def inverse(matrix: Array, sizes: Array) -> Array:
+    """The inverses (K, d, d) of equations of these sizes (K, d), or NaN where there is none."""
+    rows = reciprocals(sizes)
+    found: Array = _inverse(matrix * rows[..., None]) * rows[:, None]
+    return found
+
+
+def _inverse(matrix: Array) -> Array:
     found = np.full_like(matrix, np.nan)
     good = np.isfinite(matrix).all(axis=(1, 2))
     try:

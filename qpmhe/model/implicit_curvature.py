@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .algebraic import AlgebraicStates, inverse, solved
+from .algebraic import AlgebraicStates, equation_sizes, inverse, solved
 from .evaluation import Evaluator, VirtualMachine
 from .expressions import CasadiModel
 from .implicit_steps import ImplicitStep, newton_matrix
@@ -35,6 +35,7 @@ class _Linear(NamedTuple):
     algebraic: Array  # of z by s
     of_rate: Array  # of f by z alone
     of_residuals: Array  # of g by z alone
+    inverses: Array  # of that
     of_output: Array  # of h by z alone
     output_by_input: Array  # of h by u alone
 
@@ -100,7 +101,8 @@ class ImplicitCurvature:
         rates = at.rate.reshape(count, s, n, n + m)
         matrix = newton_matrix(A, h, rates[..., :n])
         right = h[:, None, None, None] * np.einsum("ij,kjab->kiab", A, rates)
-        inverses = inverse(matrix)
+        sizes = np.abs(x) + np.abs(W[..., :n]).max(axis=1)
+        inverses = inverse(matrix, np.tile(sizes, s))
         moved = solved(matrix, right.reshape(count, s * n, n + m), inverses)
         moved = moved.reshape(count, s, n, n + m)
         states = np.eye(n, n + m) + moved
@@ -128,17 +130,18 @@ class ImplicitCurvature:
         *_, by_input = self._joint(w, u, np.zeros((len(w), width + slope_of_h.shape[1])))
         of_z, residuals = J[:, :n, n:], J[:, n:, n:]
         right = np.concatenate((J[:, n:, :n], by_input[:, n:width]), axis=2)
-        algebraic = -solved(residuals, right, inverse(residuals))
+        inverses = inverse(residuals, equation_sizes(J, w, n))
+        algebraic = -solved(residuals, right, inverses)
         rate = np.concatenate((J[:, :n, :n], by_input[:, :n]), axis=2) + of_z @ algebraic
         return _Linear(
-            rate, algebraic, of_z, residuals, slope_of_h[..., n:], by_input[:, width:]
+            rate, algebraic, of_z, residuals, inverses, slope_of_h[..., n:], by_input[:, width:]
         )
 
     @staticmethod
     def _multipliers(at: _Linear, of_z: Array) -> Array:
         """The multipliers of g, from what weighed values change by with z."""
         matrix = at.of_residuals.swapaxes(1, 2)
-        return -solved(matrix, of_z[..., None], inverse(matrix))[..., 0]
+        return -solved(matrix, of_z[..., None], at.inverses.swapaxes(1, 2))[..., 0]
 
     def _bent(self, w: Array, u: Array, forces: Array, states: Array, at: _Linear) -> Array:
         """The second derivative by s of weighed f, g and h, with x moving as ``states``; 0 by u."""

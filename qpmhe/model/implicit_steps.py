@@ -120,11 +120,13 @@ class ImplicitStep:
         slopes = np.broadcast_to(identity, (count, n, n))
         for x, W, h in self.substeps(w, u, dt):
             with np.errstate(all="ignore"):
-                J = eliminated(np.zeros_like(W), self._slopes(x, u, W), n).jacobian
+                slopes_there = self._slopes(x, u, W)
+                J = eliminated(np.zeros_like(W), slopes_there, self._states(x, W), n).jacobian
             # (I - h A J) dZ/dx = h A J (1, ..., 1).
             right = h[:, None, None, None] * np.einsum("ij,kjab->kiab", method.A, J)
             matrix = newton_matrix(method.A, h, J)
-            dZ = solved(matrix, right.reshape(count, s * n, n), inverse(matrix))
+            sizes = np.tile(np.abs(x) + np.abs(W[..., :n]).max(axis=1), s)
+            dZ = solved(matrix, right.reshape(count, s * n, n), inverse(matrix, sizes))
             own = identity + np.einsum("i,kiab->kab", method.d, dZ.reshape(count, s, n, n))
             slopes, following = own @ slopes, self._end(x, W)
         return following, slopes
@@ -144,10 +146,16 @@ class ImplicitStep:
     def _at_stages(self, function: Batched, x: Array, u: Array, W: Array) -> Array:
         """The rates (K, s, n + k) at the stages, or their Jacobians (K, s, n + k, n + k)."""
         count, s, size = W.shape
+        states = self._states(x, W).reshape(count * s, size)
+        found = function(states, np.repeat(u, s, axis=0))
+        return found.reshape(count, s, *found.shape[1:])
+
+    @staticmethod
+    def _states(x: Array, W: Array) -> Array:
+        """The states w (K, s, n + k) at the stages."""
         states = W.copy()
         states[..., : x.shape[1]] += x[:, None]
-        found = function(states.reshape(count * s, size), np.repeat(u, s, axis=0))
-        return found.reshape(count, s, *found.shape[1:])
+        return states
 
     def _slopes(self, x: Array, u: Array, W: Array) -> Array:
         return self._at_stages(self._jacobian, x, u, W)
@@ -182,9 +190,13 @@ class ImplicitStep:
         side = np.ones((len(x), 1))
         values = self._at_stages(self._rate, x[at], u[at], W[at])
         for iteration in range(MOST_ITERATIONS):
-            J = self._slopes(x[at], u[at], W[at])
-            found = eliminated(values, J, n)
-            inverses = inverse(newton_matrix(self._method.A, h[at], found.jacobian))
+            J, w = self._slopes(x[at], u[at], W[at]), self._states(x[at], W[at])
+            found = eliminated(values, J, w, n)
+            moved = np.maximum(np.abs(W[at, :, :n]), h[at, None, None] * np.abs(found.rate))
+            inverses = inverse(
+                newton_matrix(self._method.A, h[at], found.jacobian),
+                np.tile(np.abs(x[at]) + moved.max(axis=1), len(self._method.A)),
+            )
             moves = self._correction(found, inverses, h[at], W[at])
             step, k = moves[..., :n], W.shape[2] - n
             # What rounding of the states and of their flows amounts to in each equation, or what
@@ -210,7 +222,7 @@ class ImplicitStep:
                 values = self._at_stages(self._rate, x[at], u[at], trial)
                 good, less = np.isfinite(values).all(axis=(1, 2)), 0.5 * factor
                 if damped:
-                    again = self._correction(eliminated(values, J, n), inverses, h[at], trial)
+                    again = self._correction(eliminated(values, J, w, n), inverses, h[at], trial)
                     curved = share(again - (1.0 - factor[:, None, None]) * moves, scale)
                     good = straight(curved, factor, before, length)
                     less = shorter(curved, factor, before)

@@ -12,7 +12,10 @@ import qpmhe
 from qpmhe import Box, ExtendedKalman, Luenberger, MovingHorizonEstimator, QuadraticCost, System
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import ModelError, OptionError, ShapeError
+from qpmhe.model.evaluation import NAMES, Evaluator, machine
 from qpmhe.model.implicit_steps import COLLOCATIONS
+
+from .ways import evaluated_in_c
 
 INF, NONE = np.inf, np.zeros(0)
 ENGINES = ["python", pytest.param("compiled", marks=pytest.mark.skipif(
@@ -324,20 +327,41 @@ def test_an_output_that_alone_is_traced_is_called_with_the_equations():
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("unit", [1e-9, 1e9])
-def test_units_scale_the_step(unit):
-    a, b, c = unit, 1.0 / unit, unit**0.5  # of x, z and g
+@pytest.mark.parametrize("engine", ENGINES)
+def test_any_units_give_the_same_step(engine):
+    """Of each state, each algebraic state and each equation, which are inputs here."""
+    def parts(u):
+        return u[..., 1:3], u[..., 3:5], u[..., 5:]
 
-    def rate(x, z, u):
-        return a * swing(x / a, z / b, u)
+    def of_units(function, unit):
+        def scaled(x, z, u):
+            a, b, c = parts(u)
+            return {"a": a, "c": c, "": 1.0}[unit] * function(x / a, z / b, u)
 
-    scaled = System.from_dae(
-        rate, lambda x, z: c * balance(x / a, z / b), lambda x, z, u: voltage(x / a, z / b, u),
-        dt=0.1, **SIZES, algebraic_guess=[0.0, b], scales=[a, a],
+        return scaled
+
+    system = System.from_dae(
+        of_units(swing, "a"), of_units(lambda x, z, u: balance(x, z), "c"),
+        of_units(voltage, ""), dt=0.1, **SIZES | {"m": 7}, algebraic_guess=[0.0, 1.0],
+        states=Box(X - 0.3, X + 0.3),
     )
-    plain, found = evaluated(swing_system(), X, U), evaluated(scaled, a * X, U)
-    for mine, theirs, size in zip(found, plain, (a, 1.0, 1.0, 1.0 / a), strict=True):
-        np.testing.assert_allclose(mine / size, theirs, rtol=1e-11)
+    generator, count = np.random.default_rng(0), 100
+    x = X + 0.3 * generator.uniform(-1.0, 1.0, (count, 2))
+    u = np.ones((count, 7))
+    u[:, 0] = U
+    other = u.copy()
+    # The guess is the same number in all units.
+    other[:, [1, 2, 3, 5, 6]] = 10.0 ** generator.uniform(-12.0, 12.0, (count, 5))
+    a = other[:, 1:3]
+    model = system.symbolic
+    one = evaluated_in_c(model) if engine == "compiled" else Evaluator(machine(model, False)).one
+    plain, (f, h, A, C) = (
+        [one(name, *at) for name in NAMES] for at in ((x, u), (x * a, other))
+    )
+    found = f / a, h, A * a[:, None] / a[..., None], C * a[:, None]
+    for mine, theirs in zip(found, plain, strict=True):
+        assert np.isfinite(theirs).all()
+        np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12 * np.abs(theirs).max())
 
 
 def test_steps_of_other_lengths_and_pickles():

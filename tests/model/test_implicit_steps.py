@@ -12,7 +12,10 @@ import qpmhe
 from qpmhe.codegen.compiler import find_compiler
 from qpmhe.errors import ModelError, OptionError
 from qpmhe.model.discretize import METHODS
+from qpmhe.model.evaluation import Evaluator, machine
 from qpmhe.model.implicit_steps import COLLOCATIONS, ImplicitStep
+
+from .ways import evaluated_in_c
 
 ORDERS = {"euler": 1, "rk4": 4} | {name: one.order for name, one in COLLOCATIONS.items()}
 NONE = np.zeros(0)
@@ -159,14 +162,66 @@ def test_units_scale_the_step(unit):
     np.testing.assert_allclose(found, plain.functions.f(x, NONE), rtol=1e-11)
 
 
+def arrhenius(x):
+    """A reaction that heats its reactor, and a jacket."""
+    reacted = 7.2e10 * ca.exp(-8750.0 / x[1]) * x[0]
+    return [
+        1.0 - x[0] - reacted, 350.0 - x[1] + 209.2 * reacted + 2.09 * (x[2] - x[1]),
+        20.0 * (300.0 - x[2]) + 10.0 * (x[1] - x[2]),
+    ]
+
+
+def kinetics(x):
+    """Robertson's, of a list of entries."""
+    slow, fast, back = 0.04 * x[0], 3e7 * x[1] ** 2, 1e4 * x[1] * x[2]
+    return [back - slow, slow - back - fast, fast]
+
+
+def oscillator(x):
+    """Van der Pol's, likewise."""
+    return [x[1], 1e3 * (1.0 - x[0] ** 2) * x[1] - x[0]]
+
+
+@pytest.mark.parametrize("kind", [
+    "python", pytest.param("compiled", marks=pytest.mark.skipif(
+        find_compiler() is None, reason="there is no C compiler")),
+])
+@pytest.mark.parametrize(("rate", "low", "high", "dt"), [
+    (kinetics, [0.6, 1e-6, 0.01], [1.0, 5e-5, 0.2], 1.0),
+    (oscillator, [1.4, -1e-2], [2.4, 0.0], 1.0),
+    (arrhenius, [0.4, 340.0, 300.0], [0.6, 355.0, 320.0], 0.05),
+], ids=["robertson", "van der Pol", "arrhenius"])
+def test_any_units_of_the_states_give_the_same_step(rate, low, high, dt, kind):
+    """The pivots of Newton's equations, the sizes of corrections and their end have no unit."""
+    generator, n, count = np.random.default_rng(0), len(low), 300
+    states, units = ca.SX.sym("x", n), ca.SX.sym("u", n)  # the units as inputs
+    flows = ca.vertcat(*rate(ca.vertsplit(states / units)))
+    model = qpmhe.from_casadi(
+        ca.Function("rate", [states, units], [flows * units]),
+        ca.Function("h", [states, units], [states[0]]), dt=dt, method="radau", compiled=False,
+    ).symbolic
+    one = evaluated_in_c(model) if kind == "compiled" else Evaluator(machine(model, False)).one
+    x = generator.uniform(low, high, (count, n))
+    scale = 10.0 ** generator.uniform(-12.0, 12.0, (count, n))
+    scale[0] = 10.0 ** np.array([-12.0, 12.0, -6.0])[:n]
+    (values, slopes), (others, other_slopes) = (
+        [one(name, *at) for name in ("f", "f_jacobian")]
+        for at in ((x, np.ones((count, n))), (x * scale, scale))
+    )
+    assert np.isfinite(values).all()
+    np.testing.assert_allclose(others / scale, values, rtol=1e-12)
+    other_slopes = other_slopes * scale[:, None] / scale[..., None]
+    sizes = np.abs(slopes).max(axis=2, keepdims=True)
+    assert (np.abs(other_slopes - slopes) < 1e-10 * sizes).all()
+
+
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 @pytest.mark.parametrize("method", COLLOCATIONS)
 def test_the_compiled_step_keeps_a_jacobian_and_has_the_same_values(method):
     """Over states from which one Jacobian does for the step, and others where it does not."""
     x = ca.SX.sym("x", 3)
-    slow, fast, back = 0.04 * x[0], 3e7 * x[1] ** 2, 1e4 * x[1] * x[2]
     functions = (
-        ca.Function("rate", [x], [ca.vertcat(back - slow, slow - back - fast, fast)]),
+        ca.Function("rate", [x], [ca.vertcat(*kinetics(ca.vertsplit(x)))]),
         ca.Function("h", [x], [x[0]]),
     )
     generator = np.random.default_rng(0)

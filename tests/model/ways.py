@@ -1,11 +1,23 @@
 """Ways of writing one function, and the comparison of a batched function with a plain one."""
 
 import math
+from functools import partial
 
 import numpy as np
 
+from qpmhe.adapters.casadi import _compiled
+from qpmhe.codegen.compiler import compiled_library
+from qpmhe.codegen.source import model_files
+from qpmhe.model.evaluation import Evaluator
+
 LEADS = [(), (1,), (2,), (5,), (1, 2), (2, 1), (2, 3), (4, 5)]
 NONE = np.zeros(0)
+
+
+def evaluated_in_c(model):
+    """A function of a name among f, h and their Jacobians, x and u, without the library's check."""
+    library = compiled_library(model_files(model), "model.c")
+    return Evaluator(partial(_compiled, model, library, False)).one
 
 
 def check_values(function, plain, n, m=0):

@@ -24,7 +24,7 @@ static void mhe_algebraic_step(const mhe_reduced *r, const real *values, real *s
 /* Linearise f at w; whether it is finite and dg/dz regular there. */
 static int mhe_reduce(const real *w, const real *u, mhe_reduced *r)
 {
-    real nonzeros[SIZE(MHE_F_NONZEROS)];
+    real nonzeros[SIZE(MHE_F_NONZEROS)], per[NZ];
     mhe_call_f_jacobian(w, u, r->values, nonzeros);
     for (int i = 0; i < NW; i++)
         if (!isfinite(r->values[i])) return 0;
@@ -33,8 +33,11 @@ static int mhe_reduce(const real *w, const real *u, mhe_reduced *r)
         const real *row = r->full + (NX + i) * NW;
         for (int j = 0; j < NX; j++) r->slope[i * NX + j] = -row[j];
         for (int j = 0; j < NZ; j++) r->factors[j * NZ + i] = row[NX + j];
+        per[i] = 0;
+        for (int j = 0; j < NW; j++) per[i] += (real)fabs(row[j] * w[j]);
     }
-    if (!mhe_factor_equations(NZ, r->factors, r->pivot)) return 0;
+    mhe_reciprocals(NZ, per);
+    if (!mhe_factor_equations(NZ, r->factors, per, r->pivot)) return 0;
     mhe_solve_columns(NZ, r->factors, r->pivot, NX, r->slope);
     mhe_algebraic_step(r, r->values, r->step);
     r->side = 1;

@@ -36,23 +36,41 @@ static real mhe_share(int size, const real *step, const real *sizes)
     return length;
 }
 
+/* Turn sizes of equations into reciprocals. One without a size, of infinity, contains only unknowns
+ * without one, and is solved for these. */
+static void mhe_reciprocals(int size, real *sizes)
+{
+    for (int i = 0; i < size; i++) sizes[i] = sizes[i] > 0 ? 1 / sizes[i] : INFINITY;
+}
+
+static void mhe_exchange(real *a, real *b)
+{
+    const real held = *a;
+    *a = *b;
+    *b = held;
+}
+
 /* The factors of M, stored by columns, in place, with the reciprocals of pivots; whether M is
- * regular. */
-static int mhe_factor_equations(int size, real *M, int *pivot)
+ * regular. Pivots are compared as shares of the equations' sizes, of which `per` has the reciprocals,
+ * so that units do not matter. */
+static int mhe_factor_equations(int size, real *M, real *per, int *pivot)
 {
     for (int c = 0; c < size; c++) {
-        real *column = M + c * size;
+        real *column = M + c * size, most = 0;
         int best = c;
-        for (int r = c + 1; r < size; r++)
-            if (fabs(column[r]) > fabs(column[best])) best = r;
+        for (int r = c; r < size; r++) {
+            const real share = (real)fabs(column[r]) * per[r];
+            if (share > most) {
+                most = share;
+                best = r;
+            }
+        }
         pivot[c] = best;
         if (!(fabs(column[best]) > 0) || !isfinite(column[best])) return 0;
-        if (best != c)
-            for (int j = 0; j < size; j++) {
-                const real held = M[j * size + c];
-                M[j * size + c] = M[j * size + best];
-                M[j * size + best] = held;
-            }
+        if (best != c) {
+            mhe_exchange(per + c, per + best);
+            for (int j = 0; j < size; j++) mhe_exchange(M + j * size + c, M + j * size + best);
+        }
         const real share = 1 / column[c];
         column[c] = share;
         for (int r = c + 1; r < size; r++) column[r] *= share;
@@ -63,17 +81,14 @@ static int mhe_factor_equations(int size, real *M, int *pivot)
                 for (int r = c + 1; r < size; r++) other[r] -= factor * column[r];
         }
     }
+    for (int c = size - 1; c >= 0; c--) mhe_exchange(per + c, per + pivot[c]);
     return 1;
 }
 
 /* The solution of M z = z, with the factors of M, in place. */
 static void mhe_solve_equations(int size, const real *M, const int *pivot, real *z)
 {
-    for (int c = 0; c < size; c++) {
-        const real held = z[pivot[c]];
-        z[pivot[c]] = z[c];
-        z[c] = held;
-    }
+    for (int c = 0; c < size; c++) mhe_exchange(z + c, z + pivot[c]);
     for (int c = 0; c < size; c++)
         for (int r = c + 1; r < size; r++) z[r] -= z[c] * M[c * size + r];
     for (int c = size - 1; c >= 0; c--) {
@@ -88,11 +103,7 @@ static void mhe_solve_columns(int size, const real *M, const int *pivot, int col
     for (int c = 0; c < size; c++) {
         real *row = z + c * columns, *other = z + pivot[c] * columns;
         if (pivot[c] == c) continue;
-        for (int j = 0; j < columns; j++) {
-            const real held = row[j];
-            row[j] = other[j];
-            other[j] = held;
-        }
+        for (int j = 0; j < columns; j++) mhe_exchange(row + j, other + j);
     }
     for (int c = 0; c < size; c++) {
         const real *row = z + c * columns;

@@ -1,8 +1,9 @@
 /* The derivatives of the last of three stages x + Z_3 by x, from the Jacobians at all. With B = 1/A,
  *     (B_ii - h J_i) S_i + sum_(j != i) B_ij S_j = (sum_j B_ij) I
  * for S_i = d(x + Z_i)/dx: one block is eliminated after the other, and right sides beside S_3 are
- * multiples of I. Whether all blocks are regular. */
-static int mhe_step_slope(real h, const mhe_reduced *r, real *S)
+ * multiples of I. Whether all blocks are regular, by the states' reciprocal
+ * sizes in `per`. */
+static int mhe_step_slope(real h, const mhe_reduced *r, real *per, real *S)
 {
     enum { WIDE = 2 * NX };
     const real(*B)[MHE_STAGES] = mhe_stage_inverse;
@@ -12,7 +13,7 @@ static int mhe_step_slope(real h, const mhe_reduced *r, real *S)
     /* S_1 = first (sums_1 - B_12 S_2 - B_13 S_3). */
     mhe_shifted(B[0][0], h, r[0].jacobian, block);
     for (int i = 0; i < NX * NX; i++) first[i] = i / NX == i % NX;
-    if (!mhe_factor_equations(NX, block, pivot)) return 0;
+    if (!mhe_factor_equations(NX, block, per, pivot)) return 0;
     mhe_solve_columns(NX, block, pivot, NX, first);
     /* S_2 = G_b - G_a S_3, with (G_a, G_b) in wide. */
     mhe_shifted(B[1][1], h, r[1].jacobian, block);
@@ -23,7 +24,7 @@ static int mhe_step_slope(real h, const mhe_reduced *r, real *S)
             wide[i * WIDE + j] = B[1][2] * same - share * B[0][2];
             wide[i * WIDE + NX + j] = sums[1] * same - share * sums[0];
         }
-    if (!mhe_factor_equations(NX, block, pivot)) return 0;
+    if (!mhe_factor_equations(NX, block, per, pivot)) return 0;
     mhe_solve_columns(NX, block, pivot, WIDE, wide);
     for (int i = 0; i < NX; i++) {
         for (int j = 0; j < WIDE; j++) product[i * WIDE + j] = 0;
@@ -40,7 +41,7 @@ static int mhe_step_slope(real h, const mhe_reduced *r, real *S)
             S[at] = sums[2] * (i == j) - B[2][1] * wide[b] -
                     B[2][0] * (sums[0] * first[at] - B[0][1] * product[b]);
         }
-    if (!mhe_factor_equations(NX, block, pivot)) return 0;
+    if (!mhe_factor_equations(NX, block, per, pivot)) return 0;
     mhe_solve_columns(NX, block, pivot, NX, S);
     return 1;
 }

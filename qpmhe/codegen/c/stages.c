@@ -35,9 +35,25 @@ static void mhe_stage_residual(const real *rates, real h, const real *W, real *r
         }
 }
 
-/* LU factors of M = I - h A_ij J_j; whether M is regular. */
-static int mhe_stage_factor(real h, const mhe_reduced *r, real *M, int *pivot)
+/* Reciprocal sizes of the states' equations in a step: of x, of what the stages W add, and of the flows
+ * at them, of which the first few are known. */
+static void mhe_state_reciprocals(const real *x, real h, const real *W, int known,
+                                  const mhe_reduced *r, real *per)
 {
+    for (int a = 0; a < NX; a++) {
+        real most = 0;
+        for (int i = 0; i < MHE_STAGES; i++) most = mhe_max((real)fabs(W[i * NW + a]), most);
+        for (int i = 0; i < known; i++) most = mhe_max(h * (real)fabs(r[i].rate[a]), most);
+        per[a] = (real)fabs(x[a]) + most;
+    }
+    mhe_reciprocals(NX, per);
+}
+
+/* LU factors of M = I - h A_ij J_j, with the states' reciprocal sizes; whether M is regular. */
+static int mhe_stage_factor(real h, const mhe_reduced *r, const real *per, real *M, int *pivot)
+{
+    real all[MHE_UNKNOWNS];
+    for (int i = 0; i < MHE_UNKNOWNS; i++) all[i] = per[i % NX];
     for (int i = 0; i < MHE_STAGES; i++)
         for (int a = 0; a < NX; a++)
             for (int j = 0; j < MHE_STAGES; j++)
@@ -45,7 +61,7 @@ static int mhe_stage_factor(real h, const mhe_reduced *r, real *M, int *pivot)
                     M[(j * NX + b) * MHE_UNKNOWNS + i * NX + a] =
                         (i == j && a == b) -
                         h * mhe_stage_weights[i][j] * r[j].jacobian[a * NX + b];
-    return mhe_factor_equations(MHE_UNKNOWNS, M, pivot);
+    return mhe_factor_equations(MHE_UNKNOWNS, M, all, pivot);
 }
 
 /* What rounding of the states and of their flows amounts to in each equation, or what the inverse of M
@@ -125,7 +141,7 @@ static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, 
     mhe_reduced both[2][MHE_STAGES];
     real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], moves[MHE_STAGES * NW], trial[MHE_STAGES * NW];
     real M[MHE_UNKNOWNS * MHE_UNKNOWNS], scale[MHE_STAGES * NW], sizes[MHE_UNKNOWNS];
-    real last = INFINITY;
+    real per[NX], last = INFINITY;
     int pivot[MHE_UNKNOWNS], now = 0;
     for (int i = 0; i < MHE_STAGES; i++)
         for (int j = 0; j < NW; j++) W[i * NW + j] = j < NX ? 0 : w[j];
@@ -134,7 +150,8 @@ static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, 
     for (int iteration = 0; iteration < $iterations; iteration++) {
         const mhe_reduced *r = both[now];
         mhe_reduced *next = both[!now];
-        if (!mhe_stage_factor(h, r, M, pivot)) return 0;
+        mhe_state_reciprocals(w, h, W, MHE_STAGES, r, per);
+        if (!mhe_stage_factor(h, r, per, M, pivot)) return 0;
         for (int i = 0; i < MHE_UNKNOWNS; i++) rates[i] = r[i / NX].rate[i % NX];
         mhe_stage_residual(rates, h, W, step);
         mhe_solve_equations(MHE_UNKNOWNS, M, pivot, step);

@@ -26,14 +26,14 @@ typedef struct {
     real one[NX * NX], parts[SIZE(2 * NX * NX * MHE_PAIR)];
 } mhe_modes;
 
-/* Whether the matrices are regular. */
-static int mhe_invert_modes(real h, const real *J, mhe_modes *modes)
+/* Whether the matrices are regular, by the states' reciprocal sizes. */
+static int mhe_invert_modes(real h, const real *J, real *per, mhe_modes *modes)
 {
     enum { WIDE = 2 * NX };
     real block[NX * NX], wide[SIZE(NX * WIDE * MHE_PAIR)], *P = modes->one;
     int pivot[NX];
     mhe_shifted($real, h, J, block);
-    if (!mhe_factor_equations(NX, block, pivot)) return 0;
+    if (!mhe_factor_equations(NX, block, per, pivot)) return 0;
     for (int i = 0; i < NX * NX; i++) P[i] = i / NX == i % NX;
     mhe_solve_columns(NX, block, pivot, NX, P);
     for (int i = 0; i < NX * MHE_PAIR; i++) {
@@ -49,17 +49,13 @@ static int mhe_invert_modes(real h, const real *J, mhe_modes *modes)
         }
     }
     if (MHE_PAIR) {
-        if (!mhe_factor_equations(NX, block, pivot)) return 0;
+        if (!mhe_factor_equations(NX, block, per, pivot)) return 0;
         mhe_solve_columns(NX, block, pivot, WIDE, wide);
         for (int i = 0; i < NX; i++)
             for (int j = 0; j < WIDE; j++) modes->parts[j * NX + i] = wide[i * WIDE + j];
     }
     for (int i = 0; i < NX; i++)
-        for (int j = 0; j < i; j++) {
-            const real held = P[i * NX + j];
-            P[i * NX + j] = P[j * NX + i];
-            P[j * NX + i] = held;
-        }
+        for (int j = 0; j < i; j++) mhe_exchange(P + i * NX + j, P + j * NX + i);
     return 1;
 }
 
@@ -155,8 +151,9 @@ static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_red
     real moves[MHE_STAGE_VALUES], sizes[MHE_STAGE_VALUES], per[MHE_STAGE_VALUES];
     real rounding[NW], last = INFINITY;
     real made[$kept][MHE_STAGE_VALUES], squares[$kept]; /* the corrections, as shares of the sizes */
-    if (!mhe_invert_modes(h, r->jacobian, &modes)) return 0;
     for (int i = 0; i < MHE_STAGE_VALUES; i++) W[i] = i % NW < NX ? 0 : w[i % NW];
+    mhe_state_reciprocals(w, h, W, 1, r, sizes);
+    if (!mhe_invert_modes(h, r->jacobian, sizes, &modes)) return 0;
     for (int k = 0; k < $kept; k++) {
         real *share = made[k], length = 0, square = 0;
         mhe_kept_moves(w, u, h, r, &modes, W, k == 0, moves);

@@ -38,11 +38,12 @@ $step_slope
 /* f and its Jacobian with respect to x, by rows. */
 static void $slope(const real *x, const real *u, real dt, real *next, real *A)
 {
-    real W[MHE_STAGE_VALUES];
+    real W[MHE_STAGE_VALUES], per[NX];
     mhe_reduced r[MHE_STAGES];
-    if (mhe_solve_stages(x, u, dt, W) && mhe_stage_rates(x, u, W, r) && mhe_step_slope(dt, r, A)) {
+    if (mhe_solve_stages(x, u, dt, W) && mhe_stage_rates(x, u, W, r)) {
+        mhe_state_reciprocals(x, dt, W, 0, r, per);
         mhe_step_end(x, W, next);
-        return;
+        if (mhe_step_slope(dt, r, per, A)) return;
     }
     for (int a = 0; a < NX; a++) next[a] = NAN;
     for (int i = 0; i < NX * NX; i++) A[i] = NAN;
