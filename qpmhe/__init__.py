@@ -15,6 +15,7 @@ from .adapters.sympy import from_sympy
 from .batch import BatchEstimator
 from .codegen import Compiled, compile
 from .codegen.compiler import check_any_cached
+from .codegen.payoff import prepare
 from .codegen.source import MAIN
 from .costs import (
     Barron,
@@ -74,7 +75,7 @@ def _compiled_engine(
     return compiled_engine(system, observer, cost, settings, initial_state)
 
 
-register_engine("compiled", _compiled_engine)
+register_engine("compiled", _compiled_engine, prepare)
 MovingHorizonEstimator.differentiate = Sensitivity
 
 

@@ -8,11 +8,13 @@ import os
 import platform
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -34,6 +36,8 @@ _STALE = 86400.0
 NO_COMPILER = "there is no C compiler (cc, gcc or clang); install one, or set CC to its path."
 # Seconds after which a compiler is taken to hang.
 _PATIENCE = 600.0
+# The note beside a library that could not be made, which counts for as long as _STALE.
+_FAILED = "failed"
 # Libraries that this process has checked: path and content.
 _checked: set[tuple[str, str]] = set()
 
@@ -76,13 +80,15 @@ def _processor() -> str:
 
 def compiled_library(
     files: dict[str, str] | Callable[[], dict[str, str]], main: str, key: str | None = None,
-    check: Callable[[ctypes.CDLL], str] | None = None,
+    check: Callable[[ctypes.CDLL], str] | None = None, patience: float | None = None,
 ) -> ctypes.CDLL:
     """Compile C source and load it; a library made before is loaded from the cache.
 
     With a key, which must differ where the source does, `files` may be a function that is called
     only to compile. Compilers make mistakes: if `check` finds one, the source is compiled again
-    with less optimisation, and the cache remembers the level.
+    with less optimisation, and the cache remembers the level. With a `patience` in seconds, nobody
+    has asked to compile: then all calls of the compiler take no longer, and where they have failed
+    before, none is made for a day.
     """
     compiler = required_compiler()
     if key is None:
@@ -95,6 +101,24 @@ def compiled_library(
             if ready is not None:
                 return ready
     folder = writable_folder()
+    failed = folder / f"{digest}.{_FAILED}"
+    if patience is not None and (before := _failure(failed)):
+        raise CompilationError(f"{before.rstrip('.')}. It is not tried again; call qpmhe.compile.")
+    try:
+        library = _compiled(compiler, files, main, folder, digest, check, patience)
+    except CompilationError as error:
+        _replace(failed, f"{_checked_by()}\n{error}")
+        raise
+    failed.unlink(missing_ok=True)
+    return library
+
+
+def _compiled(
+    compiler: list[str], files: dict[str, str] | Callable[[], dict[str, str]], main: str,
+    folder: Path, digest: str, check: Callable[[ctypes.CDLL], str] | None, patience: float | None,
+) -> ctypes.CDLL:
+    """Compile with less and less optimisation, until the library is right."""
+    deadline = None if patience is None else time.monotonic() + patience
     note = folder / f"{digest}.level"
     first, fault = _remembered(note)
     message = ""
@@ -103,7 +127,7 @@ def compiled_library(
         if not _intact(path, seal):
             files = files() if callable(files) else files
             try:
-                message = _make(compiler, files, main, level, path, seal)
+                message = _make(compiler, files, main, level, path, seal, deadline)
             except OSError as error:  # no output, no space left
                 raise CompilationError(f"{path} cannot be made ({error}).") from error
             if message:  # not every compiler knows its machine by these flags
@@ -131,7 +155,7 @@ def compiled_library(
 def shared_library(sources: list[Path], target: Path) -> None:
     """Compile C sources to a shared library for any machine of this kind, beside the cache."""
     compiler = required_compiler()
-    message = _run([*compiler, "-O2", "-fvisibility=hidden"], (), sources, target)
+    message = _run([*compiler, "-O2", "-fvisibility=hidden"], (), sources, target, None)
     if message:
         raise CompilationError(f"{' '.join(compiler)} failed: {message}")
 
@@ -149,6 +173,13 @@ def cached_library(
         if found is not None:
             return found
     return None
+
+
+def known_failure(main: str, key: str) -> str:
+    """Why compiling the library of this key has failed in the last day; empty if it has not."""
+    digest = _digest(required_compiler(), main, key)
+    found = (_failure(folder / f"{digest}.{_FAILED}") for folder in cache_folders())
+    return next(filter(None, found), "")
 
 
 def cached_files(main: str) -> Iterator[Path]:
@@ -262,8 +293,19 @@ def _remember(note: Path, level: int, fault: str) -> None:
     _replace(note, f"{level}\n{_checked_by()}\n{fault}")
 
 
+def _failure(note: Path) -> str:
+    """Why compiling has failed in the last day, by this version; empty if it has not."""
+    judge, _, reason = (own_file(note) or b"").decode("utf-8", "replace").partition("\n")
+    try:
+        is_new = time.time() - note.stat().st_mtime < _STALE
+    except OSError:
+        return ""
+    return reason if is_new and judge == _checked_by() else ""
+
+
 def _make(
-    compiler: list[str], files: dict[str, str], main: str, level: int, path: Path, seal: Path
+    compiler: list[str], files: dict[str, str], main: str, level: int, path: Path, seal: Path,
+    deadline: float | None,
 ) -> str:
     """Put the library into the cache; the compiler's message if it fails, else nothing."""
     _remove_stale(path.parent)
@@ -271,7 +313,7 @@ def _make(
         for name, text in files.items():
             Path(scratch, name).write_text(text, encoding="ascii")
         made, sealed = Path(scratch, "library.so"), Path(scratch, "seal")
-        message = _run(compiler, _LEVELS[level], [Path(scratch, main)], made)
+        message = _run(compiler, _LEVELS[level], [Path(scratch, main)], made, deadline)
         if not message:
             sealed.write_text(_content(path.name, made.read_bytes()), encoding="ascii")
             made.chmod(0o700)  # what others can write is not loaded
@@ -304,21 +346,39 @@ def _content(name: str, library: bytes) -> str:
 
 
 def _run(
-    compiler: list[str], options: tuple[str, ...], sources: list[Path], target: Path
+    compiler: list[str], options: tuple[str, ...], sources: list[Path], target: Path,
+    deadline: float | None,
 ) -> str:
     """Compile; what went wrong, or nothing."""
     command = [*compiler, *_FLAGS, *options, "-o", str(target), *map(str, sources), "-lm"]
+    patience = _PATIENCE if deadline is None else max(deadline - time.monotonic(), 0.0)
     try:
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace",
-            timeout=_PATIENCE, check=False,
-        )
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True, errors="replace", start_new_session=True,
+        ) as process:
+            try:
+                output, errors = process.communicate(timeout=patience)
+            except BaseException:  # too late, or an interrupt, which only we have got
+                _end(process)
+                raise
     except subprocess.TimeoutExpired as error:
         raise CompilationError(
-            f"{' '.join(compiler)} did not end within {_PATIENCE:g} s; set CC to another compiler."
+            f"{' '.join(compiler)} did not end within {error.timeout:.3g} s; set CC to another "
+            "compiler."
         ) from error
     except OSError as error:
         return str(error)
-    if done.returncode == 0:
+    if process.returncode == 0:
         return ""
-    return (done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}"
+    return (errors or output).strip()[-2000:] or f"exit status {process.returncode}"
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End a compiler and those that it has started, which do the work."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+    process.communicate()

@@ -20,7 +20,7 @@ from ..estimation.settings import Settings
 from ..model.expressions import CasadiModel
 from ..model.system import System
 from ..observers import Observer
-from .compiler import NotCachedError, cached_library, compiled_library
+from .compiler import NotCachedError, cached_library, compiled_library, known_failure
 from .directions import Directions
 from .fingerprint import source_key
 from .layout import TERMS, Layout, settings_record
@@ -275,12 +275,14 @@ class EstimatorLibrary:
     ``recompute`` are the C functions of these names; `update` is ``mhe_update_undoable``, which
     `undo` reverses. ``path`` is the file. With ``settings.engine="auto"`` it must be in the cache:
     `NotCachedError` is raised if it is not. ``check`` reports what is wrong with a library that was
-    not checked before; `checked_library` passes the usual one.
+    not checked before; `checked_library` passes the usual one. ``patience`` is that of
+    `compiled_library`.
     """
 
     def __init__(
         self, system: System, observer: Observer, cost: Cost, settings: Settings,
         check: Callable[[EstimatorLibrary, System, Observer, Cost, Settings], str],
+        patience: float | None = None,
     ) -> None:
         self.layout, self.settings = layout, record = planned(
             system, observer, cost, settings, lapack=True
@@ -299,16 +301,20 @@ class EstimatorLibrary:
 
         key = source_key(model, layout)
         if settings.engine == "auto":
-            found = None if key is None else cached_library(MAIN, key, fault)
-            if found is None:
+            if key is None:
                 raise NotCachedError(
                     "CasADi cannot serialize the model, by which the cache would know its library."
-                    if key is None
-                    else "its library is not in the cache; qpmhe.compile makes it."
+                )
+            found = cached_library(MAIN, key, fault)
+            if found is None:
+                failure = known_failure(MAIN, key)
+                raise NotCachedError(
+                    "its library is not in the cache; qpmhe.compile makes it."
+                    + (f" Compiling failed: {failure}" if failure else "")
                 )
         else:
             found = compiled_library(
-                lambda: _engine_files(model, layout, record), MAIN, key, fault
+                lambda: _engine_files(model, layout, record), MAIN, key, fault, patience
             )
         self.path = Path(found._name)
         self._bind(found)

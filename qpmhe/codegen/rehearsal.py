@@ -69,10 +69,11 @@ _CANCELLED = 1e6
 
 
 def checked_library(
-    system: System, observer: Observer, cost: Cost, settings: Settings
+    system: System, observer: Observer, cost: Cost, settings: Settings,
+    patience: float | None = None,
 ) -> EstimatorLibrary:
     """The library of an estimator, compared with the Python step before its first use."""
-    return EstimatorLibrary(system, observer, cost, settings, estimator_fault)
+    return EstimatorLibrary(system, observer, cost, settings, estimator_fault, patience)
 
 
 def compiled_engine(

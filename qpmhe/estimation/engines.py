@@ -111,20 +111,24 @@ class ModelChangedError(Exception):
     """The functions differ from what was compiled; all members of a batch are as before."""
 
 
-_ENGINES: dict[str, Callable[[System, Observer, Cost, Settings, Array], Engine]] = {
-    "python": PythonEngine
-}
+Make = Callable[[System, Observer, Cost, Settings, Array], Engine]
+Prepare = Callable[[System, Observer, Cost, Settings, int], tuple[bool, str]]
+
+_ENGINES: dict[str, Make] = {"python": PythonEngine}
+_PREPARE: dict[str, Prepare] = {}
 
 
-def register_engine(
-    name: str, make: Callable[[System, Observer, Cost, Settings, Array], Engine]
-) -> None:
+def register_engine(name: str, make: Make, prepare: Prepare | None = None) -> None:
     """Register a factory for ``engine=name``, which may raise `CompilationError`.
 
     A factory named ``compiled`` also serves ``engine="auto"``. There it must raise instead of
-    compiling, and wherever it lacks a feature.
+    compiling, and wherever it lacks a feature. Before a record of so many samples, ``prepare`` then
+    makes ready what the factory needs, if that pays: it returns whether the factory can be called,
+    and why, in words that are blank where there was nothing to decide.
     """
     _ENGINES[name] = make
+    if prepare is not None:
+        _PREPARE[name] = prepare
 
 
 def engine_for(
@@ -155,6 +159,32 @@ def _at_hand(
         with suppress(Exception):
             return make(*parts)
     return PythonEngine(*parts)
+
+
+def engine_for_record(
+    engine: Engine, system: System, observer: Observer, cost: Cost, settings: Settings,
+    samples: int,
+) -> tuple[Engine, str]:
+    """The engine for a record of so many samples that begins now, and why; blank without a choice.
+
+    With ``engine="auto"``, the compiled engine may take the place of a Python engine that has no
+    sample yet: it continues with the state and the usual conditions of that one.
+    """
+    prepare = _PREPARE.get("compiled")
+    is_free = settings.engine == "auto" and engine.name == "python" and not engine.time
+    if prepare is None or not is_free or settings.needs_python or python_only():
+        return engine, ""
+    system = system.evaluated_like(engine.system)
+    is_ready, reason = prepare(system, observer, cost, settings, samples)
+    if is_ready:
+        state, usual = engine.state, engine.usual
+        with suppress(Exception):  # as for an engine that nobody asked for
+            made = _ENGINES["compiled"](system, observer, cost, settings, state)
+            made.set(usual, usual.parameters)
+            made.reset(state)
+            return made, reason
+        reason = f"the compiled step could not be made, although {reason}"
+    return engine, reason
 
 
 def engine_of_snapshot(

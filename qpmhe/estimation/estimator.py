@@ -25,7 +25,7 @@ from ..observers import Observer
 from .branches import check_branches
 from .conditions import ConditionReader, Conditions
 from .contracts import check_correction, check_observer, check_prior
-from .engines import EngineChangeError, engine_for
+from .engines import EngineChangeError, engine_for, engine_for_record
 from .estimate import Estimate
 from .estimator_memory import EstimatorMemory
 from .reach import compared
@@ -91,8 +91,9 @@ class MovingHorizonEstimator(EstimatorMemory):
         ``compiled`` generates C code for the whole step, compiles it once and caches it on disk. It
         raises an error that names any feature without a C form; without a C compiler it warns and
         falls back to the Python step. ``auto`` uses the compiled step if its library is in the
-        cache, see `qpmhe.compile`, and otherwise the Python step; it never waits for a compiler,
-        never warns, and accepts every option. The property `engine` reports the choice.
+        cache, see `qpmhe.compile`, and otherwise the Python step; it never warns, and accepts every
+        option. Only `run` waits for a compiler, before a record so long that this is earned back.
+        The property `engine` reports the choice.
     project_observer : bool
         Whether the observer's state is projected onto X after each step, in the observer's metric:
         `Observer.metric`, the inverse of its covariance, or the Lyapunov matrix of its linearised
@@ -502,8 +503,14 @@ class MovingHorizonEstimator(EstimatorMemory):
         covariances: bool = False,
         smoothed: int | None = None,
         time_unit: Any = "s",
+        may_compile: bool = True,
     ) -> Run:
         """Update with each sample of a record, starting at the current state.
+
+        With ``engine="auto"``, an estimator without samples first compiles its step if so many are
+        to come that this is earned back, by an estimate from its sizes, or takes a library that is
+        in the cache by now. It waits a minute at most, and keeps the Python step where this fails.
+        `Run.engine_reason` has the reason.
 
         Parameters
         ----------
@@ -522,6 +529,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         time_unit : str or pandas.Timedelta
             The model's unit of time, for an index of times and for figures: ``"s"``, ``"min"``,
             ``"h"``, ...
+        may_compile : bool
+            Whether ``engine="auto"`` may change the engine before the first sample.
 
         Returns
         -------
@@ -537,6 +546,7 @@ class MovingHorizonEstimator(EstimatorMemory):
             If ``smoothed`` is no lag within the window.
         """
         flag("covariances", covariances)
+        flag("may_compile", may_compile)
         if smoothed is not None:
             smoothed = count(
                 "smoothed", smoothed, 0, most=self.horizon - 1,
@@ -548,7 +558,11 @@ class MovingHorizonEstimator(EstimatorMemory):
         if us is None and self._inputs:
             self._input(None, call="run(Y, U)")
         whole = self._with_parameters(us, len(ys))
-        at_once = None
+        at_once, reason = None, ""
+        if may_compile:
+            self._engine, reason = engine_for_record(
+                self._engine, self._own_system, self.observer, self.cost, self.settings, len(ys)
+            )
         try:
             if not covariances and smoothed is None and lengths is None:
                 at_once = self._engine.run(ys, whole)
@@ -556,7 +570,7 @@ class MovingHorizonEstimator(EstimatorMemory):
             self._change_engine(change)
         if at_once is not None:
             at_once.source = self.run_source(ys, whole, time_unit=time_unit)
-            at_once.index = index
+            at_once.index, at_once.engine_reason = index, reason
             return at_once
         start, observer_start = self.state.copy(), self.observer_state
         late = None if smoothed is None else FixedLag(start, smoothed, covariances)
@@ -576,6 +590,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         if late is not None:
             run.smoothed, run.smoothed_covariances = late.smoothed()
         run.source, run.index = self.run_source(ys, whole, lengths, time_unit), index
+        run.engine_reason = reason
         return run
 
     def run_source(

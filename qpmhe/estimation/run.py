@@ -32,6 +32,7 @@ _PER_STEP = (
     "filtered", "costs", "candidate_costs", "times", "solve_times", "qps", "solver_iterations",
     "rejected_sensors",
 )
+_TEXTS = ("engine", "engine_reason")
 
 
 class RunSource(NamedTuple):
@@ -130,6 +131,8 @@ class Run:
     engine : str
         The engine that ran the steps: ``python``, ``compiled``, or ``compiled, then python`` if the
         model changed after it was compiled.
+    engine_reason : str
+        Why `MovingHorizonEstimator.run` took this engine, where it had a choice; otherwise blank.
     elapsed, time_unit, labels : optional
         What these attributes are where there is no source that knows them.
 
@@ -154,6 +157,7 @@ class Run:
     source: RunSource | None = None
     index: pandas.Index | None = None
     # What a run that was pickled before there was this does not have.
+    engine_reason: str = ""
     _elapsed: Array | None = None
     _time_unit: str = "s"
     _labels: Sequence[str] | None = None
@@ -182,13 +186,14 @@ class Run:
         elapsed: Array | None = None,
         time_unit: str = "s",
         labels: Sequence[str] | None = None,
+        engine_reason: str = "",
     ) -> None:
         self.states, self.filtered = states, filtered
         self.costs, self.candidate_costs = costs, candidate_costs
         self.times, self.solve_times = times, solve_times
         self.qps, self.solver_iterations = qps, solver_iterations
         self.flags, self.covariances, self.engine = flags, covariances, engine
-        self.observer_states = observer_states
+        self.observer_states, self.engine_reason = observer_states, engine_reason
         self.smoothed, self.smoothed_covariances = smoothed, smoothed_covariances
         if rejected_sensors is None:
             rejected_sensors = np.zeros((flags.size, 0), np.bool_)
@@ -295,6 +300,8 @@ class Run:
         found = {
             "steps": f"{len(self)}", "states": f"{self.states.shape[1]}", "engine": self.engine,
         }
+        if self.engine_reason:
+            found["engine"] += f" ({self.engine_reason})"
         if self.has_costs or not len(self):
             found |= {"improved": f"{improved}", "candidate kept": f"{kept}"}
         if self.has_costs:
@@ -378,9 +385,10 @@ class Run:
             if isinstance(value, np.ndarray) and not name.startswith("_")
         }
         arrays |= {name: np.array(one) for name, one in self._clock().items() if one is not None}
+        arrays |= {name: np.array(getattr(self, name)) for name in _TEXTS}
         arrays |= stored_index(self.index)
         with open(path, "wb") as file:
-            np.savez_compressed(file, engine=np.array(self.engine), **arrays)
+            np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Run:
@@ -400,7 +408,9 @@ class Run:
             with np.load(path, allow_pickle=False) as file:
                 arrays = dict(file)
             index = read_index(arrays)
-            texts = {name: str(arrays[name]) for name in ("engine", "time_unit") if name in arrays}
+            texts = {
+                name: str(arrays[name]) for name in (*_TEXTS, "time_unit") if name in arrays
+            }
             if "labels" in arrays:
                 texts["labels"] = arrays["labels"].tolist()
             run = cls(**arrays | texts)

@@ -180,6 +180,10 @@ class Score:
             warnings.simplefilter("ignore", EngineWarning)
             mhe = self._estimator(system, weights, one)
             u = one.u if one.u.shape[1] else None
-            run = mhe.run(one.y, u) if one.dt is None else follow(mhe, one.start, one.y, u, one.dt)
+            # One engine for all weights, so that their scores differ by no rounding.
+            run = (
+                mhe.run(one.y, u, may_compile=False) if one.dt is None
+                else follow(mhe, one.start, one.y, u, one.dt)
+            )
         self.seconds = float(np.median(run.times))
         return run.states[1:]

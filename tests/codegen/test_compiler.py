@@ -465,7 +465,7 @@ def key_and_source(mhe, monkeypatch):
     """The key of an estimator's library, and its source without the data at its end."""
     found = []
 
-    def capture(files, main, key, check):
+    def capture(files, main, key, check, patience):
         code, mark, _ = files()["mhe.c"].partition("/* Weights, gain, sets")
         assert mark
         found.append((key, files()["mhe.h"] + code))
