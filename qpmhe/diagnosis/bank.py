@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..codegen.filters import HypothesisInput, HypothesisLibrary, scalar_model
 from ..errors import CompilationError
 from ..estimation.engines import python_only
+from ..model.expressions import CasadiModel
 from ..model.system import System
 
 Array = NDArray[np.float64]
@@ -31,13 +32,16 @@ _OUTLIER = 4.0
 _MOST_OUTLIERS = 0.5
 # Samples without any measurement that make a gap, and measured ones after it that are no evidence.
 _GAP = 10
-# Seconds that NumPy takes for a sample of a filter, and a compiler for a library and for each of
-# the model's operations, roughly; a library is compiled where it saves so many times as much.
-_RUNNING, _LIBRARY, _COMPILING, _PAYS = 8e-6, 0.5, 4e-3, 3.0
+# Seconds that NumPy takes for a sample of a filter, and for each entry of its covariance, and a
+# compiler for a library and for each of the model's operations, roughly; a library is compiled
+# where it saves so many times as much.
+_RUNNING, _ENTRY, _LIBRARY, _COMPILING, _PAYS = 8e-6, 1e-7, 0.5, 4e-3, 3.0
 # Samples on which both filters are compared, and the difference that is no rounding.
 _COMPARED, _ROUNDING = 40, 1e-6
-# Of systems that were asked for one; None where it was not to be had.
-_libraries: WeakKeyDictionary[System, HypothesisLibrary | None] = WeakKeyDictionary()
+# Of systems that were asked for one, by the filters' kind; None where it was not to be had.
+_libraries: WeakKeyDictionary[
+    System, dict[tuple[int, ...], HypothesisLibrary | None]
+] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +119,8 @@ class FilterBank:
     ) -> None:
         self.system, self.before, self.steps, self._loss = system, before, steps, loss
         self._filters = filters
+        #: Which filters of the system's they are: those of a kind have one library.
+        self.kind: tuple[int, ...] = ()
         #: Length of the state that is filtered.
         self.n = system.n
         #: The first thing that the model has raised.
@@ -221,7 +227,7 @@ class FilterBank:
 
     def _run(self, hypotheses: Sequence[Hypothesis], usual: Hypothesis) -> Filtered:
         """Filter the record under hypotheses of this model, with units and evidence of `usual`."""
-        library = self._compiled(usual)
+        library = self._compiled(hypotheses[0])
         found = None if library is None else self._run_in_c(library, hypotheses, usual)
         return self._run_in_numpy(hypotheses, usual) if found is None else found
 
@@ -280,16 +286,16 @@ class FilterBank:
                 alive = good
                 x[~good], covariance[~good] = start[~good], prior[~good]
                 e[~good], c[~good], spread[~good], transposed[~good] = 0.0, 0.0, eye_p, 0.0
+            factor = _each(np.linalg.cholesky, spread, alive)
             inverse = _each(np.linalg.inv, spread, alive)
             gain = transposed @ inverse
             if self._loss is None:
                 cost = 0.5 * np.einsum("hi,hij,hj->h", e, inverse, e)
                 move = np.einsum("hij,hj->hi", gain, e)
             else:
-                factor = _each(np.linalg.cholesky, spread, alive)
                 cost, used = self._loss(np.asarray(np.linalg.solve(factor, e[..., None]))[..., 0])
                 move = np.einsum("hij,hjk,hk->hi", gain, factor, used)
-            logs[t] -= cost + 0.5 * np.linalg.slogdet(spread)[1]
+            logs[t] -= cost + np.log(np.einsum("hii->hi", factor)).sum(axis=1)
             first.states[t], first.outputs[t], first.gains[t] = x[0], c[0], gain[0]
             first.innovations[t] = np.where(seen[0] & alive[0], e[0], np.nan)
             first.spreads[t], first.weights[t] = spread[0], inverse[0]
@@ -345,50 +351,57 @@ class FilterBank:
         if 0 in failed:
             return None
         self._judge(hypotheses, usual, first.logs, there, left_out)
-        if failed:  # as NumPy has them
-            some = self._run_in_numpy([hypotheses[k] for k in (0, *failed)], usual)
-            first.logs[:, failed] = some.logs[:, 1:]
+        first.logs[:, failed] = -np.inf
         first.innovations[_recovering_of(usual)] = np.nan
         _in_outputs(first, unit)
         return first
 
     def _in_c(self, one: Hypothesis, unit: Array) -> HypothesisInput:
         system, (total, p) = self.system, one.measurements.shape
-        inputs = self.full_inputs(one.inputs, one.step)
-        if not self._is_timed:
-            inputs = np.column_stack((inputs, np.full(total, system.dt or 0.0)))
-        states, residual, periods = system.states, system.output_residual, np.zeros(p)
+        low, high = np.full(self.n, -np.inf), np.full(self.n, np.inf)
+        residual, periods = system.output_residual, np.zeros(p)
+        if system.states is not None:
+            low[: system.n], high[: system.n] = system.states.lower, system.states.upper
         if residual is not None:
             periods[list(residual.components)] = residual.periods
         return HypothesisInput(
             one.start, one.prior, one.disturbance, one.noise / np.multiply.outer(unit, unit),
-            np.where(np.isfinite(one.measurements), one.measurements, 0.0), inputs,
-            np.isfinite(one.measurements), unit,
-            np.full(self.n, -np.inf) if states is None else states.lower,
-            np.full(self.n, np.inf) if states is None else states.upper, periods,
+            np.where(np.isfinite(one.measurements), one.measurements, 0.0),
+            self._inputs_in_c(one), np.isfinite(one.measurements), unit, low, high, periods,
             np.ones(total, np.int64) if one.repeats is None else one.repeats.astype(np.int64),
             int(one.noise.ndim > 2), int(one.outliers), 1.0 if self._is_timed else one.step,
             _OUTLIER, _WIDTH, _EXTREME, _INLYING,
         )
 
+    def _inputs_in_c(self, one: Hypothesis) -> Array:
+        """The inputs of `_model_in_c`, and the length of each step."""
+        inputs = self.full_inputs(one.inputs, one.step)
+        lengths = [] if self._is_timed else [np.full(len(inputs), self.system.dt or 0.0)]
+        return np.column_stack((inputs, *lengths))
+
+    def _model_in_c(self, model: CasadiModel) -> CasadiModel:
+        """What is compiled of the system's model."""
+        return model
+
     def _compiled(self, one: Hypothesis) -> HypothesisLibrary | None:
         """The library of this model, if it saves more time than it takes to compile it."""
         system, residual = self.system, self.system.output_residual
         if (
-            type(self) is not FilterBank or self._loss is not None or python_only()
+            self._loss is not None or python_only()
             or (residual is not None and residual.periods is None)
             or (system.states is not None and system.turns is not None)
         ):
             return None
-        if system in _libraries:
-            return _libraries[system]
+        libraries = _libraries.setdefault(system, {})
+        if self.kind in libraries:
+            return libraries[self.kind]
         model = scalar_model(system.evaluated_by(system.model()).symbolic)
         if model is None:
             return None
+        model = self._model_in_c(model)
         operations = model.step().n_instructions() + model.h.n_instructions()
-        if self._filters * len(one.measurements) * _RUNNING < _PAYS * (
-            _LIBRARY + operations * _COMPILING
-        ):
+        saved = self._filters * len(one.measurements) * (_RUNNING + _ENTRY * self.n**2)
+        if saved < _PAYS * (_LIBRARY + operations * _COMPILING):
             return None
         part = one.first(_COMPARED)
 
@@ -405,10 +418,10 @@ class FilterBank:
             return ""
 
         try:
-            _libraries[system] = HypothesisLibrary(model, fault)
+            libraries[self.kind] = HypothesisLibrary(model, fault)
         except CompilationError:
-            _libraries[system] = None
-        return _libraries[system]
+            libraries[self.kind] = None
+        return libraries[self.kind]
 
     def _judge(
         self, hypotheses: Sequence[Hypothesis], usual: Hypothesis, logs: Array, there: Mask,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from ..model.expressions import CasadiModel, import_casadi
 from .bank import Array, Batch, FilterBank, Hypothesis
 from .faults import Evidence, Fault
 
@@ -20,6 +22,8 @@ _SHARES = ((0.01, 1.0), (0.5, 0.5), (1.0, 1.0), (1.0, 4.0), (0.01, 4.0))
 _SOON, _LIMIT, _MOST = 5, 2.5, 3
 # Up to this length of the state, all sensors have one in the same filters.
 _SMALL = 8
+# Filters that a search runs of each kind, roughly.
+_FILTERS = 60
 
 
 class MemoryBank(FilterBank):
@@ -33,9 +37,11 @@ class MemoryBank(FilterBank):
     """
 
     def __init__(self, bank: FilterBank, sensors: Sequence[int]) -> None:
-        super().__init__(bank.system, bank.steps, bank.before)
+        super().__init__(bank.system, bank.steps, bank.before, filters=_FILTERS)
         self._bank, self._sensors = bank, list(sensors)
         self.n = bank.system.n + len(self._sensors)
+        # In C, a single memory is that of any sensor.
+        self.kind = (-1,) if len(self._sensors) == 1 else tuple(self._sensors)
 
     def full_inputs(self, inputs: Array, step: float = 1.0) -> Array:
         """The inputs of the model, with a, b, c and d behind."""
@@ -84,6 +90,41 @@ class MemoryBank(FilterBank):
             return found
 
         return following, outputs, following_jacobian, outputs_jacobian
+
+    def _model_in_c(self, model: CasadiModel) -> CasadiModel:
+        """A map of (x, s), with the length of the step behind the inputs, and then a, b, c and d.
+
+        b and c are matrices, and d has a number for each sensor.
+        """
+        ca, n, m, memories = import_casadi(), model.n, model.m, len(self._sensors)
+        which = self._pattern
+        z, u, a = ca.SX.sym("z", n + memories), ca.SX.sym("u", m + 1), ca.SX.sym("a", memories)
+        b, c, d = ca.SX.sym("b", which.T), ca.SX.sym("c", which), ca.SX.sym("d", model.p)
+        x, s, shown = z[:n], z[n:], model.h(z[:n], u[:m])
+        inputs = ca.vertcat(u, a, *b.nonzeros(), *c.nonzeros(), d)
+        following = ca.vertcat(model.step()(x, u[:m], u[m]), a * s + ca.mtimes(b, shown))
+        return CasadiModel(
+            ca.Function("f", [z, inputs], [ca.densify(following)]),
+            ca.Function("h", [z, inputs], [ca.densify(d * shown + ca.mtimes(c, s))]),
+            n + memories, model.p, inputs.numel(),
+        )
+
+    @property
+    def _pattern(self) -> Any:
+        """Where c is not 0: one memory may be that of any sensor."""
+        ca, p = import_casadi(), self.system.p
+        one = len(self._sensors) == 1
+        return ca.Sparsity.dense(p, 1) if one else ca.DM.eye(p)[:, self._sensors].sparsity()
+
+    def _inputs_in_c(self, one: Hypothesis) -> Array:
+        some, p = self._sensors, self.system.p
+        own = replace(one, inputs=one.inputs[:, : self.system.m])
+        a, b, c, d = one.inputs[:, self.system.m :].reshape(len(one.inputs), 4, -1).swapaxes(0, 1)
+        if len(some) == 1:
+            b, c = (each * np.eye(p)[some] for each in (b, c))
+        all_d = np.ones((len(d), p))
+        all_d[:, some] = d
+        return np.column_stack((self._bank._inputs_in_c(own), a, b, c, all_d, np.zeros(len(d))))
 
     def hypothesis(
         self, base: Hypothesis, part: Sequence[int], memory: tuple[float, ...], white: float,

@@ -148,14 +148,14 @@ def moments(signatures: list[Signature], null: Filtered) -> tuple[Array, Array]:
     there = np.isfinite(null.innovations)
     errors = np.where(there, null.innovations, 0.0)
     moved = np.zeros(states.shape[1:])
-    against, own = np.zeros(len(signatures)), np.zeros((len(signatures), len(signatures)))
+    shown = outputs * there[:, :, None]
     for t in range(len(outputs)):
-        shown = null.outputs[t] @ moved + outputs[t] * there[t][:, None]
-        weighted = null.weights[t] @ shown
-        against += errors[t] @ weighted
-        own += shown.T @ weighted
-        moved = null.transitions[t] @ (moved - null.gains[t] @ shown) + states[t]
-    return against, own
+        shown[t] += null.outputs[t] @ moved
+        moved = null.transitions[t] @ (moved - null.gains[t] @ shown[t]) + states[t]
+    # All samples at once: W shown, and shown' W shown.
+    weighted, k = null.weights @ shown, len(signatures)
+    own = shown.reshape(-1, k).T @ weighted.reshape(-1, k)
+    return np.asarray(errors.ravel() @ weighted.reshape(-1, k)), np.asarray(own)
 
 
 def with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -> Fault:

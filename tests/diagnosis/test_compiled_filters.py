@@ -8,6 +8,7 @@ import pytest
 import qpmhe
 from qpmhe.diagnosis import bank
 from qpmhe.diagnosis.bank import FilterBank, Hypothesis
+from qpmhe.diagnosis.sensor_memory import MemoryBank
 
 
 def hypotheses(name, unit=1.0, vague=1.0, steps=80):
@@ -65,6 +66,52 @@ def test_all_that_a_bank_says_is_the_same(name, monkeypatch):
     check_same(filters.run(vague), FilterBank(system, None).run(vague), 1e-5)
 
 
+def _with_memory(system, tried, sensors, filters=10**9):
+    """The filters with a memory of some sensors, of all and of the last of these alone."""
+    memories = MemoryBank(FilterBank(system, None), sensors)
+    memories._filters = filters
+    return memories, [
+        memories.hypothesis(base, part, *memory)
+        for base in tried for part in (sensors, sensors[-1:])
+        for memory in (((0.9, 0.0, 1.0, 1.0), 0.5, 0.5), ((0.7, 0.3, 0.7, 0.3), 1.0, 0.0))
+    ]
+
+
+@pytest.mark.parametrize("name", [
+    "van_der_pol", "pendulum", "vehicle", "batch_reactor", "cstr", "battery_cell",
+    pytest.param("quadrotor", marks=pytest.mark.slow),
+    pytest.param("chain_of_masses", marks=pytest.mark.slow),
+])
+def test_sensors_with_memory_are_filtered_as_in_numpy(name, monkeypatch):
+    system, tried = hypotheses(name)
+    # Beside a prior of 1e10, covariances of a lag keep no digits, in NumPy or in C.
+    _, vague = hypotheses(name, vague=1e6)
+    usual, p = tried[0], system.p
+    for sensors in ([p - 1], list(range(p))):
+        memories, some = _with_memory(system, tried, sensors)
+        of_vague = _with_memory(system, vague[:2], sensors)[1]
+        with np.errstate(all="ignore"):  # as a diagnosis runs them: some of the reactor's fail
+            expected = memories._run_in_numpy(some, usual)
+            expected_of_vague = memories._run_in_numpy(of_vague, usual)
+        monkeypatch.delenv("QPMHE_ENGINE", raising=False)
+        memories._run([some[0].first(40)], usual.first(40))  # compiles, and compares with NumPy
+        with monkeypatch.context() as patched:
+            patched.setattr(memories, "_run_in_numpy", lambda *_: pytest.fail("not compiled"))
+            check_same(memories._run(some, usual), expected)
+            found = memories._run(of_vague, usual).likelihoods
+        np.testing.assert_allclose(found, expected_of_vague.likelihoods, rtol=1e-6)
+
+
+def test_one_library_serves_a_memory_of_any_sensor(monkeypatch):
+    system, tried = hypotheses("vehicle")
+    monkeypatch.delenv("QPMHE_ENGINE", raising=False)
+    for sensor in range(system.p):
+        memories, some = _with_memory(system, tried[:1], [sensor])
+        expected = memories._run_in_numpy(some, tried[0])
+        check_same(memories._run(some, tried[0]), expected)
+    assert [kind for kind, one in bank._libraries[system].items() if one is not None] == [(-1,)]
+
+
 def test_a_filter_that_fails_counts_as_in_numpy(monkeypatch):
     system = qpmhe.System(lambda x: x**3, lambda x: x, n=1, p=1)
     one = np.eye(1)
@@ -101,7 +148,7 @@ def test_a_diagnosis_in_c_says_the_same(monkeypatch):
     monkeypatch.setattr(bank, "_PAYS", 0.0)
     assert str(qpmhe.diagnose(run)) == expected
     assert "1." in expected
-    assert any(one is not None for one in bank._libraries.values())
+    assert any(one is not None for some in bank._libraries.values() for one in some.values())
 
 
 def test_few_filters_are_not_compiled_nor_those_without_a_form(monkeypatch):
