@@ -41,6 +41,10 @@ DAMPING, MORE_DAMPING, LESS_DAMPING, OLD_DAMPING = 1e-4, 4.0, 1.0 / 3.0, 0.1
 #: shorter steps are tried.
 SMALLER_REGION, LARGER_REGION, WELL, POOR, SHORTER = 1.0 / 3.0, 4.0, 0.75, 0.25, 30
 
+#: The ridge of a Hessian that is singular up to rounding, as a share of its diagonal: above
+#: rounding, and far below what a useful step depends on.
+RIDGE = 1e-10
+
 #: With more damping than this, a step is rounding beside the one without.
 MOST_DAMPING = 1e16
 
@@ -83,6 +87,7 @@ LEAST_DISCOUNT = 1e-280
 LARGEST = 1e150
 
 _SINGLE = {
+    "RIDGE": 1e-4,
     "ROUNDING": 1e-6, "NEARLY": 1e-3, "FEASIBLE": 1e-5, "LARGEST": 1e15, "SAME_COVARIANCE": 1e-4,
     "IN_RANGE": 1e-4, "VAGUE": 2.0**-11, "LEAST_DISCOUNT": 1e-27,
 }
@@ -98,7 +103,7 @@ def c_definitions(prefix: str, real: str) -> str:
         "MOST_DAMPING": MOST_DAMPING, "MORE_DAMPING": MORE_DAMPING,
         "LESS_DAMPING": LESS_DAMPING, "OLD_DAMPING": OLD_DAMPING, "TOWARDS": TOWARDS,
         "LEAST_DISCOUNT": LEAST_DISCOUNT, "SMALLER_REGION": SMALLER_REGION,
-        "LARGER_REGION": LARGER_REGION, "WELL": WELL, "POOR": POOR,
+        "LARGER_REGION": LARGER_REGION, "WELL": WELL, "POOR": POOR, "RIDGE": RIDGE,
     }
     if real == "float":
         values |= _SINGLE

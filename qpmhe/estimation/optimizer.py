@@ -49,6 +49,9 @@ _ENDS = (
     | Status.TIME_UP
 )
 
+# Statuses of QPs that need no ridge.
+_FACTORISED = SolveStatus.SOLVED, SolveStatus.UNCONSTRAINED
+
 # What no longer holds where another sequence begins.
 _OUTDATED = Status.CONVERGED | Status.NO_DECREASE | Status.SOLVER_FAILED | Status.CAP_REACHED
 
@@ -571,14 +574,20 @@ class Optimizer:
         return None if solution is None else self._subproblem.lowered(qp, solution)
 
     def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
-        """Solve a QP within the time left; None if no time is left."""
-        began = perf_counter()
-        left = outcome.remaining(began)
-        if left is not None and left <= 0.0:
-            return None
-        solution = self._subproblem.solve(qp, self._solver, left)
-        outcome.count(solution.iterations, perf_counter() - began)
-        return solution
+        """Solve a QP within the time left; None if no time is left.
+
+        An unsolved one is solved again if its Hessian is singular up to rounding: with a ridge.
+        """
+        solution = None
+        while True:
+            began = perf_counter()
+            left = outcome.remaining(began)
+            if left is not None and left <= 0.0:
+                return solution
+            solution = self._subproblem.solve(qp, self._solver, left)
+            outcome.count(solution.iterations, perf_counter() - began)
+            if solution.status in _FACTORISED or not self._subproblem.give_ridge(qp):
+                return solution
 
     @staticmethod
     def _trial(problem: Problem, best: Trial, step: Array) -> Trial:

@@ -15,7 +15,7 @@ from qpmhe_solvers.solver import ContainedSolver
 from ..model.functions import raised_along
 from ..model.residuals import difference
 from ..model.system import System
-from ..terms.base import QuadraticModel, Trial
+from ..terms.base import QuadraticModel, Term, Trial
 from ..terms.information import window_information
 from ..terms.linearization import Span, StageTerms
 from ..terms.rows import Rows
@@ -23,10 +23,15 @@ from ..terms.soft import BEYOND, Penalties
 from ..terms.sum import rows_of_first, weight_of_first
 from .constraints import Constraints
 from .elimination import SINGULAR, Around, Eliminated, Elimination
+from .limits import RIDGE
 from .problem import Problem
 from .region import Metric
 
 Array = NDArray[np.float64]
+
+_EPSILON = float(np.finfo(np.float64).eps)
+# Share of the diagonal that is rounding for any factorisation.
+_LOST = 1e-13
 
 
 class Subproblem:
@@ -56,8 +61,10 @@ class Subproblem:
         self, system: System, constraints: Constraints, horizon: int,
         penalties: Penalties | None = None,
     ) -> None:
+        from scipy.linalg.lapack import dpbtrf  # late: twice the cost of importing NumPy
+
         n, p = system.n, system.p
-        self._n, self._p = n, p
+        self._n, self._p, self._pbtrf = n, p, dpbtrf
         self._terms = StageTerms(horizon, n, p)
         states, w, v = constraints.states, constraints.disturbances, constraints.noises
         # Bounds of states are the QP's own.
@@ -86,7 +93,9 @@ class Subproblem:
         # Multipliers of the nonlinear constraints in the last QP of the sequence, (K + 1, T).
         self._forces: Array | None = None
         self._qp: QP | None = None
-        # Its band without damping, once it has been damped; and the band of the damping, with the
+        self._terms_of_cost: tuple[Term, ...] = ()  # of the present QP
+        self._has_ridge = False
+        # Its band without damping or ridge, once it has one; and the band of the damping, with the
         # trial around which that is.
         self._undamped: Array | None = None
         self._damping: Array
@@ -133,6 +142,7 @@ class Subproblem:
             self._undamped = qp.band.copy()
         np.multiply(self._damping, mu, out=qp.band)
         qp.band += self._undamped
+        self._has_ridge = False
         if self._elimination is not None:
             rows, side = rows_of_first(problem.terms, trial)
             added = np.diag(np.sqrt(mu * self._information))
@@ -197,6 +207,27 @@ class Subproblem:
         if found is None:
             found = eliminated.restored(solver.solve(eliminated.qp, None, limit))
         return found
+
+    def give_ridge(self, qp: QP) -> bool:
+        """Give a QP whose Hessian is singular up to rounding a ridge; whether it has got one.
+
+        Vague priors, and weights that a loss takes from outliers, leave such a Hessian. Whether it
+        has a factor, and where a solver stops, is then rounding.
+        """
+        if self._has_ridge or qp is not self._qp or self._elimination is not None:
+            return False
+        diagonal, less = qp.band[:, :, 0], qp.band.copy()
+        less[:, :, 0] -= _LOST * diagonal
+        if self._pbtrf(less.reshape(qp.size, -1).T, lower=1, overwrite_ab=1)[1] == 0:
+            return False
+        self._has_ridge = True
+        if self._undamped is None:
+            self._undamped = qp.band.copy()
+        weights = np.zeros_like(diagonal)
+        for term in self._terms_of_cost:
+            term.add_weights(weights)
+        diagonal += RIDGE * diagonal + _EPSILON * weights
+        return True
 
     def correct_rows(self, qp: QP, problem: Problem, around: Trial, trial: Trial) -> None:
         """Shift the rows of the QP around a trajectory by its linearisation error at a trial.
@@ -291,7 +322,8 @@ class Subproblem:
 
     def _assemble(self, problem: Problem, trial: Trial, span: Span, is_candidate: bool) -> QP:
         stages, qp = len(trial.trajectory), self._qp
-        self._undamped = None
+        self._undamped, self._has_ridge = None, False
+        self._terms_of_cost = problem.terms
         if qp is None or qp.stages != stages:
             qp = self._new_qp(stages)
         self._minus_jacobian, functions, slopes = span.minus_jacobian, self._functions, None

@@ -289,6 +289,9 @@ class Term(ABC):
     def magnitude(self, trial: Trial) -> float:
         """The sum of the absolute values that cancel in the term, as far as it is a square."""
 
+    def add_weights(self, diagonal: Array) -> None:
+        """Add the term's weights of x_0 and w, untouched by a loss, to a diagonal (K + 1, n)."""
+
     def with_cost(self, cost: Cost) -> Term:
         """The term with another cost of the stages."""
         return self

@@ -328,6 +328,10 @@ class Prior(FirstStateTerm):
             return force
         return self._force(self.offset(trial))
 
+    def add_weights(self, diagonal: Array) -> None:
+        """See `Term.add_weights`."""
+        diagonal[0] += self.factor * self.weight.diagonal()
+
     def magnitude(self, trial: Trial) -> float:
         """See `Term.magnitude`."""
         offset, root = abs(self.offset(trial)), self._initial.root

@@ -152,6 +152,14 @@ class Stages(Term):
             last = bands[-1]
         model.last_band[...] = last
 
+    def add_weights(self, diagonal: Array) -> None:
+        """See `Term.add_weights`."""
+        weights = self._with_factors(np.broadcast_to(
+            self.weights, (len(diagonal) - 1, *self.weights.shape[-2:])
+        ))
+        n = diagonal.shape[1]
+        diagonal[1:] += np.diagonal(weights, axis1=1, axis2=2)[:, :n]
+
     def magnitude(self, trial: Trial) -> float:
         """See `Term.magnitude`."""
         residuals, weights = abs(trial.residuals), abs(self.weights)

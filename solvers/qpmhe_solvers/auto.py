@@ -55,7 +55,8 @@ class AutoSolver(Solver):
                 return answer
             exact = None
         solution = self._banded._solve(qp, start)
-        if solution.status is SolveStatus.SOLVED:
+        if solution.status is SolveStatus.SOLVED or not (qp.bounded or qp.rows):
+            # Without inequalities, no other solver finds more than rounding in a singular Hessian.
             return solution
         if exact is not None:
             answer = self._exactly(exact, qp, _left(until))

@@ -264,7 +264,7 @@ class Regression(NamedTuple):
         unit = np.maximum(1e-6 * np.abs(self.certified), 1e-4 * self.deviations)
         return float(np.max(np.abs(b - self.certified) / unit))
 
-    def estimator(self, start, form, max_qps, engine):
+    def estimator(self, start, form, max_qps, engine, backend="auto"):
         """Constant parameters as states, fitted to a window of all measurements.
 
         With a wide form, the states have bounds that are far away.
@@ -289,16 +289,16 @@ class Regression(NamedTuple):
                 noise=[[self.sigma**2]],
             ),
             horizon=len(self.y), initial_state=start, max_qps=max_qps, tolerance=1e-13,
-            engine=engine,
+            engine=engine, backend=backend,
         )
 
-    def fit(self, start, form, max_qps, engine):
+    def fit(self, start, form, max_qps, engine, backend="auto"):
         """The estimate after the last measurement; without QPs before it."""
         samples = [*zip(self.y[:, None], self.x[:, None], strict=True)]
         before = self.estimator(start, form, 0, engine)
         for y, u in samples[:-1]:
             before.update(y, u)
-        mhe = self.estimator(start, form, max_qps, engine)
+        mhe = self.estimator(start, form, max_qps, engine, backend)
         mhe.load_state_dict(before.state_dict())
         return mhe.update(*samples[-1])
 

@@ -54,6 +54,24 @@ def test_damped_steps_and_small_disturbances(name, start, form):
     check(name, start, form, "python")
 
 
+@pytest.mark.parametrize("engine", [
+    "python",
+    pytest.param("compiled", marks=pytest.mark.skipif(
+        find_compiler() is None, reason="there is no C compiler"
+    )),
+])
+@pytest.mark.parametrize("form", ["small", "wide small"])
+def test_hessians_that_are_singular_up_to_rounding(form, engine):
+    """Vague priors, small disturbances: whether H has a factor is rounding, the end is not."""
+    data, solved = regression("Rat43"), 0
+    for seed in range(6):
+        moved = np.random.default_rng([seed, 7]).uniform(-0.05, 0.05, data.start.size)
+        estimate = data.fit(data.start * (1.0 + moved), form, 100, engine)
+        assert not estimate.status & (Status.SOLVER_FAILED | Status.SOLVER_STOPPED)
+        solved += data.missed(estimate.filtered) < 1 and Status.CONVERGED in estimate.status
+    assert solved >= 4
+
+
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 @pytest.mark.parametrize(("form", "name", "start"), [
     *(("set", name, "start") for name in HARD),

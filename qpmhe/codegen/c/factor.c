@@ -15,10 +15,6 @@
 @
 #define WIDTH MHE_PANEL_WIDTH
 
-/* The ridge of a Hessian that is singular up to rounding, as shares of its diagonal and of the weights'
- * that losses have not touched: above rounding, and far below what a useful step depends on. */
-#define RIDGE (sizeof(real) == 8 ? (real)1e-10 : (real)1e-4)
-
 /* hessian = A' Q A + C' R C (upper half), coupling = -A' Q, own = -(A' Q w + C' R v). */
 static void mhe_set_own_terms(const real *Q, const real *R, const real *w, const real *v,
                               mhe_terms *t)
@@ -165,7 +161,7 @@ static void mhe_assemble(mhe_estimator *e, mhe_workspace *k, const real *offset)
                                     : mhe_disturbance_weight(s, mhe_stage_at(e, i - 1));
         for (int r = 0; r < NX; r++) {
             real *pivot = k->panels + (i * NX + r) * WIDTH + r;
-            *pivot += RIDGE * *pivot + EPSILON * factors[i] * weight[r * NX + r];
+            *pivot += MHE_RIDGE * *pivot + EPSILON * factors[i] * weight[r * NX + r];
         }
     }
 }
