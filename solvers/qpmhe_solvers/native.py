@@ -127,12 +127,14 @@ class NativeSolver(Solver):
             self._limit(workspace.handle, self.time_limit)
         point = None if start is None else np.ravel(start)
         answer = self._run(workspace.handle, layout, point, self._kept_duals(workspace, qp))
-        if answer.sound and _finite(answer.x) and _finite(answer.duals):
+        sound = answer.sound and (answer.solved or self._may_stop)
+        if sound and _finite(answer.x) and _finite(answer.duals):
             workspace.duals, workspace.shifts = answer.duals, self._shifts
             if len(self._workspaces) == self.kept:
                 del self._workspaces[next(iter(self._workspaces))]  # the longest unused
             self._workspaces[key] = workspace
         else:
+            self._drop_scale(qp)
             if len(self._layouts) == self.kept:
                 del self._layouts[next(iter(self._layouts))]
             self._layouts[key[:2]] = layout

@@ -166,6 +166,10 @@ class Scaling:
         """Drop the scales: the next one is that of the next QP alone."""
         self._scales.clear()
 
+    def drop(self, key: int) -> None:
+        """Drop the scale of this key, as that of a QP which tells nothing of the next ones."""
+        self._scales = [scale for scale in self._scales if scale.key != key]
+
     def _hold(self, sizes: tuple[int, int, int]) -> None:
         """Make room for QPs of these sizes."""
         self.qp, self._peaks = QP(*sizes), Peaks(*sizes)

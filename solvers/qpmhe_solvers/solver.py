@@ -166,7 +166,23 @@ class Solver(ABC):
             first, solution = solution, self._answer(qp, scale, scaled, usable)
             if first.iterations is not None and solution.iterations is not None:
                 solution.iterations += first.iterations
+        if solution.status is not SolveStatus.SOLVED and not self._may_stop:
+            self._drop_scale(scaled)
         return solution
+
+    @property
+    def _may_stop(self) -> bool:
+        """Whether a cap or a time limit asks for answers that are not solved."""
+        return self.options.max_iterations is not None or self.time_limit is not None
+
+    def _drop_scale(self, scaled: QP) -> None:
+        """Let the next QP have a scale of its own.
+
+        That of an infeasible QP is as large as its misses: a good one would be solved to the
+        tolerance in these units only.
+        """
+        if self._scaling is not None:
+            self._scaling.drop(scaled.key)
 
     def _answer(self, qp: QP, scale: Scale, scaled: QP, usable: Array | None) -> Solution:
         """Solve the scaled QP, and judge."""

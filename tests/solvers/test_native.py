@@ -168,7 +168,7 @@ class Kept(NativeSolver):
     package, style = "numpy", QPStyle("dense")
 
     def __init__(self, warm_start):
-        super().__init__(SolverOptions(warm_start=warm_start))
+        super().__init__(SolverOptions(max_iterations=1, warm_start=warm_start))
         self.starts = []
 
     def _set_up(self, layout):

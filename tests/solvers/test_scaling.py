@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from qpmhe_solvers import QP, SolverOptions, SolveStatus, create
+from qpmhe_solvers.sample_qps import sample
 from qpmhe_solvers.scaling import Scaling
 
-from .problems import CASES, EVERY, TIGHT, in_units, make, of_order_one
+from .problems import CASES, EVERY, TIGHT, WITH_INEQUALITIES, in_units, make, of_order_one
 
 # Methods of first order, and those that look at other residuals than ours, are less accurate.
 ACCURACY = {"scs": 1e-4, "ecos": 1e-4, "qpsolvers:piqp": 1e-4, "qpsolvers:proxqp": 1e-4}
@@ -133,3 +134,35 @@ def test_a_badly_scaled_qp_does_not_end_the_process():
     qp, _ = make(2, 3, 2, seed=406, bounds="all", sides="mixed")
     qp = in_units(qp, np.array([1e-8, 1.0, 1e9]), 0.01, np.array([1.0, 1e-8]))
     assert create("highs", SolverOptions(time_limit=10.0), isolated=True).solve(qp).status is SOLVED
+
+
+def impossible(far):
+    """An infeasible QP that asks for far more than the good ones: rows that exclude each other."""
+    qp = sample(6, 2, 2, bounds="all", sides="two", seed=8)
+    qp.row_own[2], qp.row_next[2] = 1.0, 0.0
+    qp.row_lower[2], qp.row_upper[2] = [far, -2.0 * far], [2.0 * far, -far]
+    return qp
+
+
+@pytest.mark.parametrize("name", WITH_INEQUALITIES)
+def test_an_infeasible_qp_leaves_no_scale_to_the_next_one(name):
+    """In its units the next QP's tolerance is loose: PIQP called errors of 2e-3 solved."""
+    for far in (50.0, 300.0, 1000.0):
+        for push in (1.0, 0.1, 0.03):
+            qp = sample(6, 2, 2, bounds="all", sides="two", seed=9, push=push)
+            solver, fresh = create(name), create(name)
+            assert solver.solve(impossible(far)).status is not SolveStatus.SOLVED
+            found, wanted = solver.solve(qp), fresh.solve(qp)
+            assert found.status is wanted.status
+            # Two fresh solvers of ProxQP may differ in the last digits.
+            np.testing.assert_allclose(found.d, wanted.d, rtol=0, atol=1e-7)
+
+
+def test_a_cap_keeps_the_scale_of_what_it_stops():
+    """There such answers are usual, and the next QP starts from the last multipliers."""
+    pytest.importorskip("osqp")
+    solver = create("osqp", SolverOptions(max_iterations=3))
+    for seed in range(3):
+        qp = sample(6, 2, 2, bounds="all", sides="two", push=1.0 + 0.01 * seed)
+        assert solver.solve(qp).status is SolveStatus.STOPPED
+    assert len(solver._workspaces) == 1
