@@ -191,6 +191,7 @@ MENDED = {
     70000051: 20,  # Python's exact solution with soft rows was not finite, and raised
     60000182: 40,  # rows that are missed by little, and cost much
     71000100: None,  # C shortened a step from outside of the sets
+    21000104: 40,  # rows whose first weights in the interior point left H without a factor
 }
 
 

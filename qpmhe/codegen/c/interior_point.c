@@ -7,6 +7,10 @@
 #define SMALL (real)1e-3
 /* Products at the start of the way to the nearest point, in squares of the miss. */
 #define GENEROUS (real)1e4
+/* Where rounding cannot bear the weights of such products beside the Hessian, it starts so many
+ * times more, from products that are smaller by this factor. */
+#define STARTS 4
+#define SMALLER (real)1e-3
 
 /* The sign of a row's value in the slack of one of its sides. */
 static real mhe_sign(int side) { return side ? -1 : 1; }
@@ -189,8 +193,9 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     const real scale = mhe_max(promise, outside * outside);
     /* Generous products: from smaller ones it creeps on some QPs. The way to the nearest point promises
      * nothing, and may cost much more than the square of the miss. */
-    const real product = (nearest ? GENEROUS : 1) * mhe_max(scale, EPSILON * EPSILON);
+    real product = (nearest ? GENEROUS : 1) * mhe_max(scale, EPSILON * EPSILON);
     const int sides = mhe_start(q, rows, missed, reach, product);
+    int starts = 0;
     if (!sides) return STOPPED;
     for (*iterations = 0;; ++*iterations) {
         real infeasible, length = 1, target = 0;
@@ -214,8 +219,14 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
             if (infeasible > SMALL && infeasible > SHARE * far) return STOPPED;
             far = infeasible;
         }
-        if (!mhe_factorise_rows(e, k))
-            return *iterations ? mhe_give_up(q, rows, products, scale) : FAILED;
+        if (!mhe_factorise_rows(e, k)) {
+            if (*iterations > starts) return mhe_give_up(q, rows, products, scale);
+            if (starts == STARTS) return FAILED;
+            starts++;
+            product *= SMALLER;
+            mhe_start(q, rows, missed, reach, product);
+            continue;
+        }
         for (int corrector = 0; corrector < 2; corrector++) {
             if (!mhe_set_direction(e, k, target))
                 return *iterations ? mhe_give_up(q, rows, products, scale) : FAILED;
