@@ -205,6 +205,15 @@ def test_engines_that_differed_agree(seed, samples):
     assert counts["compared"] >= (samples or 60)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+def test_a_kept_factor_is_used_for_its_own_rows():
+    """Not where the next first guess leaves some out: a correction ended elsewhere than its QP."""
+    counts, faults, words = run(60000062, "compiled", samples=80)
+    assert faults == [], words
+    assert counts["compared"] >= 80
+
+
 @pytest.mark.parametrize(("event", "seed"), [
     ("restored", 94), ("restarted", 64), ("restored", 104), ("restarted", 77),
 ])

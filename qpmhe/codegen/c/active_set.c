@@ -148,8 +148,8 @@ static real mhe_limit_of(const mhe_rows *q, int i)
 }
 
 /* The first guess is the active set that was left there, as far as its limits exist; how many rows
- * are in it. Without iterations, all rows are left out. */
-static int mhe_first_guess(mhe_rows *q, int rows, int limit)
+ * are in it. Without iterations, all rows are left out. `again`: whether the last factor is theirs. */
+static int mhe_first_guess(mhe_rows *q, int rows, int limit, int *again)
 {
     int active = 0;
     for (int i = 0; i < rows; i++) {
@@ -160,6 +160,7 @@ static int mhe_first_guess(mhe_rows *q, int rows, int limit)
         else if (!(fabs(mhe_limit_of(q, i)) <= FARTHEST * q->deviation[i])) q->place[i] = BETWEEN;
         if (limit == 0) q->place[i] = BETWEEN;
         mhe_guess_soft(q, i, place);
+        *again &= q->place[i] == place;
         active += q->place[i] != BETWEEN;
     }
     return active;
@@ -267,7 +268,7 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
     const int size = (e->length + 1) * NX, rows = mhe_row_stages(e) * ROWS;
     const real tolerance = e->settings->solver_tolerance / 100;
     mhe_rows *q = &k->rows;
-    int active = mhe_first_guess(q, rows, limit), sharp = 0;
+    int active = mhe_first_guess(q, rows, limit, &again), sharp = 0;
     mhe_guess guess = {0, rows + 1, 0};
     for (*iterations = 0;; again = 0) {
         real open = 0, energy = 0, last = INFINITY, left = 0, moved = 0;
