@@ -298,3 +298,23 @@ def test_where_nothing_is_proved_in_advance_there_is_no_guard(bound):
     stated = Monitor(gaussian, estimator(bound), initial_error=START, guard=True,
                      sizes=Sizes(W, V))
     assert stated.unguarded == ""
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"constraints": [qpmhe.Constraint(lambda x: x[:1] ** 2 - 4.0)]},
+     "nonlinear constraints, whose set need not be convex"),
+    ({"state_residual": qpmhe.angles([0])}, "angles among its states"),
+    ({"f": lambda x: np.array([0.5 * float(x[0])])}, "the observer's bound is sampled, not proved"),
+])
+def test_systems_without_a_convex_set_or_a_proof_have_no_guard(options, words):
+    """Their observer has a bound, which a monitor without a guard gives."""
+    system = qpmhe.System(**{"f": lambda x: 0.5 * x, "h": lambda x: 1.0 * x, "n": 1, "p": 1}
+                          | options)
+    observer, cost = qpmhe.Luenberger([[0.1]]), unit_cost()
+    found = bound_observer(
+        system, observer, cost, box(-1.0, 1.0), sizes=Sizes(box(-0.01, 0.01), box(-0.01, 0.01)))
+    mhe = qpmhe.MovingHorizonEstimator(system, observer, cost, horizon=2, initial_state=[0.0])
+    assert np.isfinite(Monitor(found, mhe, initial_error=0.1).check(mhe.update([0.1])).error)
+    mhe.reset()
+    with pytest.raises(CertificateError, match=f"there is no guard: .*{words}"):
+        Monitor(found, mhe, initial_error=0.1, guard=True)
