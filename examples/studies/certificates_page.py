@@ -44,9 +44,15 @@ bounds for disturbances |w| and noises |v| up to the sizes given, and the larges
 adversary found who knows the model, chooses every disturbance and every noise anew, and starts the
 observer at the true state. `make certificates` makes it.
 
-| system | region | \\|w\\|, \\|v\\| | CPU time | observer: bound | worst | factor \
-| around it: x̂ within | worst | factor | guarded x̂ in advance: bound | worst | factor |
-|---|---|---|---|---|---|---|---|---|---|---|---|---|
+| system | region | diameter | \\|w\\|, \\|v\\| | CPU time |
+|---|---|---|---|---|
+{places}
+
+*CPU time* is that of `certify`, and of finding the gain where it was synthesised (†).
+
+| system | observer: bound | worst | factor | around it: x̂ within | worst | factor \
+| guarded x̂ in advance: bound | worst | factor |
+|---|---|---|---|---|---|---|---|---|---|
 {first}
 
 *Observer*: |x - z| in the limit, from `certificate.observer_bound`. *Around it*: the farthest point
@@ -54,11 +60,10 @@ from x̂ of the set around z that holds the true state, at the time of the worst
 `certificate.bound(run)`; the estimator has two QPs a sample. *Guarded x̂*: with a guard in
 `Monitor`, the bound that is known before any measurement; the worst error is that of hostile
 estimates, far beyond the observer's state as seen from the truth, in the same runs. Lengths are
-Euclidean, in the units of the states; *CPU time* is that of `certify`, and of finding the gain
-where it was synthesised (†).
+Euclidean, in the units of the states.
 
-| system | Lyapunov: N | bound | worst | paper's theorem: N | bound | region's diameter |
-|---|---|---|---|---|---|---|
+| system | Lyapunov: N | bound | worst | paper's theorem: N | bound |
+|---|---|---|---|---|---|
 {second}
 
 *Lyapunov*: the discounted cost and the horizon of `qpmhe.certificates.design` with the
@@ -326,7 +331,7 @@ def short(value: float, *, bound: bool = False) -> str:
     return f"{float(text):,.0f}" if value >= 100 else text
 
 
-def first_line(row: Row) -> str:
+def place_line(row: Row) -> str:
     case, sizes = row.case, row.case.sizes
     sides = " x ".join(
         f"[{low:g}, {high:g}]"
@@ -336,8 +341,14 @@ def first_line(row: Row) -> str:
         sides = f"[{case.region.lower[0]:g}, {case.region.upper[0]:g}]{superscript(case.system.n)}"
     own = "" if case.observer is not None else " †"
     return (
-        f"| {case.name}{own} | {sides} | {sizes.disturbance:g}, {sizes.noise:g} "
-        f"| {row.seconds:.1f} s | {short(row.bound, bound=True)} | {short(row.observed)} "
+        f"| {case.name}{own} | {sides} | {row.certificate.diameter:.3g} "
+        f"| {sizes.disturbance:g}, {sizes.noise:g} | {row.seconds:.1f} s |"
+    )
+
+
+def first_line(row: Row) -> str:
+    return (
+        f"| {row.case.name} | {short(row.bound, bound=True)} | {short(row.observed)} "
         f"| **{row.bound / row.observed:.1f}** | {short(row.around, bound=True)} "
         f"| {short(row.estimated)} | **{row.around / row.estimated:.1f}** "
         f"| {short(2.0 * row.bound, bound=True)} | {short(row.hostile)} "
@@ -355,7 +366,7 @@ def second_line(row: Row) -> str:
     if certificate.constants:
         limit = certificate.of().result.limit(*certificate.sizes.largest)
         paper = [str(row.case.horizon), short(limit, bound=True)]
-    return f"| {row.case.name} | {' | '.join((*cells, *paper))} | {certificate.diameter:.3g} |"
+    return f"| {row.case.name} | {' | '.join((*cells, *paper))} |"
 
 
 def superscript(number: int) -> str:
@@ -368,8 +379,9 @@ def main() -> None:
         row = prepared(case)
         attack(row)
         rows.append(row)
-        print(first_line(row), second_line(row), sep="\n", flush=True)
+        print(*(line(row) for line in (place_line, first_line, second_line)), sep="\n", flush=True)
     (DOCS / "certified-systems.md").write_text(PAGE.format(
+        places="\n".join(map(place_line, rows)),
         first="\n".join(map(first_line, rows)), second="\n".join(map(second_line, rows)),
         starts=STARTS, directions="n + 4", steps=", ".join(map(str, STEPS)),
         compared=f"{sum(row.compared for row in rows):,}",
