@@ -107,12 +107,14 @@ def test_from_far_away_the_direction_decides(bound):
 
 def test_no_estimate_is_farther_than_twice_the_bound_from_any_state_of_the_set(bound):
     guard, rng, P = Guard(bound, bound.stability.system), np.random.default_rng(1), bound.metric
+    compared = 0
     for size in (1e-9, 0.1, 1.0, 1e3, 1e150):
         for _ in range(20):
             z = rng.uniform(-1.0, 1.0, 2)
             radius = float(10.0 ** rng.uniform(-3.0, 0.5))
             tube = Tube(radius, bound.components(radius) * rng.uniform(0.3, 1.0, 2))
-            found = guard(z + size * rng.standard_normal(2), z, tube)
+            estimate = z + size * rng.standard_normal(2)
+            found = guard(estimate, z, tube)
             assert not found.reason
             directions = rng.standard_normal((200, 2))
             lengths = np.sqrt(np.einsum("ki,ij,kj->k", directions, P, directions))
@@ -121,6 +123,13 @@ def test_no_estimate_is_farther_than_twice_the_bound_from_any_state_of_the_set(b
             e = truth - found.point
             assert (np.sqrt(np.einsum("ki,ij,kj->k", e, P, e)) <= 2.0 * radius * (1 + 1e-12)).all()
             assert (np.abs(e) <= 2.0 * tube.box * (1.0 + 1e-12)).all()
+            # In P, the guarded estimate is no farther from them than the estimate: RGES carries
+            # over, with the root of P's condition in Euclidean lengths.
+            inside = truth[bound.region.contains(truth)]
+            before = plain(inside - estimate, P)
+            assert (plain(inside - found.point, P) <= before * (1.0 + 1e-9)).all()
+            compared += found.acted * len(inside)
+    assert compared > 1000
 
 
 def test_no_state_in_the_set_is_named(bound):
