@@ -1,0 +1,59 @@
+"""Which models of the zoo are proved, on the regions that their records fill, and which are not."""
+
+import numpy as np
+import pytest
+
+import qpmhe
+from qpmhe.certificates import Evidence, Sizes, synthesise_gain
+from qpmhe.certificates.observer_bound import bound_observer
+from qpmhe.certificates.report import region_of
+from qpmhe.errors import ModelError
+
+from .helpers import box, unit_cost
+
+
+def stated(scenario):
+    """Boxes of three standard deviations."""
+    return Sizes(*(
+        box(-half, half) for half in (
+            3.0 * np.sqrt(np.diag(each))
+            for each in (scenario.disturbance_covariance, scenario.noise_covariance))
+    ))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["batch_reactor", "battery_cell", "cstr", "pendulum", "van_der_pol", "vehicle"])
+def test_a_gain_is_found_and_its_bound_is_proved(name):
+    """With a bound on each state that is less than the region is wide."""
+    made = qpmhe.models.catalogue()[name]()
+    system, sizes = made.system, stated(made.scenario)
+    region = region_of(system, made.scenario)
+    found = synthesise_gain(system, region, sizes=sizes.typical, seconds=600.0)
+    bound = bound_observer(
+        system, found.observer, unit_cost(system.r, system.p), region, sizes=sizes, seconds=600.0)
+    assert bound.evidence is Evidence.PROVED
+    assert bound.rate < 1.0
+    assert bound.headline.count("guarded, x_hat is within") == 1
+    assert (bound.settled.box < bound.widths).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["midpoint", "radau"])
+def test_an_implicit_step_rests_on_samples_and_says_so(method):
+    system = qpmhe.System.from_ode(
+        lambda x: -np.sin(x), lambda x: 1.0 * x, dt=0.1, n=1, p=1, method=method)
+    bound = bound_observer(
+        system, qpmhe.Luenberger([[0.1]]), unit_cost(), box(-1.0, 1.0), sizes=Sizes(0.01, 0.01))
+    assert bound.evidence is Evidence.SAMPLED
+    assert any("it is an implicit step" in note for note in bound.stability.notes)
+    assert "(sampled" in bound.headline
+    assert "guarded" not in bound.headline
+
+
+@pytest.mark.slow
+def test_a_chain_with_a_spring_without_length_is_refused():
+    """Two masses may be at the same point of the box: f has no value there."""
+    chain = qpmhe.models.chain_of_masses(masses=2).system
+    with pytest.raises(ModelError, match="f is not finite at x = .*within the region"):
+        synthesise_gain(chain, box(-np.ones(chain.n), np.ones(chain.n)))
