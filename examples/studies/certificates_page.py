@@ -80,7 +80,7 @@ on the regions that their records fill, with gains made for these;
 - **Chain of masses**: proved for one mass within 0.05 m and 0.5 m/s of its rest, for a tenth of the
   scenario's disturbances and noises, with a bound of 0.025 m and 0.23 m/s. The box around a record
   of two masses has states in which both are at the same point: a spring of length 0 has no
-  direction, and f no derivative there.
+  direction, and f no value there.
 - **Quadrotor**: on the box around its record, 12 states and 4 inputs, the program for a constant
   gain is infeasible for every rate below 1. Detectability holds at samples only: its proof needs
   more cells than the 2,722 of a minute.

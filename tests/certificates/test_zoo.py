@@ -55,5 +55,5 @@ def test_an_implicit_step_rests_on_samples_and_says_so(method):
 def test_a_chain_with_a_spring_without_length_is_refused():
     """Two masses may be at the same point of the box: f has no value there."""
     chain = qpmhe.models.chain_of_masses(masses=2).system
-    with pytest.raises(ModelError, match="f is not finite at x = .*within the region"):
+    with pytest.raises(ModelError, match=r"f is not finite at x = .*within the region"):
         synthesise_gain(chain, box(-np.ones(chain.n), np.ones(chain.n)))
