@@ -6,8 +6,8 @@ For the models of the zoo that are certified, and for other systems, with gains 
 An adversary chooses disturbances and noises at their bounds along their influence on one state's
 last error, from many starts at once, anew along each run that follows. A larger error than the
 bound stops the script. Beside it is the bound as a multiple of the largest error where each sample
-may have the Jacobian of any state of the region, as the bound allows: of no use is a search for a
-smaller one where this is near 1.
+may have the Jacobian of any state of the region, as the bound allows: where this is near 1, no
+other P and no finer cells make the bound much smaller.
 """
 
 from __future__ import annotations
