@@ -56,10 +56,11 @@ class Case(NamedTuple):
 
     def run(self, engine: str = "auto") -> qpmhe.Run:
         """Estimate the record."""
-        mhe = qpmhe.MovingHorizonEstimator(
-            self.system, self.observer, self.cost, engine=engine, **self.settings
-        )
         with warnings.catch_warnings():
+            warnings.simplefilter("ignore", qpmhe.PriorWarning)
+            mhe = qpmhe.MovingHorizonEstimator(
+                self.system, self.observer, self.cost, engine=engine, **self.settings
+            )
             # A fault may drive it away, and a Q too small make steps too long.
             warnings.simplefilter("ignore", qpmhe.ObserverWarning)
             warnings.simplefilter("ignore", qpmhe.ModelWarning)

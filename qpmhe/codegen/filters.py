@@ -135,7 +135,7 @@ class LikelihoodLibrary(FilterLibrary):
         record, _held = _structure(_Record, given)
         by = [np.zeros(shape) for shape in ((n, n), (n, n), (p, p), (m,))]
         # As few numbers as possible where the record is too long to keep all.
-        length = samples
+        length = max(1, samples)
         if samples * self._size > _MOST_BYTES:
             length = int(np.sqrt(samples)) + 1
         if self._kept.size < length * self._size:  # new pages take time

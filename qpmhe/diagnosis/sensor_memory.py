@@ -119,7 +119,8 @@ class MemoryBank(FilterBank):
     def _inputs_in_c(self, one: Hypothesis) -> Array:
         some, p = self._sensors, self.system.p
         own = replace(one, inputs=one.inputs[:, : self.system.m])
-        a, b, c, d = one.inputs[:, self.system.m :].reshape(len(one.inputs), 4, -1).swapaxes(0, 1)
+        shape = len(one.inputs), 4, len(some)
+        a, b, c, d = one.inputs[:, self.system.m :].reshape(shape).swapaxes(0, 1)
         if len(some) == 1:
             b, c = (each * np.eye(p)[some] for each in (b, c))
         all_d = np.ones((len(d), p))

@@ -151,6 +151,20 @@ def test_a_diagnosis_in_c_says_the_same(monkeypatch):
     assert any(one is not None for some in bank._libraries.values() for one in some.values())
 
 
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_samples_are_filtered_as_in_numpy(count, monkeypatch):
+    system, tried = hypotheses("vehicle")
+    memories, some = _with_memory(system, tried[:1], [0])
+    monkeypatch.delenv("QPMHE_ENGINE", raising=False)
+    for filters, one in ((FilterBank(system, None, filters=10**9), tried[0]), (memories, some[0])):
+        library, part = filters._compiled(one), one.first(count)
+        found, expected = filters._run_in_c(library, [part], part), filters._run([part], part)
+        assert found.logs.shape == (count, 1)
+        np.testing.assert_allclose(
+            found.likelihoods, filters._run_in_numpy([part], part).likelihoods, rtol=1e-9)
+        np.testing.assert_array_equal(expected.logs, found.logs)
+
+
 def test_few_filters_are_not_compiled_nor_those_without_a_form(monkeypatch):
     system, tried = hypotheses("vehicle")
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)

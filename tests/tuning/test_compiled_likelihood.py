@@ -51,6 +51,23 @@ def test_it_is_the_one_of_casadi_of_twelve_states():
     check_slope(second, theta, 60)
 
 
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_samples_have_the_likelihood_of_casadi(count):
+    first, second, theta = both(*zoo("vehicle"))
+    first.data, second.data = ([one.first(count) for one in each.data] for each in (first, second))
+    chosen = [np.ones(len(one), np.bool_) for one in first.data]
+    assert sum(map(len, chosen)) == count
+    value, slope = second.gradient(theta, chosen)
+    assert second.value(theta, chosen) == value
+    if count == 0:
+        assert value == 0.0
+        np.testing.assert_array_equal(slope, 0.0)
+        return
+    expected, of_casadi = first.gradient(theta, chosen)
+    assert value == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(slope, of_casadi, rtol=0, atol=1e-9 * np.linalg.norm(of_casadi))
+
+
 def cart(unit=1.0, matrix=None, linear=False):
     """A cart whose position is in another unit than its speed."""
     step, bent = np.array([[1.0, 0.1 / unit], [0.0, 0.95]]), np.array([0.01 / unit, 0.01])

@@ -537,6 +537,9 @@ def of_a_gain(problem):
 BAD = {
     "too short": (InvalidInputError, "too few for 3 parameters",
                   {"records": [(Y[:20], U[:20])], "held_out": 0.0}),
+    "ten samples": (InvalidInputError, "the records have 10 samples, too few for held-out blocks",
+                    {"records": [(Y[:10], U[:10])]}),
+    "no samples": (InvalidInputError, "has no samples", {"records": [(Y[:0], U[:0])]}),
     "no measurements": (InvalidInputError, "all measurements", {"records": [(Y * np.nan, U)]}),
     "no truth": (InvalidInputError, "true states", {"objective": "truth"}),
     "dead sensor": (InvalidInputError, "never changes: .* 1,", {"records": [(0.0 * Y + 1.0, U)]}),
