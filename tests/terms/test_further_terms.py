@@ -93,6 +93,19 @@ def test_a_new_term_is_part_of_every_estimate(known):
     assert abs(estimator(False).run(MEASUREMENTS).states[-1] - x[-1]) > 1e-3
 
 
+def test_it_is_there_with_a_disturbance_matrix_too(known):
+    """The cost in the dimension of the states stands in for the user's."""
+    found = []
+    for ridged in (True, False):
+        lifted = system(disturbance_matrix=[[2.0]]), cost(ridged)
+        plain = system(), cost(ridged, disturbance=2.5)  # of d = 2 w
+        one, other = (estimator(ridged, parts).run(MEASUREMENTS) for parts in (lifted, plain))
+        np.testing.assert_allclose(one.states, other.states, rtol=1e-9)
+        np.testing.assert_allclose(one.costs, other.costs, rtol=1e-9)
+        found.append(one.states[-1])
+    assert abs(found[0] - found[1]) > 1e-3
+
+
 def test_the_compiled_step_refuses_it_by_name(known):
     with pytest.raises(OptionError, match="Ridge"):
         estimator(True, engine="compiled")
