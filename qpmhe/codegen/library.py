@@ -57,8 +57,8 @@ def uncovered(system: System, observer: Observer, cost: Cost, settings: Settings
         return (
             f"{type(observer).__name__} has no C form: of observers of your own, those have one "
             "that correct by z and v alone, without a covariance, Jacobians or a `filter`; take "
-            "one of qpmhe's (Luenberger, HighGain, SteadyStateKalman, ExtendedKalman, "
-            "UnscentedKalman, OutputInjection), or engine='python'."
+            "one of qpmhe's, such as Luenberger, ExtendedKalman or OutputInjection, or "
+            "engine='python'."
         )
     if form.innovation is not None and form.innovation.c_name is None:
         return (
