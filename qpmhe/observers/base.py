@@ -100,8 +100,9 @@ class ObserverForm:
 
     That part has two functions: ``mhe_correction``, L(z, v) of a stage and what the observer
     remembers behind it, and ``mhe_filter``, its estimate of x(t) that has used y(t). Without a
-    covariance it also has ``mhe_correction_slope``, the slope of L at v = 0; with deviations and a
-    rule for innovations also ``mhe_predict_outputs`` and ``mhe_predict_deviations``.
+    covariance it also has ``mhe_correction_slope``: the constant gain, or the slope of L between
+    v = 0 and each of ``settings->noise_deviations``. With deviations and a rule for innovations it
+    has ``mhe_predict_outputs`` and ``mhe_predict_deviations``, too.
 
     Parameters
     ----------
