@@ -749,6 +749,9 @@ FEATURES = {
         "held in sets": (lambda: _held(
             {1: 0.1}, bounds=Box([0.9, 0.2], [1.2, 0.6]), noises=Box([-0.2, -0.3], [0.2, 0.3])
         ), WARM, {"solver_tolerance": 1e-10}),
+        "held, fewer disturbances": (
+            lambda: _held(disturbance_matrix=[[1.0], [0.5]]), gaps, conditions, WARM,
+        ),
         "held, graduated": (_held, losses(prior=huber(0.5), noise=qpmhe.GemanMcClure), AGAIN),
     },
     "losses": {

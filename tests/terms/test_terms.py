@@ -139,6 +139,27 @@ def test_second_derivatives_are_those_of_the_first_ones(name):
         )
 
 
+@pytest.mark.parametrize(
+    "name", ["fewer disturbances", "held, fewer disturbances", "constraints, noise-free"]
+)
+def test_an_elimination_solves_the_qp_of_all_terms(name):
+    """Its rows are not made from the QP, but beside it."""
+    one = case(name)
+    mhe = one.estimator("python")
+    for sample in one.samples[:12]:
+        mhe.update(**sample)
+    problem, subproblem = mhe._engine.solved().problem, mhe._engine._tools.subproblem
+    qp = subproblem.at(problem, problem.candidate)
+    found = subproblem._elimination.of(subproblem._around, qp, subproblem._w)
+    assert np.abs(found.step).max() > 1e-6
+    # Of half of J, in the directions that are free: no slope, and the identity for curvature.
+    slope = np.einsum("kij,ki->j", found.along, qp.hessian_times(found.step) + qp.gradient)
+    size = np.abs(np.einsum("kij,ki->j", np.abs(found.along), np.abs(qp.gradient))).max()
+    np.testing.assert_allclose(slope, 0.0, atol=1e-10 * size)
+    along = found.along.reshape(qp.size, -1)
+    np.testing.assert_allclose(along.T @ qp.dense() @ along, np.eye(along.shape[1]), atol=1e-10)
+
+
 def test_the_weight_of_the_first_state_is_that_of_prior_and_hold():
     problem, x, _ = solved("held with gaps")
     trial = at(problem, x)
