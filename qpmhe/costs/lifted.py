@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,12 @@ class LiftedCost(Cost):
         weight = self._lifted(cost.disturbance)
         assert weight is not None
         super().__init__(cost.prior, weight, cost.noise, cost.discount)
+
+    def __getattr__(self, name: str) -> Any:
+        """What only the user's cost has, such as the numbers of a further term."""
+        if name.startswith("_"):  # a copy that is being made has no user's cost yet
+            raise AttributeError(name)
+        return getattr(self._cost, name)
 
     def graduated(self, progress: float) -> Cost:
         """The user's surrogate; see `Cost.graduated`."""
