@@ -8,7 +8,8 @@ trajectories agree to 11 digits; by rounding, where an engine differs as much fr
 memory and its data change in their last digits; by the tolerance of QPs, where one step follows
 the other once it solves them to 1e-12; by the rounding of the Hessian, where the Python step
 differs as much from itself when the QPs change in their last digits; by a cap or by a QP that a
-method has not solved, mostly since it has no feasible point. What is left is a fault.
+method has not solved, mostly since it has no feasible point; by the tolerance of QPs with active
+rows, where J is the same up to 1e-6. What is left is a fault.
 `docs/how-to/speed.md` lists these reasons.
 """
 
@@ -149,7 +150,7 @@ class Beside:
         self.explained[kind, rows] += 1
         reason = "not examined"
         if self.explained[kind, rows] <= _MEASURED[rows]:
-            reason = self._reason(estimate, other, kind, x, J, act)
+            reason = self._reason(estimate, other, kind, x, J, act, not quiet)
         detail = (
             f"x {x:.1e}, J {J:.1e}, candidate {candidate:.1e}, by rounding {self.far}",
             estimate.cost, other.cost, estimate.candidate_cost, str(estimate.status),
@@ -185,14 +186,16 @@ class Beside:
             return x, 0.0
         return x, abs(one.cost - other.cost) / (abs(one.cost) + 1e-300)
 
-    def _reason(self, estimate, other, kind, x, J, act):
+    def _reason(self, estimate, other, kind, x, J, act, is_active):
         if Status.CONVERGED in estimate.status & other.status and J <= CONVERGED:
             return "tolerance of the sequence"
         if kind != "candidate" and self._is_fall(estimate, other):
             return "a fall of 12 digits"
         if np.abs(estimate.candidate / self.case.x_units).max() > LOST:
             return "lost digits"
-        if kind == "memory" and J <= FALL and self._observers_agree():
+        # What was kept differs where J is the same up to `CLOSE`: see `compare`.
+        same = kind == "memory" and self._observers_agree()
+        if same and J <= FALL:
             return "flat J"
         engine = self.compiled._engine
         after, tools = engine._memory.copy(), engine._tools
@@ -211,7 +214,8 @@ class Beside:
             return "cap"
         if solver.unsolved or STOPPED & (estimate.status | other.status):
             return "unsolved QP"
-        return "open"
+        # QPs with active rows are solved to a tolerance, and J of their solutions is.
+        return "flat J, by the tolerance of QPs" if same and is_active and J <= CLOSE else "open"
 
     def _observers_agree(self):
         ours, theirs = self._kept(), self.python._engine._window
