@@ -18,8 +18,13 @@ _SIMPLER = (
     (re.compile(r" && !0\b|(?<![\w)])!0 && "), ""),
     (re.compile(r"\bif \([^()\n]* && 0\)"), "if (0)"),
 )
+# What stands before a statement, and the word that says that it holds another one.
+_BLANK = re.compile(r"(?:\s|/\*.*?\*/)*(?=(?P<word>for|while|if|do)\b)?", re.S)
+_ELSE = re.compile(r"(?:\s|/\*.*?\*/)*else\b", re.S)
 # A statement may begin behind such a line, other than that of a condition or a loop.
 _ENDS = (";", "{", "}", "*/", "\x01")
+# No more blanks stand before one.
+_NEAR = 200
 
 
 def folded(text: str, value: Callable[[str], bool | None]) -> str:
@@ -64,7 +69,9 @@ def _without_branches(text: str, value: Callable[[str], bool | None]) -> str:
             if holds is None and True in known.values():
                 left = " && ".join(one for one in known if not known[one])
                 text = text[:start] + left + text[close - 1 :]
-        if holds is None:
+        # What a loop or another branch without braces holds must stay one statement.
+        before = text[max(found.start() - _NEAR, 0) : found.start()].rstrip()
+        if holds is None or not before.endswith(_ENDS):
             continue
         if text.startswith(" {\n", close):
             first = close + 3
@@ -73,10 +80,10 @@ def _without_branches(text: str, value: Callable[[str], bool | None]) -> str:
             if text[last:end] != f"{indent}}}\n":
                 continue
         else:
-            first = close + 1
-            last = end = _statement_end(text, first)
-            if text.startswith(f"{indent}else", end):
+            first, behind = close + 1, _behind(text, close)
+            if _ELSE.match(text, behind):
                 continue
+            last = end = text.index("\n", behind) + 1
             if text[close] == " ":  # on the same line
                 text, last = f"{text[:first]}\n{indent}    {text[first:]}", last + 1
                 first, last = first + 1, last + len(indent) + 4
@@ -86,19 +93,27 @@ def _without_branches(text: str, value: Callable[[str], bool | None]) -> str:
     return text
 
 
-def _closing(text: str, start: int) -> int:
-    """Behind the parenthesis that closes one before ``start``."""
+def _closing(text: str, start: int, pair: str = "()") -> int:
+    """Behind the parenthesis, or brace, that closes one before ``start``."""
     depth = 1
     while depth:
-        depth += {"(": 1, ")": -1}.get(text[start], 0)
+        depth += (text[start] == pair[0]) - (text[start] == pair[1])
         start += 1
     return start
 
 
-def _statement_end(text: str, start: int) -> int:
-    """Behind the line in which a statement without braces ends."""
-    while True:
-        end = text.index("\n", start) + 1
-        if text[:end].rstrip().endswith(";"):
-            return end
-        start = end
+def _behind(text: str, start: int) -> int:
+    """Behind the statement that begins here, with those within it."""
+    found = _BLANK.match(text, start)
+    assert found is not None
+    start, word = found.end(), found["word"]
+    if text.startswith("{", start):
+        return _closing(text, start + 1, "{}")
+    if word is None:
+        return text.index(";", start) + 1
+    start += len(word)
+    if word == "do":
+        return text.index(";", _behind(text, start)) + 1
+    end = _behind(text, _closing(text, text.index("(", start) + 1))
+    other = _ELSE.match(text, end) if word == "if" else None
+    return end if other is None else _behind(text, other.end())

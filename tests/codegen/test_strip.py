@@ -154,6 +154,24 @@ COMPILERS = "_H$|__cplusplus|__GNUC__|__FAST_MATH__|__STDC_VERSION__|_WIN32|CASA
     ("    if (A_NONE && x)\n        c();\n    b();\n", "    b();\n"),
     ("    if (A_ONE && x > 1) b();\n", "    if (x > 1) b();\n"),
     ("    if (A_NONE || x)\n        b();\n", None),
+    # Statements that hold others, without braces around them.
+    ("    for (;;)\n        if (A_NONE) b();\n    c();\n", None),
+    ("    if (x)\n        if (A_NONE) b();\n    c();\n", None),
+    ("    if (x)\n        b();\n    else\n        if (A_ONE) c();\n    d();\n", None),
+    ("    do\n        if (A_NONE) b();\n    while (x);\n", None),
+    ("    for (;;)\n        if (A_ONE)\n            b();\n    c();\n", None),
+    ("    if (A_NONE)\n        for (;;) {\n            b();\n            c();\n        }\n"
+     "    d();\n", "    d();\n"),
+    ("    if (A_NONE)\n        for (x = 0;\n             x < 2; x++)\n            b();\n    d();\n",
+     "    d();\n"),
+    ("    if (A_ONE)\n        while (x) {\n            b();\n            c();\n        }\n"
+     "    d();\n", "    while (x) {\n        b();\n        c();\n    }\n    d();\n"),
+    ("    if (A_NONE)\n        if (x)\n            b();\n        else if (y)\n            c();\n"
+     "        else {\n            d();\n        }\n    e();\n", "    e();\n"),
+    ("    if (A_NONE)\n        do {\n            b();\n        } while (x);\n    d();\n",
+     "    d();\n"),
+    ("    if (A_NONE) b(); else c();\n    d();\n", None),
+    ("    for (;;)\n        idle(e, 1);\n    b();\n", None),
 ])
 def test_what_does_nothing_goes(text, left):
     functions = (
