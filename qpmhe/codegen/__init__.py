@@ -106,7 +106,7 @@ def write(
     -------
     header, source : Path
         ``<name>.h`` and ``<name>.c``; with ``fmu``, also the path of the FMU. Its attribute
-        ``needs`` says what a step takes at most: see `Needs`.
+        ``needs`` says what a step takes at most, operations included: see `Needs`.
 
     Raises
     ------
@@ -123,6 +123,7 @@ def write(
     from .guard import guarded_files
     from .library import generated
     from .needs import measured
+    from .operations import bounded
     from .strip import stripped
 
     if not isinstance(estimator, MovingHorizonEstimator):
@@ -150,6 +151,7 @@ def write(
     if form is not None:
         files = guarded_files(files, name, form)
     files = dict(zip(files, stripped(*files.values()), strict=True))
+    needs = replace(needs, **bounded("".join(files.values()), name, needs))
     if compiler is not None:
         needs = replace(needs, **measured(files, name, compiler))
     header, types = f"{name}.h", f"typedef {real} {name}_real;\n"

@@ -1,4 +1,4 @@
-"""What generated C needs: QPs and iterations of a step, memory, code and stack."""
+"""What generated C needs: QPs, iterations and operations of a step, memory, code and stack."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from ..errors import CompilationError, OptionError
 from ..estimation.limits import ALONG, CORRECTIONS, NEAREST_POINTS, RESTORING
 from ..terms.soft import SOFT
 from .layout import Layout
+from .operations import FLOPS
 
 _PARTS = ("estimator", "workspace", "estimate")
 _MARK = b"qpmhe: sizes of\0"
@@ -54,6 +55,13 @@ class Needs:
         Bytes of stack of the function that takes most.
     compiler : str
         The command of the compiler that these were measured with; blank without one.
+    operations : dict of int or None
+        Operations in floating point: ``additions`` (and subtractions), ``multiplications``,
+        ``divisions``, ``square_roots``, and calls of other functions of ``libm`` by their names.
+        An upper bound, by the source alone: every loop runs as often as its condition allows, every
+        branch that may be taken is. None where there is none: see ``unbounded``.
+    unbounded : str
+        Why there are no ``operations``; else blank.
     """
 
     qps: int
@@ -65,6 +73,13 @@ class Needs:
     stack: int | None = None
     frame: int | None = None
     compiler: str = ""
+    operations: dict[str, int] | None = None
+    unbounded: str = ""
+
+    @property
+    def flops(self) -> int | None:
+        """Additions, multiplications, divisions and square roots together."""
+        return None if self.operations is None else sum(self.operations[one] for one in FLOPS)
 
     @classmethod
     def of(cls, layout: Layout, settings: Any) -> Needs:
@@ -90,8 +105,25 @@ class Needs:
         sizes = " + ".join(f"sizeof({prefix}_{one})" for one in _PARTS)
         text = "What a step takes at most, in the words of the estimate's members, and the static "
         text += f"memory of one estimator.{self._measured()}"
+        text += f" {self._computed()}"
         lines = fill(text, _WIDTH, initial_indent="/* ", subsequent_indent=" * ")
+        if self.operations is not None:
+            counts += f"#define {capital}_MOST_FLOPS {self.flops}\n"
         return f"{lines} */\n{counts}#define {capital}_MEMORY ({sizes})\n"
+
+    def _computed(self) -> str:
+        """A sentence on the operations."""
+        if self.operations is None:
+            return f"There is no bound of its operations in floating point: {self.unbounded}."
+        kinds = [f"{self.operations[one]} {one.replace('_', ' ')}" for one in FLOPS]
+        calls = [
+            f"{most} calls of {name}" for name, most in self.operations.items() if name not in FLOPS
+        ]
+        beside = f", and in addition {', '.join(calls)}" if calls else ""
+        return (
+            f"Operations in floating point with the settings below: at most {', '.join(kinds)}"
+            f"{beside}."
+        )
 
     def _measured(self) -> str:
         if not self.compiler:

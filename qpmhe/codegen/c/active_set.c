@@ -270,7 +270,9 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
     mhe_rows *q = &k->rows;
     int active = mhe_first_guess(q, rows, limit, &again), sharp = 0;
     mhe_guess guess = {0, rows + 1, 0};
-    for (*iterations = 0;; again = 0) {
+    /* Guesses without an active row are no iterations; behind each, some row is active. */
+    *iterations = 0;
+    for (int more = 2 * (limit < GUESSES ? limit : GUESSES) + 2; more > 0; more--, again = 0) {
         real open = 0, energy = 0, last = INFINITY, left = 0, moved = 0;
         if (active && (*iterations == limit || *iterations == GUESSES)) return STOPPED;
         *iterations += active > 0;
@@ -295,9 +297,9 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
         mhe_compare(q, rows, tolerance, &guess);
         if (limit == 0 && guess.wrong) return UNCONSTRAINED;
         /* Forces are exact enough for a guess; not yet for a solution. */
-        int more = active ? MORE_ROUNDS : 0;
-        for (int round = 0; !guess.wrong; round++) {
-            if (!(open > tolerance || left > precise) && more-- <= 0) break;
+        int further = active ? MORE_ROUNDS : 0;
+        for (int round = 0; !guess.wrong && round <= ROUNDS; round++) {
+            if (!(open > tolerance || left > precise) && further-- <= 0) break;
             if (open > tolerance && energy > last * (1 - STUCK)) {
                 guess.wrong = mhe_exclude(q, rows, open);
                 if (!guess.wrong) return EXCLUDED;
@@ -319,4 +321,5 @@ static int mhe_active_set(mhe_estimator *e, mhe_workspace *k, const real *offset
         active = 0;
         for (int i = 0; i < rows; i++) active += q->place[i] != BETWEEN;
     }
+    return STOPPED;
 }

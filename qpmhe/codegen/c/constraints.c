@@ -347,9 +347,10 @@ static void mhe_set_bends(mhe_estimator *e, mhe_workspace *k, const mhe_trial *a
     if (!k->has_pushes) return;
     mhe_clear_bends(k);
     for (int i = 0; i < mhe_row_stages(e); i++)
-        for (int first = 0, end = 0; first < MHE_G_ROWS; first = end) {
-            int pushed = 0;
-            for (end = first; end < MHE_G_ROWS && group[end] == group[first]; end++)
+        for (int first = 0; first < MHE_G_ROWS; first++) {
+            int pushed = 0, end = first;
+            if (first > 0 && group[first] == group[first - 1]) continue;
+            for (; end < MHE_G_ROWS && group[end] == group[first]; end++)
                 pushed |= k->pushes[i * MHE_G_ROWS + end] > 0;
             if (pushed) mhe_bend_group(e, k, i, around, first, end);
         }

@@ -197,7 +197,7 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
     const int sides = mhe_start(q, rows, missed, reach, product);
     int starts = 0;
     if (!sides) return STOPPED;
-    for (*iterations = 0;; ++*iterations) {
+    for (*iterations = 0; *iterations <= limit; ++*iterations) {
         real infeasible, length = 1, target = 0;
         mhe_build_again(e, k, offset, nearest);
         mhe_rows_times(e, k, k->step);
@@ -251,4 +251,5 @@ static int mhe_interior_point(mhe_estimator *e, mhe_workspace *k, const real *of
         }
         mhe_move_soft(q, rows, length);
     }
+    return STOPPED;
 }

@@ -56,7 +56,7 @@ static int mhe_settle(const mhe_settings *s, const real *K, const mhe_terms *t, 
     if (!mhe_all_finite(NX * NX, A) || !mhe_all_finite(NY * NX, C) || !mhe_all_finite(NX * NY, K))
         return 0;
     for (int j = 0; j < NX; j++) moving[j] = j, scale[j] = sqrt(s->metric_weight[j * (NX + 1)]);
-    for (int stage = 0;; stage++) {
+    for (int stage = 0; stage < 2; stage++) {
         for (int r = 0; r < count; r++)
             for (int c = 0; c < count; c++) {
                 const int i = moving[r], j = moving[c];

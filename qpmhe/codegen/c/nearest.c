@@ -157,7 +157,7 @@ static int mhe_join(mhe_nearest *n, int side, real missed)
     real column[NX], own = 0;
     mhe_side_spread(n, side, column);
     for (int j = 0; j < NX; j++) column[j] /= n->deviation[side];
-    for (;;) {
+    for (int leaving = n->count; leaving >= 0; leaving--) { /* each time but the last, a side leaves */
         real left[NX], exchange[NX], largest = n->reach[side], length = INFINITY;
         int blocking = -1;
         memcpy(left, column, sizeof left);
