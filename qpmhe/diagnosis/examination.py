@@ -14,6 +14,7 @@ from ..estimation.estimate import Status
 from ..estimation.observability import observability, prior_shares
 from ..estimation.run import Run, RunSource
 from ..model.residuals import difference
+from ..model.system import System
 from ..terms.information import prior_units
 from .apparent import apparent_information
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
@@ -26,8 +27,8 @@ from .stuck import stuck
 
 # The search takes at most so many samples: of a longer record, those least like the model.
 _MOST_SAMPLES = 6000
-# Filters that a search for faults runs, roughly.
-_FILTERS = 200
+# Filters that a search for faults runs, roughly, for each sensor and input.
+_FILTERS = 40
 # Fewer samples with measurements say nothing about a covariance. Where the model fails, so many of
 # the longest stretches between are tried.
 LEAST_SAMPLES, _STRETCHES = 30, 3
@@ -132,7 +133,7 @@ class Examination:
         steps = None if source.steps is None else source.steps[part]
         # The system, by shorter steps where its own are too long, and the finding that they are.
         self.system, self.coarse = source.system, list[Finding]()
-        self.bank = FilterBank(self.system, steps, self.first, filters=_FILTERS)
+        self.bank = FilterBank(self.system, steps, self.first, filters=_expected(self.system))
         start = run.states[self.first]
         start = start if np.isfinite(start).all() else run.states[0]
         y = source.measurements.copy()
@@ -239,7 +240,7 @@ class Examination:
         first, steps = self.first + part.start, self.source.steps
         bank = FilterBank(
             self.system, None if steps is None else steps[self.first :][part], first,
-            filters=_FILTERS,
+            filters=_expected(self.system),
         )
         base = replace(
             self.base, measurements=self.base.measurements[part], inputs=self.base.inputs[part],
@@ -586,6 +587,11 @@ class Examination:
                     "The model may lack an effect of this input, unless a controller computes it "
                     "from states that are not measured.", "note",
                 )
+
+
+def _expected(system: System) -> int:
+    """How many filters a search for faults runs, roughly."""
+    return _FILTERS * (system.p + system.m)
 
 
 def _limits(count: int) -> tuple[float, float]:
