@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from .._version import __version__
+from ..model.algebraic import AlgebraicStates
 from ..model.expressions import CasadiModel, import_casadi
+from ..model.implicit_steps import ImplicitStep
 from ..model.products import with_slope
 from .layout import Layout
 
@@ -56,7 +58,8 @@ def _generator() -> str:
     """Digest of all that makes the source of a model: templates and generator."""
     digest = hashlib.sha256(__version__.encode())
     models = [
-        Path(sys.modules[one.__module__].__file__ or "") for one in (CasadiModel, with_slope)
+        Path(sys.modules[one.__module__].__file__ or "")
+        for one in (AlgebraicStates, CasadiModel, ImplicitStep, with_slope)
     ]
     here = files(__package__)
     for folder in (here, here.joinpath("c")):

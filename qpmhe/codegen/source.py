@@ -15,9 +15,26 @@ from numpy.typing import NDArray
 
 from .._version import __version__
 from ..errors import CompilationError
-from ..model.algebraic import CURVED, LESS, MOST_HALVINGS, MOST_ITERATIONS, ROUNDING, SMALL
+from ..model.algebraic import (
+    CURVED,
+    FOLLOWED,
+    LESS,
+    MOST_HALVINGS,
+    MOST_ITERATIONS,
+    ROUNDING,
+    SMALL,
+)
 from ..model.expressions import CasadiModel, import_casadi
-from ..model.implicit_steps import COLLOCATIONS, Collocation
+from ..model.implicit_steps import (
+    COLLOCATIONS,
+    CONTRACTION,
+    FEW_ROUNDINGS,
+    LARGEST_SPREAD,
+    MOST_FOLLOWING,
+    MOST_KEPT,
+    MOST_WHOLE,
+    Collocation,
+)
 from ..terms.soft import SOFT
 from .layout import SET_NAMES, TERMS, Layout
 from .single import in_single_precision
@@ -26,8 +43,6 @@ from .single import in_single_precision
 MAIN = "mhe.c"
 # Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
-# An implicit step keeps one Jacobian for so many iterations, while corrections fall to this share.
-_MOST_KEPT, _CONTRACTION = 20, 0.25
 
 
 @cache
@@ -257,7 +272,9 @@ def _step_parts(model: CasadiModel) -> list[str]:
         "iterations": MOST_ITERATIONS, "halvings": MOST_HALVINGS, "rounding": repr(ROUNDING),
         "small": repr(SMALL), "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
         "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),
-        "kept": _MOST_KEPT, "contraction": repr(_CONTRACTION),
+        "kept": MOST_KEPT, "contraction": repr(CONTRACTION), "few": repr(FEW_ROUNDINGS),
+        "spread": repr(LARGEST_SPREAD), "parts": FOLLOWED, "whole": MOST_WHOLE,
+        "following": MOST_FOLLOWING,
         "step_slope": template(f"slope_{how.method}.c"),
     } | names | _collocation(COLLOCATIONS[how.method])
     rate = _filled("algebraic", values) if model.guess else template("rate.c")
@@ -281,7 +298,7 @@ def _collocation(method: Collocation) -> dict[str, object]:
     def matrix(one: NDArray[Any]) -> str:
         return ", ".join(f"{{{', '.join(map(repr, row))}}}" for row in one.tolist())
 
-    first, shift = float(eigenvalues[real].real), pair - float(eigenvalues[real].real)
+    first, shift = method.real, pair - method.real
     return {
         "stages": count, "weights": matrix(method.A), "inverse": matrix(inverse),
         "ends": ", ".join(map(repr, method.d.tolist())),

@@ -6,22 +6,28 @@ states, z_i:
     Z_i = h sum_j A_ij f_c(x + Z_j, z_j, u),    0 = g(x + Z_i, z_i, u),    x⁺ = x + sum_i d_i Z_i.
 
 The start is Z = 0 and the algebraic states at x, so that the step is a function of x, u and h
-alone. The implicit function theorem gives its derivative, from the Jacobians at the converged
-stages: exact, whatever the iteration did. C first tries a simplified iteration with one Jacobian,
-from the same start (`stages_kept.c`). Where there are several solutions, it may find another one.
+alone. A simplified iteration with one Jacobian comes first; where its corrections do not shrink
+fast, Newton's method starts again, with whole and then with damped steps; and where these fail,
+too, it follows the stages as h grows. C does the same in the same order. The implicit function
+theorem gives the derivative, from the Jacobians at the converged stages: exact, whatever the
+iteration did.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .algebraic import (
+    FOLLOWED,
     MOST_HALVINGS,
     MOST_ITERATIONS,
+    ROUNDING,
     AlgebraicStates,
     Batched,
     Eliminated,
@@ -29,13 +35,27 @@ from .algebraic import (
     converged,
     eliminated,
     inverse,
+    reciprocals,
     share,
     shorter,
+    sides,
     solved,
     straight,
 )
 
 Array = NDArray[np.float64]
+
+
+#: One Jacobian serves so many iterations, while corrections fall to this share of those before.
+MOST_KEPT, CONTRACTION = 20, 0.25
+#: Whole Newton steps: where more of them wander, rounding decides where they end. Few for each part
+#: of the way, as stages are followed.
+MOST_WHOLE, MOST_FOLLOWING = 30, 8
+#: Newton's method fails where relative errors of the equations spread by more than this factor into
+#: the stages: rounding alone then decides where a correction leads.
+LARGEST_SPREAD = 1e13
+#: Where they no longer fall, corrections of this many roundings have converged.
+FEW_ROUNDINGS = 25.0
 
 
 class Collocation(NamedTuple):
@@ -54,6 +74,12 @@ class Collocation(NamedTuple):
     A: Array
     d: Array
     order: int
+
+    @property
+    def real(self) -> float:
+        """The real eigenvalue of the inverse of A."""
+        values = np.linalg.eigvals(np.linalg.inv(self.A))
+        return float(values[np.argmin(np.abs(values.imag))].real)
 
 
 _ROOT = float(np.sqrt(6.0))
@@ -168,15 +194,98 @@ class ImplicitStep:
         W[~known] = np.nan
         start = W.copy()
         with np.errstate(all="ignore"):
-            for damped in False, True:
+            self._keep(w, u, h, W, np.flatnonzero(known))
+            for damped, most in (False, MOST_WHOLE), (True, MOST_ITERATIONS):
                 left = np.flatnonzero(known & ~np.isfinite(W).all(axis=(1, 2)))
-                at = left if damped else np.flatnonzero(known)
-                W[at] = start[at]
-                self._iterate(x, u, h, W, at, damped)
+                W[left] = start[left]
+                self._iterate(x, u, h, W, left, damped, most)
+            left = np.flatnonzero(known & ~np.isfinite(W).all(axis=(1, 2)))
+            W[left] = start[left]
+            for part in range(1, FOLLOWED + 1):
+                self._iterate(x, u, part * h / FOLLOWED, W, left, False, MOST_FOLLOWING)
+                left = left[np.isfinite(W[left]).all(axis=(1, 2))]
         return W
 
+    def _keep(self, w: Array, u: Array, h: Array, W: Array, at: NDArray[np.intp]) -> None:
+        """The simplified iteration for all these states, in place; NaN where it fails.
+
+        Its Jacobian is that at x, with rank-one corrections by what the rate did along each step
+        (Broyden's method in scaled unknowns; Kelley, Iterative Methods for Linear and Nonlinear
+        Equations, section 7.3).
+        """
+        if not at.size:
+            return
+        A, n, width, count = self._method.A, w.shape[1] - self._k, w.shape[1], len(self._method.A)
+        w, u, h, many = w[at], u[at], h[at], (len(at), count)
+        J = self._jacobian(w, u)
+        first = eliminated(self._rate(w, u), J, w, n)
+        sizes = np.abs(w[:, :n]) + h[:, None] * np.abs(first.rate)
+        jacobians = np.broadcast_to(first.jacobian[:, None], (*many, n, n))
+        inverses = inverse(newton_matrix(A, h, jacobians), np.tile(sizes, count))
+        frozen = np.repeat(J[:, None], count, axis=1), np.repeat(w[:, None], count, axis=1)
+        now = np.repeat(w[:, None], count, axis=1)
+        now[..., :n] = 0.0
+        found = eliminated(np.zeros_like(now), *frozen, n)._replace(
+            rate=np.broadcast_to(first.rate[:, None], (*many, n))
+        )
+        made: list[Array] = []
+        last, result = np.full(len(at), np.inf), np.full(now.shape, np.nan)
+        left = np.ones(len(at), np.bool_)
+        for k in range(MOST_KEPT):
+            if k:
+                values = self._at_stages(self._rate, w[:, :n], u, now)
+                found = eliminated(values, *frozen, n)
+            moves = self._correction(found, partial(_times, inverses), h, now)
+            if k == 0:
+                scale = np.abs(w) + np.abs(moves).max(axis=1)
+                least, spread = self._rounding(first, h, scale, sizes)
+                left &= (spread <= LARGEST_SPREAD * scale[:, :n]).all(axis=1)
+                rounding = np.where(least > 0.0, scale / least, 1.0)
+                per = np.where(scale > 0.0, 1.0 / scale, 1.0)
+            parts = (moves * per[:, None]).reshape(len(at), -1)
+            for before, after in pairwise(made):
+                parts = parts + (_dot(before, parts) / _dot(before, before))[:, None] * after
+            if made:
+                factor = 1.0 - _dot(made[-1], parts) / _dot(made[-1], made[-1])
+                parts = parts / factor[:, None]
+            made.append(parts)
+            shares = parts.reshape(now.shape)
+            lost = ~np.isfinite(_dot(parts, parts))
+            lost |= ((scale[:, None] == 0.0) & (shares != 0.0)).any(axis=(1, 2))
+            now = now + shares * scale[:, None]
+            length = np.abs(shares).max(axis=(1, 2))
+            falls = length / last
+            done = (length <= ROUNDING) | ((length * falls <= ROUNDING) & np.isfinite(last))
+            slow = ~done & (falls > CONTRACTION)
+            most = np.abs(shares * rounding[:, None]).max(axis=(1, 2))
+            done |= slow & ((length <= FEW_ROUNDINGS * ROUNDING) | (most <= ROUNDING))
+            done &= left & ~lost
+            result[done] = now[done]
+            left &= ~(done | lost | slow)
+            if not left.any():
+                break
+            last = length
+        if width > n:  # another solution for z is no stage of this step
+            states = self._states(w[:, :n], result)
+            there = sides(self._slopes(w[:, :n], u, result), states, n)
+            result[(there != first.side[:, None]).any(axis=1)] = np.nan
+        W[at] = result
+
+    def _rounding(
+        self, first: Eliminated, h: Array, scale: Array, sizes: Array
+    ) -> tuple[Array, Array]:
+        """What rounding is a share of (K, n + k), and what of it the inverse leaves in x (K, n)."""
+        n = first.rate.shape[-1]
+        flows, real = h[:, None, None] * first.jacobian, self._method.real
+        equations = real * scale[:, :n] + (np.abs(flows) @ scale[:, :n, None])[..., 0]
+        inverses = np.abs(inverse(real * np.eye(n) - flows, sizes))
+        spread = (inverses @ equations[..., None])[..., 0]
+        equations = np.minimum(equations, spread)
+        behind = [algebraic_sizes(first, equations, scale[:, n:])] if self._k else []
+        return np.concatenate((equations, *behind), axis=1), spread
+
     def _iterate(
-        self, x: Array, u: Array, h: Array, W: Array, at: NDArray[np.intp], damped: bool
+        self, x: Array, u: Array, h: Array, W: Array, at: NDArray[np.intp], damped: bool, most: int
     ) -> None:
         """Newton's iteration for all these states, in place.
 
@@ -189,23 +298,25 @@ class ImplicitStep:
         n, last = x.shape[1], np.full(len(at), np.inf)
         side = np.ones((len(x), 1))
         values = self._at_stages(self._rate, x[at], u[at], W[at])
-        for iteration in range(MOST_ITERATIONS):
+        for iteration in range(most):
             J, w = self._slopes(x[at], u[at], W[at]), self._states(x[at], W[at])
             found = eliminated(values, J, w, n)
             moved = np.maximum(np.abs(W[at, :, :n]), h[at, None, None] * np.abs(found.rate))
-            inverses = inverse(
-                newton_matrix(self._method.A, h[at], found.jacobian),
-                np.tile(np.abs(x[at]) + moved.max(axis=1), len(self._method.A)),
-            )
-            moves = self._correction(found, inverses, h[at], W[at])
+            matrix = newton_matrix(self._method.A, h[at], found.jacobian)
+            rows = np.tile(np.abs(x[at]) + moved.max(axis=1), len(self._method.A))
+            inverses, solve = inverse(matrix, rows), partial(_solved, matrix, rows)
+            moves = self._correction(found, solve, h[at], W[at])
             step, k = moves[..., :n], W.shape[2] - n
             # What rounding of the states and of their flows amounts to in each equation, or what
             # the inverse leaves of it in the stages, if that is less.
-            size = np.abs(x[at]) + np.abs(W[at, :, :n] + step).max(axis=1)
-            size += h[at, None] * (np.abs(found.jacobian).max(axis=1) @ size[..., None])[..., 0]
+            own = size = np.abs(x[at]) + np.abs(W[at, :, :n] + step).max(axis=1)
+            flows = (np.abs(found.jacobian).max(axis=1) @ size[..., None])[..., 0]
+            size = size + h[at, None] * flows
             sizes = np.repeat(size[:, None], len(self._method.A), axis=1)
-            sizes = np.minimum(sizes, _times(np.abs(inverses), sizes))
+            spread = _times(np.abs(inverses), sizes)
+            sizes = np.minimum(sizes, spread)
             length = share(step, sizes)
+            length[(spread > LARGEST_SPREAD * own[:, None]).any(axis=(1, 2))] = np.nan
             if k:
                 behind = algebraic_sizes(found, sizes, np.abs(W[at, :, n:] + moves[..., n:]))
                 length = np.maximum(length, share(moves[..., n:], behind))
@@ -222,7 +333,7 @@ class ImplicitStep:
                 values = self._at_stages(self._rate, x[at], u[at], trial)
                 good, less = np.isfinite(values).all(axis=(1, 2)), 0.5 * factor
                 if damped:
-                    again = self._correction(eliminated(values, J, w, n), inverses, h[at], trial)
+                    again = self._correction(eliminated(values, J, w, n), solve, h[at], trial)
                     curved = share(again - (1.0 - factor[:, None, None]) * moves, scale)
                     good = straight(curved, factor, before, length)
                     less = shorter(curved, factor, before)
@@ -238,11 +349,13 @@ class ImplicitStep:
             at, values, last = at[left], values[left], length[left]
         W[at] = np.nan
 
-    def _correction(self, found: Eliminated, inverses: Array, h: Array, W: Array) -> Array:
-        """Newton's correction (K, s, n + k) of the stages, by inverses of its matrix."""
+    def _correction(
+        self, found: Eliminated, solve: Callable[[Array], Array], h: Array, W: Array
+    ) -> Array:
+        """Newton's correction (K, s, n + k) of the stages, by what solves its equations."""
         n = found.rate.shape[-1]
         flows = np.einsum("ij,kjn->kin", self._method.A, found.rate)
-        step = -_times(inverses, W[..., :n] - h[:, None, None] * flows)
+        step = -solve(W[..., :n] - h[:, None, None] * flows)
         if W.shape[2] == n:
             return step
         move = found.step + (found.slope @ step[..., None])[..., 0]
@@ -256,6 +369,21 @@ def newton_matrix(A: Array, h: Array, J: Array) -> Array:
     found: Array = blocks.transpose(0, 1, 3, 2, 4).reshape(count, s * n, s * n)
     found += np.eye(s * n)
     return found
+
+
+def _solved(matrix: Array, sizes: Array, stages: Array) -> Array:
+    """By elimination, whose residual is small however ill-conditioned the equations are."""
+    rows = reciprocals(sizes)
+    right = rows * stages.reshape(len(stages), -1)
+    try:
+        found = np.linalg.solve(matrix * rows[..., None], right[..., None])
+    except np.linalg.LinAlgError:  # one of them is singular
+        return _times(inverse(matrix, sizes), stages)
+    return np.asarray(found.reshape(stages.shape))
+
+
+def _dot(one: Array, other: Array) -> Array:
+    return np.asarray(np.einsum("ki,ki->k", one, other))
 
 
 def _times(matrix: Array, stages: Array) -> Array:

@@ -215,6 +215,51 @@ def test_any_units_of_the_states_give_the_same_step(rate, low, high, dt, kind):
     assert (np.abs(other_slopes - slopes) < 1e-10 * sizes).all()
 
 
+def drawn(rate, dt, low, high):
+    """The model of a rate, and 1,500 random states, where most steps have no use."""
+    n, generator = len(low), np.random.default_rng(1)
+    x = ca.SX.sym("x", n)
+    model = qpmhe.from_casadi(
+        ca.Function("rate", [x], [ca.vertcat(*rate(ca.vertsplit(x)))]),
+        ca.Function("h", [x], [x[0]]), dt=dt, method="radau", compiled=False,
+    ).symbolic
+    return model, generator.uniform(low, high, (1500, n)), np.zeros((1500, 0))
+
+
+def drawn_fold():
+    """A solution for z that ends within some steps."""
+    model = qpmhe.System.from_dae(
+        lambda x, z: -z - 0.1 * x, lambda x, z, u: z * z - x + u, lambda x, z: x + z,
+        dt=0.1, n=1, k=1, p=1, m=1, algebraic_guess=[1.0],
+    ).symbolic
+    generator = np.random.default_rng(1)
+    return model, generator.uniform(0.0, 4.0, (1500, 1)), generator.uniform(-1.0, 4.0, (1500, 1))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("make", [
+    lambda: drawn(arrhenius, 0.1, [0.0, -50.0, 200.0], [1.0, 500.0, 400.0]),
+    lambda: drawn(arrhenius, 0.05, [0.0, -50.0, -50.0], [1.0, 50.0, 50.0]),
+    lambda: drawn(kinetics, 1.0, [-2.0, -2e-3, -2.0], [2.0, 2e-3, 2.0]),
+    lambda: drawn(oscillator, 1.0, [-4.0, -4.0], [4.0, 4.0]), drawn_fold,
+], ids=["arrhenius", "arrhenius at 0 K", "robertson", "van der Pol", "fold"])
+def test_engines_fail_at_the_same_states(make):
+    """Values and derivatives together. Rounding decides where an iteration wanders for long."""
+    model, x, u = make()
+    engines = evaluated_in_c(model), Evaluator(machine(model, False)).one
+    found = []
+    for one in engines:
+        values, slopes = (one(name, x, u) for name in ("f", "f_jacobian"))
+        known = np.isfinite(values).all(axis=1)
+        np.testing.assert_array_equal(np.isfinite(slopes).all(axis=(1, 2)), known)
+        found.append((values, known))
+    (values, known), (others, _) = found
+    assert 0 < known.sum() < len(x)
+    same = np.isclose(values, others, rtol=1e-6, atol=1e-9, equal_nan=True).all(axis=1)
+    assert same.mean() >= 0.99, 1.0 - same.mean()
+
+
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 @pytest.mark.parametrize("method", COLLOCATIONS)
 def test_the_compiled_step_keeps_a_jacobian_and_has_the_same_values(method):

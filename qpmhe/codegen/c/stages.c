@@ -65,8 +65,8 @@ static int mhe_stage_factor(real h, const mhe_reduced *r, const real *per, real 
 }
 
 /* What rounding of the states and of their flows amounts to in each equation, or what the inverse of M
- * leaves of it in the stages, if that is less. */
-static void mhe_stage_sizes(const real *x, real h, const real *W, const real *step,
+ * leaves of it in the stages, if that is less; whether rounding does not decide where `step` leads. */
+static int mhe_stage_sizes(const real *x, real h, const real *W, const real *step,
                             const mhe_reduced *r, const real *M, const int *pivot, real *sizes)
 {
     real states[NX], equations[NX], inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
@@ -93,7 +93,9 @@ static void mhe_stage_sizes(const real *x, real h, const real *W, const real *st
         for (int j = 0; j < MHE_UNKNOWNS; j++)
             left += (real)fabs(inverse[i * MHE_UNKNOWNS + j]) * equations[j % NX];
         sizes[i] = left < equations[i % NX] ? left : equations[i % NX];
+        if (left > (real)$spread * states[i % NX]) return 0;
     }
+    return 1;
 }
 
 /* The corrections of the stages W, from those of Z; the largest share of one. */
@@ -134,20 +136,25 @@ static real mhe_stage_curved(const mhe_reduced *r, const mhe_reduced *next, real
     return mhe_share(MHE_STAGES * NW, again, scale);
 }
 
+/* Where iterations start: Z = 0, and z at x. */
+static void mhe_start_stages(const real *w, real *W)
+{
+    for (int i = 0; i < MHE_STAGES; i++)
+        for (int j = 0; j < NW; j++) W[i * NW + j] = j < NX ? 0 : w[j];
+}
+
 /* The stages W of a step from w = (x, z), by whole Newton steps or by damped ones, along which f is
  * nearly linear; whether they converge. */
-static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, real *W)
+static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, int most, real *W)
 {
     mhe_reduced both[2][MHE_STAGES];
     real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], moves[MHE_STAGES * NW], trial[MHE_STAGES * NW];
     real M[MHE_UNKNOWNS * MHE_UNKNOWNS], scale[MHE_STAGES * NW], sizes[MHE_UNKNOWNS];
     real per[NX], last = INFINITY;
     int pivot[MHE_UNKNOWNS], now = 0;
-    for (int i = 0; i < MHE_STAGES; i++)
-        for (int j = 0; j < NW; j++) W[i * NW + j] = j < NX ? 0 : w[j];
     if (!mhe_stage_rates(w, u, W, both[0])) return 0;
     const int side = both[0][0].side;
-    for (int iteration = 0; iteration < $iterations; iteration++) {
+    for (int iteration = 0; iteration < most; iteration++) {
         const mhe_reduced *r = both[now];
         mhe_reduced *next = both[!now];
         mhe_state_reciprocals(w, h, W, MHE_STAGES, r, per);
@@ -155,7 +162,7 @@ static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, 
         for (int i = 0; i < MHE_UNKNOWNS; i++) rates[i] = r[i / NX].rate[i % NX];
         mhe_stage_residual(rates, h, W, step);
         mhe_solve_equations(MHE_UNKNOWNS, M, pivot, step);
-        mhe_stage_sizes(w, h, W, step, r, M, pivot, sizes);
+        if (!mhe_stage_sizes(w, h, W, step, r, M, pivot, sizes)) return 0;
         const real length = mhe_stage_moves(r, W, sizes, step, moves);
         if (isnan(length)) return 0;
         const int done = mhe_converged(length, last);

@@ -1,8 +1,8 @@
 /* The stages of an implicit step by the simplified Newton method: one Jacobian for all stages and
  * iterations, that at x, with rank-one corrections by what the rate did along each step (Broyden's
  * method in scaled unknowns; Kelley, Iterative Methods for Linear and Nonlinear Equations, section
- * 7.3). It goes on only while each correction is a small part of the one before. Where the equations
- * have several solutions, it may still end at another one than Newton's method does. */
+ * 7.3). It goes on only while each correction is a small part of the one before.
+ * qpmhe/model/implicit_steps.py does the same in Python. */
 
 /* By the eigenvectors of the inverse of A, Newton's equations fall apart into real ones,
  * (a - h J) w = r, and, for three stages, complex ones, (a + c - h J) w = r with a complex c. Their
@@ -119,8 +119,9 @@ static void mhe_kept_moves(const real *x, const real *u, real h, const mhe_reduc
 }
 
 /* The sizes of a stage's unknowns, behind the first corrections, and how small a share these are of what
- * rounding amounts to in the equations, or what the real inverse leaves of it, if that is less. */
-static void mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const mhe_modes *modes,
+ * rounding amounts to in the equations, or what the real inverse leaves of it, if that is less; whether
+ * rounding does not decide where the corrections lead. */
+static int mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const mhe_modes *modes,
                            const real *moves, real *sizes, real *shares)
 {
     real equations[NX];
@@ -139,9 +140,11 @@ static void mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const mh
         real left = 0;
         for (int b = 0; b < NX; b++) left += (real)fabs(modes->one[b * NX + a]) * equations[b];
         shares[a] = left < equations[a] ? left : equations[a];
+        if (!(left <= (real)$spread * sizes[a])) return 0;
     }
     mhe_algebraic_sizes(r, sizes + NX, shares, shares + NX);
     for (int j = 0; j < NW; j++) shares[j] = shares[j] > 0 ? sizes[j] / shares[j] : 1;
+    return 1;
 }
 
 /* The stages W of a step from w = (x, z), at which f is linearised; whether they converge fast. */
@@ -151,14 +154,14 @@ static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_red
     real moves[MHE_STAGE_VALUES], sizes[MHE_STAGE_VALUES], per[MHE_STAGE_VALUES];
     real rounding[NW], last = INFINITY;
     real made[$kept][MHE_STAGE_VALUES], squares[$kept]; /* the corrections, as shares of the sizes */
-    for (int i = 0; i < MHE_STAGE_VALUES; i++) W[i] = i % NW < NX ? 0 : w[i % NW];
+    mhe_start_stages(w, W);
     mhe_state_reciprocals(w, h, W, 1, r, sizes);
     if (!mhe_invert_modes(h, r->jacobian, sizes, &modes)) return 0;
     for (int k = 0; k < $kept; k++) {
         real *share = made[k], length = 0, square = 0;
         mhe_kept_moves(w, u, h, r, &modes, W, k == 0, moves);
         if (k == 0) {
-            mhe_kept_sizes(w, h, r, &modes, moves, sizes, rounding);
+            if (!mhe_kept_sizes(w, h, r, &modes, moves, sizes, rounding)) return 0;
             for (int i = 0; i < MHE_STAGE_VALUES; i++) {
                 sizes[i] = sizes[i % NW];
                 per[i] = sizes[i] > 0 ? 1 / sizes[i] : 1;
@@ -192,7 +195,7 @@ static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_red
             real most = 0;
             for (int i = 0; i < MHE_STAGE_VALUES; i++)
                 most = mhe_max((real)fabs(share[i]) * rounding[i % NW], most);
-            return length <= 25 * (real)$rounding || most <= (real)$rounding;
+            return length <= (real)$few * (real)$rounding || most <= (real)$rounding;
         }
         last = length;
     }

@@ -3,17 +3,35 @@
 
 static const real mhe_step_weights[MHE_STAGES] = {$ends};
 
-/* The stages W of a step; whether one of the iterations has converged. */
-static int mhe_solve_stages(const real *x, const real *u, real h, real *W)
+/* The stages W of a step, by whichever iteration converges first; whether one does. Rates at them
+ * come in r where they are wanted, and where there are algebraic states: another solution for z is no
+ * stage of this step. */
+static int mhe_solve_stages(const real *x, const real *u, real h, int wanted, real *W,
+                            mhe_reduced *r)
 {
-    mhe_reduced r;
+    mhe_reduced first;
     real w[NW];
-    int found = mhe_complete(x, u, w, &r);
-    if (!found || mhe_keep_jacobian(w, u, h, &r, W)) return found;
-    found = 0;
-    for (int damped = 0; damped < 2 && !found; damped++)
-        found = mhe_iterate_stages(w, u, h, damped, W);
-    return found;
+    if (!mhe_complete(x, u, w, &first)) return 0;
+    wanted = wanted || NW > NX;
+    if (mhe_keep_jacobian(w, u, h, &first, W)) {
+        int same = !wanted || mhe_stage_rates(x, u, W, r);
+        for (int i = 0; i < MHE_STAGES; i++)
+            same = same && (!wanted || r[i].side == first.side);
+        if (same) return 1;
+    }
+    int found = 0;
+    for (int damped = 0; damped < 2 && !found; damped++) {
+        mhe_start_stages(w, W);
+        found = mhe_iterate_stages(w, u, h, damped, damped ? $iterations : $whole, W);
+    }
+    if (!found) {
+        /* Follow them as h grows. */
+        mhe_start_stages(w, W);
+        found = 1;
+        for (int part = 1; part <= $parts && found; part++)
+            found = mhe_iterate_stages(w, u, part * h / $parts, 0, $following, W);
+    }
+    return found && (!wanted || mhe_stage_rates(x, u, W, r));
 }
 
 static void mhe_step_end(const real *x, const real *W, real *next)
@@ -27,7 +45,8 @@ static void mhe_step_end(const real *x, const real *W, real *next)
 static void $value(const real *x, const real *u, real dt, real *next)
 {
     real W[MHE_STAGES * NW];
-    if (mhe_solve_stages(x, u, dt, W)) {
+    mhe_reduced r[MHE_STAGES];
+    if (mhe_solve_stages(x, u, dt, 0, W, r)) {
         mhe_step_end(x, W, next);
         return;
     }
@@ -40,7 +59,7 @@ static void $slope(const real *x, const real *u, real dt, real *next, real *A)
 {
     real W[MHE_STAGE_VALUES], per[NX];
     mhe_reduced r[MHE_STAGES];
-    if (mhe_solve_stages(x, u, dt, W) && mhe_stage_rates(x, u, W, r)) {
+    if (mhe_solve_stages(x, u, dt, 1, W, r)) {
         mhe_state_reciprocals(x, dt, W, 0, r, per);
         mhe_step_end(x, W, next);
         if (mhe_step_slope(dt, r, per, A)) return;
