@@ -36,7 +36,7 @@ from stopwatch import timed
 from swing import equations
 
 import qpmhe
-from qpmhe.codegen.source import model_files
+from qpmhe.codegen.model_source import model_files
 from qpmhe.model.implicit_steps import COLLOCATIONS
 
 N, K, P, M, DT, HORIZON = 4, 4, 3, 2, 0.05, 10

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..codegen.comparison import Batch, Interpreter, model_fault, points
 from ..codegen.compiler import WrongCodeError, compiled_library, find_compiler
 from ..codegen.fingerprint import source_key
-from ..codegen.source import model_files
+from ..codegen.model_source import model_files
 from ..errors import CompilationError, EngineWarning, OptionError
 from ..model.accuracy import TRIED, Choice, choice
 from ..model.augmentation import Augmentation

@@ -14,7 +14,7 @@ from ..errors import CompilationError
 from ..model.expressions import CasadiModel, import_casadi
 from ..model.products import MOST_OPERATIONS, in_scalars
 from .compiler import compiled_library
-from .source import filter_files
+from .model_source import filter_files
 
 Array = NDArray[np.float64]
 

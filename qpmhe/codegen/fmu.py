@@ -17,7 +17,7 @@ from .._version import __version__
 from ..errors import CompilationError
 from ..model.system import System
 from .compiler import shared_library
-from .source import renamed, template
+from .templates import renamed, template
 
 _FOLDERS = {"Linux": "linux", "Windows": "win", "Darwin": "darwin"}
 _SUFFIXES = {"Linux": ".so", "Windows": ".dll", "Darwin": ".dylib"}

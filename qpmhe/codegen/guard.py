@@ -11,7 +11,7 @@ import numpy as np
 
 from .._checks import Array
 from ..model.sets import ConvexSet
-from .source import renamed, template
+from .templates import renamed, template
 
 if TYPE_CHECKING:
     from ..estimation.estimator import MovingHorizonEstimator

@@ -26,7 +26,8 @@ from .fingerprint import source_key
 from .layout import TERMS, Layout, settings_record
 from .losses import loss_function
 from .needs import Needs
-from .source import MAIN, estimator_files, template
+from .source import MAIN, estimator_files
+from .templates import template
 
 # What NumPy allows a structure; entries of its arrays can be counted by an int then.
 _MOST_BYTES = 2**31 - 1

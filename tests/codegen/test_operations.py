@@ -8,7 +8,7 @@ import pytest
 
 from qpmhe import codegen
 from qpmhe.codegen.operations import FLOPS
-from qpmhe.codegen.source import template
+from qpmhe.codegen.templates import template
 from qpmhe.codegen.worst_case import Known, UnboundedError, WorstCase
 
 from .cases import case

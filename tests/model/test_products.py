@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.codegen.source import model_files
+from qpmhe.codegen.model_source import model_files
 from qpmhe.model.evaluation import Evaluator, machine
 from qpmhe.model.products import LEAST, has_products, operations
 from qpmhe.model.second_derivatives import SecondDerivatives

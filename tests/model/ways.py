@@ -7,7 +7,7 @@ import numpy as np
 
 from qpmhe.adapters.casadi import _compiled
 from qpmhe.codegen.compiler import compiled_library
-from qpmhe.codegen.source import model_files
+from qpmhe.codegen.model_source import model_files
 from qpmhe.model.evaluation import Evaluator
 
 LEADS = [(), (1,), (2,), (5,), (1, 2), (2, 1), (2, 3), (4, 5)]
