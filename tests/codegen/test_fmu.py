@@ -60,7 +60,8 @@ class Unit:
 
 
 @pytest.mark.parametrize("name", [
-    "reactor with gaps", "inputs converged", "algebraic substeps", "restored noise-free",
+    "reactor with gaps", "inputs converged", "radau substeps", "algebraic substeps",
+    "algebraic midpoint", "restored noise-free",
 ])
 def test_it_is_the_python_step_from_any_state(name, tmp_path):
     one = case(name)

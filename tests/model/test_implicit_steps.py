@@ -451,3 +451,48 @@ def test_auto_where_the_rate_has_no_value():
 def test_methods_and_steps_are_checked(options, words):
     with pytest.raises(OptionError, match=words):
         system(pendulum, 2, 1, dt=0.1, **options)
+
+
+def turning(kind, **angles):
+    """A driven pendulum that goes round, whose torque solves an equation where it is a DAE."""
+    if kind == "dae":
+        return qpmhe.System.from_dae(
+            lambda x, z, u: np.stack([x[..., 1], z[..., 0] + u[..., 0] - 0.1 * x[..., 1]], -1),
+            lambda x, z: z + 0.1 * z**3 + np.sin(x[..., :1]), lambda x, z: x[..., :1],
+            dt=0.5, n=2, k=1, p=1, m=1, algebraic_guess=[0.0], steps=2, **angles,
+        )
+    return system(pendulum, 2, 1, dt=0.5, method=kind, steps=4, **angles)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["radau", "midpoint", "dae"])
+def test_angles_among_the_states_wrap(kind):
+    """As without angles, fed with a record that goes on past whole turns; from other turns, too."""
+    turn, plain = 2.0 * np.pi, turning(kind)
+    made = turning(kind, state_residual=qpmhe.angles([0]), output_residual=qpmhe.angles([0]))
+    generator, x = np.random.default_rng(2), np.array([2.0, 2.5])
+    start, Y, U = x + [0.3, -0.2], [], 0.4 + 0.2 * generator.normal(size=(20, 1))
+    for u in U:
+        Y.append(x[:1] + 0.1 * generator.normal(size=1))
+        x = plain.f(x, u) + 0.02 * generator.normal(size=2)
+    Y = np.array(Y)
+    wrapped = np.remainder(Y + np.pi, turn) - np.pi
+    assert np.ptp(np.round((Y - wrapped) / turn)) >= 2.0  # turns in the record
+    covariances = {"disturbance": 0.02**2 * np.eye(2), "noise": 0.1**2 * np.eye(1)}
+    observer = qpmhe.ExtendedKalman(prior=0.3**2 * np.eye(2), **covariances)
+    cost = qpmhe.QuadraticCost.from_covariances(**covariances)
+
+    def estimates(one, Y, start, engine):
+        mhe = qpmhe.MovingHorizonEstimator(
+            one, observer, cost, horizon=4, max_qps=2, initial_state=start, engine=engine
+        )
+        return mhe.run(Y, U)
+
+    expected = estimates(plain, Y, start, "python")
+    for engine in ["python", *["compiled"] * bool(find_compiler())]:
+        for turns in (0.0, -2.0):
+            found = estimates(made, wrapped, start + [turns * turn, 0.0], engine)
+            off = found.filtered - expected.filtered
+            off[:, 0] -= turn * np.round(off[:, 0] / turn)
+            assert np.abs(off).max() < 1e-9
+            np.testing.assert_allclose(found.costs, expected.costs, rtol=1e-9, atol=1e-12)
