@@ -186,6 +186,7 @@ class ContinuousTime:
         m: int = 0,
         algebraic_guess: ArrayLike | None = None,
         rate_guess: ArrayLike | None = None,
+        algebraic_set: ConvexSet | SoftSet | None = None,
         method: str = "radau",
         steps: int = 1,
         tolerance: float | None = None,
@@ -208,6 +209,8 @@ class ContinuousTime:
             Numbers of states, outputs, algebraic states and inputs.
         algebraic_guess, rate_guess : (k,) and (n,) array_like, optional
             Where z and the rates are looked for. The rates' is zero if left out.
+        algebraic_set : Box or Polytope, optional
+            A set of z alone, of dimension k; see `from_dae`.
         method, steps, tolerance, **options
             As for `from_dae`.
 
@@ -233,5 +236,5 @@ class ContinuousTime:
         return made_from_implicit(
             cast("type[System]", cls), residual, h, dt=dt, n=n, k=k, p=p, m=m,
             how=how, guess=algebraic_guess, rate_guess=rate_guess, options=options,
-            tolerance=allowed,
+            algebraic_set=algebraic_set, tolerance=allowed,
         )

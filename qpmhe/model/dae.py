@@ -27,7 +27,7 @@ from .index import check_index, unsolved
 from .model import Origin
 from .ode import timed_by_input, without_last
 from .points import FEW, Magnitude, Points, points
-from .sets import ConvexSet, SoftSet
+from .sets import ConvexSet, SoftSet, behind_free
 from .system_arguments import SystemOptions, checked_scales, checked_set, timed_options
 
 if TYPE_CHECKING:
@@ -222,7 +222,8 @@ def made_from_dae(
 def made_from_implicit(
     cls: type[System], residual: Function, h: Function, *, dt: float, n: int, k: int, p: int,
     m: int, how: Discretization, guess: ArrayLike | None, rate_guess: ArrayLike | None,
-    options: SystemOptions, tolerance: float = TOLERANCE,
+    options: SystemOptions, algebraic_set: ConvexSet | SoftSet | None = None,
+    tolerance: float = TOLERANCE,
 ) -> System:
     """The system that `System.from_implicit` describes: one whose rates are algebraic states."""
     n, k = dimension("n", n, 1), dimension("k", k, 0)
@@ -232,18 +233,21 @@ def made_from_implicit(
             f"algebraic_guess is missing: k is {k}; expected ({k},), where z is looked for."
         )
     start = np.zeros(0) if guess is None else vector("algebraic_guess", guess, k)
+    checked_set("algebraic_set", algebraic_set, k, ", the number of algebraic states")
     names = ("xdot", "x", *(("z",) if k else ()))
     # Of (x, (x', z), u), as `made_from_dae` takes them.
     of_residual = _of_parts("residual", residual, names, m, n, lambda x, v: (v[..., :n], x))
     of_output = _of_parts("h", h, names[1:], m, n, lambda x, _: (x,))
     made = made_from_dae(
         cls, lambda _, v: v[..., :n], of_residual, of_output, dt=dt, n=n, k=n + k, p=p, m=m,
-        how=how, guess=np.concatenate((rates, start)), options=options, tolerance=tolerance,
+        how=how, guess=np.concatenate((rates, start)), options=options,
+        algebraic_set=None if algebraic_set is None else behind_free(n, algebraic_set),
+        tolerance=tolerance,
     )
     return made.with_origin(recipe=(cls.from_implicit, {
         "residual": residual, "h": h, "dt": dt, "n": n, "k": k, "p": p, "m": m,
         "method": made.method, "steps": made.steps, "algebraic_guess": start if k else None,
-        "rate_guess": rates, **options,
+        "rate_guess": rates, "algebraic_set": algebraic_set, **options,
     }))
 
 

@@ -341,6 +341,19 @@ class Polytope(ConvexSet):
         self._check_not_empty()
 
 
+def behind_free(count: int, one: ConvexSet | SoftSet) -> ConvexSet | SoftSet:
+    """All (f, s) with any f (count,) and s in the set, as soft as that."""
+    hard, free = one.convex if isinstance(one, SoftSet) else one, np.full(count, np.inf)
+    wide = ConvexSet(
+        np.append(-free, hard.lower), np.append(free, hard.upper),
+        np.pad(hard.matrix, ((0, 0), (count, 0))), hard.row_lower, hard.row_upper,
+    )
+    if not isinstance(one, SoftSet):
+        return wide
+    none = np.zeros(count)
+    return SoftSet(wide, np.append(none, one.linear), np.append(none, one.quadratic))
+
+
 def equilibrated(matrix: Array) -> tuple[Array, Array]:
     """Factors of rows and columns that bring the geometric mean of each one's entries to 1."""
     there = matrix != 0.0

@@ -468,16 +468,21 @@ def test_a_set_of_algebraic_states_goes_into_augmented_models(engine):
         qpmhe.noisy_inputs(bounded)
 
 
-def test_an_implicit_equation_is_the_dae_that_it_contains():
-    """The swing model with its flow as it is written down, inertia times acceleration."""
-    def residual(xdot, x, z, u):
-        return np.concatenate((
-            xdot[:1] - x[1:], 0.25 * xdot[1:] - u + flows(x, z)[0] + 0.3 * x[1:], balance(x, z)
-        ))
+def balanced(xdot, x, z, u):
+    return np.concatenate((
+        xdot[:1] - x[1:], 0.25 * xdot[1:] - u + flows(x, z)[0] + 0.3 * x[1:], balance(x, z)
+    ))
 
-    made = System.from_implicit(
-        residual, voltage, dt=0.1, **SIZES, algebraic_guess=[0.0, 1.0], steps=2
+
+def implicit_swing(**options):
+    """The swing model with its flow as it is written down, inertia times acceleration."""
+    return System.from_implicit(
+        balanced, voltage, dt=0.1, **SIZES, algebraic_guess=[0.0, 1.0], **options
     )
+
+
+def test_an_implicit_equation_is_the_dae_that_it_contains():
+    made = implicit_swing(steps=2)
     for mine, other in zip(
         evaluated(made, X, U), evaluated(swing_system(steps=2), X, U), strict=True
     ):
@@ -516,6 +521,10 @@ def test_an_implicit_ode_has_the_step_of_the_explicit_one():
     (lambda x: x, 0, {}, ModelError, r"cannot be called as residual\(xdot, x\)"),
     (of_mass, 0, {"rate_guess": [1.0]}, ShapeError, "rate_guess has shape"),
     (lambda xdot, x, u: x - u, 0, {}, ModelError, "equation 0 depends on no algebraic state"),
+    (of_mass, 0, {"algebraic_set": Box([0.0], [1.0])}, qpmhe.errors.SetError,
+     "algebraic_set has dimension 1; expected 0, the number of algebraic states"),
+    (of_mass, 1, {"algebraic_guess": [0.0], "algebraic_set": [0.0, 1.0]}, qpmhe.errors.SetError,
+     r"algebraic_set is \[0.0, 1.0\]; expected a qpmhe.Box"),
 ])
 def test_bad_implicit_equations(residual, k, options, error, words):
     with pytest.raises(error, match=words):
@@ -586,6 +595,38 @@ def test_a_set_of_algebraic_states_is_a_constraint_of_the_solution(soft, engine)
     )
     np.testing.assert_allclose(one.states, two.states, rtol=0, atol=1e-9)
     assert np.abs(one.states - free.states).max() > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("held", [
+    Box([-INF, 0.99], [0.14, INF]).soften(linear=30.0, quadratic=2.0),
+    qpmhe.Polytope([[1.0, 0.5], [0.2, -1.0]], [0.64, -0.97]),
+    Box([-INF, 0.97], [INF, 1.1]) & qpmhe.Polytope([[1.0, 0.5]], [0.64]),
+], ids=["soft box", "polytope", "both"])
+def test_a_set_of_the_algebraic_states_of_an_implicit_equation(held, engine):
+    """As of the DAE that it contains; the rates are free."""
+    generator = np.random.default_rng(5)
+    U = 0.8 + 0.3 * generator.normal(size=(8, 1))
+    Y = np.array([0.95, 0.25]) + 0.1 * generator.normal(size=(8, 2))
+    observer, cost = weights(2, 2)
+    made = implicit_swing(algebraic_set=held)
+    rows, other = (one.constraints._bound[0] for one in (made, swing_system(algebraic_set=held)))
+    for name in ("function", "jacobian"):
+        np.testing.assert_allclose(
+            getattr(rows, name)(X, U[0]), getattr(other, name)(X, U[0]), rtol=0, atol=1e-12
+        )
+    options = {"horizon": 4, "initial_state": [0.3, 0.0], "max_qps": 3}
+    found, expected, free = (
+        MovingHorizonEstimator(one, observer, cost, engine=name, **options).run(Y, U)
+        for one, name in (
+            (pickle.loads(pickle.dumps(made)) if engine == "python" else made, engine),
+            (swing_system(algebraic_set=held), "python"), (swing_system(), "python"),
+        )
+    )
+    np.testing.assert_allclose(found.states, expected.states, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.costs, expected.costs, rtol=1e-9)
+    assert np.abs(found.states - free.states).max() > 1e-3  # the set acts
 
 
 def test_a_set_of_algebraic_states_of_another_size_is_refused():
