@@ -471,7 +471,7 @@ def test_angles_among_the_states_wrap(kind):
     turn, plain = 2.0 * np.pi, turning(kind)
     made = turning(kind, state_residual=qpmhe.angles([0]), output_residual=qpmhe.angles([0]))
     generator, x = np.random.default_rng(2), np.array([2.0, 2.5])
-    start, Y, U = x + [0.3, -0.2], [], 0.4 + 0.2 * generator.normal(size=(20, 1))
+    start, Y, U = x + np.array([0.3, -0.2]), [], 0.4 + 0.2 * generator.normal(size=(20, 1))
     for u in U:
         Y.append(x[:1] + 0.1 * generator.normal(size=1))
         x = plain.f(x, u) + 0.02 * generator.normal(size=2)
@@ -491,7 +491,7 @@ def test_angles_among_the_states_wrap(kind):
     expected = estimates(plain, Y, start, "python")
     for engine in ["python", *["compiled"] * bool(find_compiler())]:
         for turns in (0.0, -2.0):
-            found = estimates(made, wrapped, start + [turns * turn, 0.0], engine)
+            found = estimates(made, wrapped, start + turn * np.array([turns, 0.0]), engine)
             off = found.filtered - expected.filtered
             off[:, 0] -= turn * np.round(off[:, 0] / turn)
             assert np.abs(off).max() < 1e-9
