@@ -49,7 +49,7 @@ class Choice(NamedTuple):
 
     def __str__(self) -> str:
         lines = [
-            f"step: {_named(self.how)}, the cheapest with an error up to {self.tolerance:g} of "
+            f"step: {self.how.words}, the cheapest with an error up to {self.tolerance:g} of "
             "the states, of"
         ]
         for one, error in self.errors.items():
@@ -119,15 +119,11 @@ def choice(
         best = min(errors, key=lambda one: errors[one])
         raise ModelError(
             f"no discretisation that method='auto' tries has an error of at most {tolerance:g} of "
-            f"the states in dt = {dt:g}; the least one is {errors[best]:.1e}, of {_named(best)}. "
+            f"the states in dt = {dt:g}; the least one is {errors[best]:.1e}, of {best.words}. "
             "Take a larger tolerance or a shorter dt, or choose method and steps yourself."
         )
     cheapest = min(good, key=lambda one: (_WORK[one.method] * one.steps, errors[one]))
     return Choice(cheapest, tolerance, errors)
-
-
-def _named(how: Discretization) -> str:
-    return f"{how.method} with {how.steps} substep{'s' * (how.steps != 1)}"
 
 
 def _stepped(step: Callable[[Array, Array, Array], Array], dt: float, where: Points) -> Array:

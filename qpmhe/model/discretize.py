@@ -37,6 +37,11 @@ class Discretization(NamedTuple):
         """The coefficients, of an implicit method."""
         return COLLOCATIONS[self.method]
 
+    @property
+    def words(self) -> str:
+        """Both, as text."""
+        return f"{self.method} with {self.steps} substep{'s' * (self.steps != 1)}"
+
 
 def checked_discretization(
     method: str, steps: int, methods: tuple[str, ...] = METHODS

@@ -405,6 +405,18 @@ def test_an_iteration_that_fails_is_a_failed_stage(engine):
     assert np.isfinite(mhe.update([1.5], [0.0]).state).all()
 
 
+def test_the_explanation_names_the_step_and_where_it_is_checked():
+    made = system(pendulum, 2, 1, dt=0.2, method="radau", steps=2)
+    for one in (made, qpmhe.augment_parameters(made, nominal=[0.1])):
+        step = one.explain().split("step: ")[1]
+        assert step.startswith("radau with 2 substeps in dt = 0.2. Each estimator compares it")
+        assert "qpmhe doctor" in step
+    given = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1)
+    chosen = system(pendulum, 2, 1, dt=0.2, method="auto", tolerance=1e-3)
+    for one in (given, chosen):
+        assert "Each estimator" not in one.explain()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate", "n", "options", "method"), [
     (pendulum, 2, {"m": 1, "dt": 0.2}, "rk4"),
