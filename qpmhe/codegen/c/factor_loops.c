@@ -6,76 +6,42 @@ static int mhe_dense_terms(const real *Q, const real *w, mhe_terms *t)
     return 0;
 }
 
-/* Two rows at a time share what they read of the rows above. These are the columns of both that are
- * updated at once, while they are factorised and in the next block: as many as fit in a processor's
- * registers, and fixed numbers, so that a compiler can keep them there. Which are the quickest, only
- * trying tells: GCC 12 on x86-64, at -O3 and -O2. ROW_COLUMNS divides the width of a panel. */
-#define ROW_COLUMNS (NX >= 24 ? 16 : NX > 4 && WIDTH % 8 == 0 ? 8 : WIDTH % 12 == 0 ? 12 : 4)
-#define TILE_COLUMNS (NX > 24 ? NX : NX > 20 || WIDTH == 36 ? 24 : WIDTH == 12 ? 8 : 4)
-
-/* Note a pivot's inverse; whether it is positive. */
-static int mhe_take_pivot(real pivot, real *inverse)
-{
-    if (!(pivot > 0) || !isfinite(pivot)) return 0;
-    *inverse = 1 / pivot;
-    return 1;
-}
+/* Columns of a panel that are updated at once: as many as fit in a processor's registers, and
+ * a fixed number, so that a compiler can keep them there. */
+#define CHUNK (WIDTH <= 48 ? WIDTH : 32)
 
 /* Overwrite the panels by the rows of D L', with H = L D L'; whether H was positive definite.
- * No square roots: their latency would be half of the time at small sizes. Factors are not computed
- * ahead: the code that GCC 12 made of that took up to 12 times as long. */
+ * No square roots: their latency would be half of the time at small sizes. */
 static int mhe_factorise(mhe_workspace *k, int count)
 {
     for (int i = 0; i <= count; i++) {
         real *restrict panel = k->panels + i * NX * WIDTH;
         real *restrict inverse = k->inverse_pivots + i * NX;
-        for (int r = 0; r < NX; r += 2) {
-            const int other = r + 1 < NX; /* 0 where there is no second row */
-            real *row = panel + r * WIDTH, *below = row + other * WIDTH;
-            for (int b = r / ROW_COLUMNS * ROW_COLUMNS; b < WIDTH; b += ROW_COLUMNS) {
-                real sums[ROW_COLUMNS], more[ROW_COLUMNS];
-                for (int c = 0; c < ROW_COLUMNS; c++) sums[c] = row[b + c];
-                for (int c = 0; c < ROW_COLUMNS; c++) more[c] = below[b + c];
+        for (int r = 0; r < NX; r++) {
+            real *row = panel + r * WIDTH;
+            for (int b = r / CHUNK * CHUNK; b < WIDTH; b += CHUNK) {
+                real sums[CHUNK];
+                for (int c = 0; c < CHUNK; c++) sums[c] = row[b + c];
                 for (int j = 0; j < r; j++) {
-                    const real *above = panel + j * WIDTH;
-                    const real f = above[r] * inverse[j], g = above[r + other] * inverse[j];
-                    for (int c = 0; c < ROW_COLUMNS; c++) {
-                        sums[c] -= f * above[b + c];
-                        more[c] -= g * above[b + c];
-                    }
+                    const real *above = panel + j * WIDTH + b, factor = panel[j * WIDTH + r] * inverse[j];
+                    for (int c = 0; c < CHUNK; c++) sums[c] -= factor * above[c];
                 }
-                for (int c = 0; c < ROW_COLUMNS; c++) row[b + c] = sums[c];
-                if (other)
-                    for (int c = 0; c < ROW_COLUMNS; c++) below[b + c] = more[c];
+                for (int c = 0; c < CHUNK; c++) row[b + c] = sums[c];
             }
-            if (!mhe_take_pivot(row[r], inverse + r)) return 0;
-            if (!other) break;
-            const real f = row[r + 1] * inverse[r];
-            for (int c = (r + 1) & ~3; c < WIDTH; c++) below[c] -= f * row[c];
-            if (!mhe_take_pivot(below[r + 1], inverse + r + 1)) return 0;
+            const real pivot = row[r];
+            if (!(pivot > 0) || !isfinite(pivot)) return 0;
+            inverse[r] = 1 / pivot;
         }
         if (i == count) break;
-        /* The upper half; a tile may read beyond a row's end, but does not write there. */
-        real *next = panel + NX * WIDTH;
-        for (int r = 0; r < NX; r += 2) {
-            const int other = r + 1 < NX;
-            for (int b = r / TILE_COLUMNS * TILE_COLUMNS; b < NX; b += TILE_COLUMNS) {
-                real sums[TILE_COLUMNS], more[TILE_COLUMNS];
-                for (int c = 0; c < TILE_COLUMNS; c++) sums[c] = more[c] = 0;
-                for (int j = 0; j < NX; j++) {
-                    const real *row = panel + j * WIDTH + NX;
-                    const real f = row[r] * inverse[j], g = row[r + other] * inverse[j];
-                    for (int c = 0; c < TILE_COLUMNS; c++) {
-                        sums[c] += f * row[b + c];
-                        more[c] += g * row[b + c];
-                    }
-                }
-                const int width = NX - b < TILE_COLUMNS ? NX - b : TILE_COLUMNS;
-                real *to = next + r * WIDTH + b;
-                for (int c = 0; c < width; c++) to[c] -= sums[c];
-                if (other)
-                    for (int c = 0; c < width; c++) to[WIDTH + c] -= more[c];
+        real *restrict next = panel + NX * WIDTH;
+        for (int r = 0; r < NX; r++) {
+            real sums[NX];
+            for (int c = 0; c < NX; c++) sums[c] = 0;
+            for (int j = 0; j < NX; j++) {
+                const real *row = panel + j * WIDTH + NX, factor = row[r] * inverse[j];
+                for (int c = 0; c < NX; c++) sums[c] += factor * row[c];
             }
+            for (int c = 0; c < NX; c++) next[r * WIDTH + c] -= sums[c];
         }
     }
     return 1;
