@@ -215,6 +215,22 @@ def test_any_units_of_the_states_give_the_same_step(rate, low, high, dt, kind):
     assert (np.abs(other_slopes - slopes) < 1e-10 * sizes).all()
 
 
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("method", list(COLLOCATIONS))
+def test_the_compiled_slope_at_rest_has_pivots(method):
+    """There no equation has a size: a first pivot near 0 had cost four digits."""
+    first = np.linalg.inv(COLLOCATIONS[method].A)[0, 0]
+    x, J = ca.SX.sym("x", 2), np.array([[first * (1.0 - 1e-13), 1.0], [-1.0, 0.3]])
+    model = qpmhe.from_casadi(
+        ca.Function("rate", [x], [J @ x]), ca.Function("h", [x], [x[0]]), dt=1.0, method=method,
+        compiled=False,
+    ).symbolic
+    at_rest, elsewhere = evaluated_in_c(model)(
+        "f_jacobian", np.array([[0.0, 0.0], [1.0, 2.0]]), np.empty((2, 0))
+    )
+    np.testing.assert_allclose(at_rest, elsewhere, rtol=0, atol=1e-12 * np.abs(elsewhere).max())
+
+
 def drawn(rate, dt, low, high):
     """The model of a rate, and 1,500 random states, where most steps have no use."""
     n, generator = len(low), np.random.default_rng(1)

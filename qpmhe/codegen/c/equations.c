@@ -60,7 +60,8 @@ static int mhe_factor_equations(int size, real *M, real *per, int *pivot)
         int best = c;
         for (int r = c; r < size; r++) {
             const real share = (real)fabs(column[r]) * per[r];
-            if (share > most) {
+            /* Equations without a size are compared by their numbers. */
+            if (share > most || (isinf(share) && fabs(column[r]) > fabs(column[best]))) {
                 most = share;
                 best = r;
             }
