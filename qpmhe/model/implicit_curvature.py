@@ -102,6 +102,8 @@ class ImplicitCurvature:
         matrix = newton_matrix(A, h, rates[..., :n])
         right = h[:, None, None, None] * np.einsum("ij,kjab->kiab", A, rates)
         sizes = np.abs(x) + np.abs(W[..., :n]).max(axis=1)
+        flows = np.abs(rates[..., :n]).max(axis=1) @ sizes[..., None]
+        sizes = sizes + h[:, None] * flows[..., 0]
         inverses = inverse(matrix, np.tile(sizes, s))
         moved = solved(matrix, right.reshape(count, s * n, n + m), inverses)
         moved = moved.reshape(count, s, n, n + m)

@@ -151,7 +151,7 @@ class ImplicitStep:
             # (I - h A J) dZ/dx = h A J (1, ..., 1).
             right = h[:, None, None, None] * np.einsum("ij,kjab->kiab", method.A, J)
             matrix = newton_matrix(method.A, h, J)
-            sizes = np.tile(np.abs(x) + np.abs(W[..., :n]).max(axis=1), s)
+            sizes = np.tile(_equations(np.abs(x) + np.abs(W[..., :n]).max(axis=1), h, J), s)
             dZ = solved(matrix, right.reshape(count, s * n, n), inverse(matrix, sizes))
             own = identity + np.einsum("i,kiab->kab", method.d, dZ.reshape(count, s, n, n))
             slopes, following = own @ slopes, self._end(x, W)
@@ -219,8 +219,8 @@ class ImplicitStep:
         w, u, h, many = w[at], u[at], h[at], (len(at), count)
         J = self._jacobian(w, u)
         first = eliminated(self._rate(w, u), J, w, n)
-        sizes = np.abs(w[:, :n]) + h[:, None] * np.abs(first.rate)
         jacobians = np.broadcast_to(first.jacobian[:, None], (*many, n, n))
+        sizes = _equations(np.abs(w[:, :n]) + h[:, None] * np.abs(first.rate), h, jacobians)
         inverses = inverse(newton_matrix(A, h, jacobians), np.tile(sizes, count))
         frozen = np.repeat(J[:, None], count, axis=1), np.repeat(w[:, None], count, axis=1)
         now = np.repeat(w[:, None], count, axis=1)
@@ -239,7 +239,8 @@ class ImplicitStep:
             if k == 0:
                 scale = np.abs(w) + np.abs(moves).max(axis=1)
                 least, spread = self._rounding(first, h, scale, sizes)
-                left &= (spread <= LARGEST_SPREAD * scale[:, :n]).all(axis=1)
+                most = _reach(scale[:, :n], h, jacobians)
+                left &= (spread <= LARGEST_SPREAD * most).all(axis=1)
                 rounding = np.where(least > 0.0, scale / least, 1.0)
                 per = np.where(scale > 0.0, 1.0 / scale, 1.0)
             parts = (moves * per[:, None]).reshape(len(at), -1)
@@ -303,20 +304,21 @@ class ImplicitStep:
             found = eliminated(values, J, w, n)
             moved = np.maximum(np.abs(W[at, :, :n]), h[at, None, None] * np.abs(found.rate))
             matrix = newton_matrix(self._method.A, h[at], found.jacobian)
-            rows = np.tile(np.abs(x[at]) + moved.max(axis=1), len(self._method.A))
+            rows = _equations(np.abs(x[at]) + moved.max(axis=1), h[at], found.jacobian)
+            rows = np.tile(rows, len(self._method.A))
             inverses, solve = inverse(matrix, rows), partial(_solved, matrix, rows)
             moves = self._correction(found, solve, h[at], W[at])
             step, k = moves[..., :n], W.shape[2] - n
             # What rounding of the states and of their flows amounts to in each equation, or what
             # the inverse leaves of it in the stages, if that is less.
-            own = size = np.abs(x[at]) + np.abs(W[at, :, :n] + step).max(axis=1)
-            flows = (np.abs(found.jacobian).max(axis=1) @ size[..., None])[..., 0]
-            size = size + h[at, None] * flows
+            size = np.abs(x[at]) + np.abs(W[at, :, :n] + step).max(axis=1)
+            reach = _reach(size, h[at], found.jacobian)
+            size = _equations(size, h[at], found.jacobian)
             sizes = np.repeat(size[:, None], len(self._method.A), axis=1)
             spread = _times(np.abs(inverses), sizes)
             sizes = np.minimum(sizes, spread)
             length = share(step, sizes)
-            length[(spread > LARGEST_SPREAD * own[:, None]).any(axis=(1, 2))] = np.nan
+            length[(spread > LARGEST_SPREAD * reach[:, None]).any(axis=(1, 2))] = np.nan
             if k:
                 behind = algebraic_sizes(found, sizes, np.abs(W[at, :, n:] + moves[..., n:]))
                 length = np.maximum(length, share(moves[..., n:], behind))
@@ -369,6 +371,24 @@ def newton_matrix(A: Array, h: Array, J: Array) -> Array:
     found: Array = blocks.transpose(0, 1, 3, 2, 4).reshape(count, s * n, s * n)
     found += np.eye(s * n)
     return found
+
+
+def _flows(sizes: Array, h: Array, J: Array) -> tuple[Array, Array]:
+    """What states of these sizes (K, n) add to each other, and to themselves, as shares."""
+    slopes = h[:, None, None] * np.abs(J).max(axis=1)
+    return (slopes @ sizes[..., None])[..., 0], np.diagonal(slopes, axis1=1, axis2=2)
+
+
+def _equations(sizes: Array, h: Array, J: Array) -> Array:
+    """How large the terms of the states' equations are; at rest they cancel."""
+    return sizes + _flows(sizes, h, J)[0]
+
+
+def _reach(sizes: Array, h: Array, J: Array) -> Array:
+    """How large states get by single terms: also one that is 0, at rest, has a size."""
+    flows, own = _flows(sizes, h, J)
+    reach: Array = sizes + flows / (1.0 + own)
+    return reach
 
 
 def _solved(matrix: Array, sizes: Array, stages: Array) -> Array:

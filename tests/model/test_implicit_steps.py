@@ -231,6 +231,30 @@ def test_the_compiled_slope_at_rest_has_pivots(method):
     np.testing.assert_allclose(at_rest, elsewhere, rtol=0, atol=1e-12 * np.abs(elsewhere).max())
 
 
+@pytest.mark.parametrize("kind", [
+    "python", pytest.param("compiled", marks=pytest.mark.skipif(
+        find_compiler() is None, reason="there is no C compiler")),
+])
+@pytest.mark.parametrize("method", list(COLLOCATIONS))
+def test_a_state_at_rest_in_0_has_a_step(method, kind):
+    """A mass beside its spring's rest: the terms of its velocity's equation cancel, and f was NaN.
+
+    And with a velocity near 0, pivots by its size alone had cost the derivative 13 digits.
+    """
+    for stiffness in 1e-9, 1e-3, 1e3:
+        x, rest = ca.SX.sym("x", 2), np.array([1.0, 0.0])
+        J = np.array([[0.0, 1.0], [-stiffness, -0.1]])
+        model = qpmhe.from_casadi(
+            ca.Function("rate", [x], [J @ (x - rest)]), ca.Function("h", [x], [x[0]]), dt=1e-2,
+            method=method, compiled=False,
+        ).symbolic
+        one = evaluated_in_c(model) if kind == "compiled" else Evaluator(machine(model, False)).one
+        states = np.array([[1.2, 0.5], [1.0, 0.0], [1.0, 1e-14], [1.0, -1e-25], [1.0, 1e-200]])
+        values, slopes = (one(name, states, np.empty((5, 0))) for name in ("f", "f_jacobian"))
+        np.testing.assert_allclose(values[1:], states[1:], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(slopes[1:], slopes[[0] * 4], rtol=0, atol=1e-14)
+
+
 def drawn(rate, dt, low, high):
     """The model of a rate, and 1,500 random states, where most steps have no use."""
     n, generator = len(low), np.random.default_rng(1)

@@ -35,16 +35,26 @@ static void mhe_stage_residual(const real *rates, real h, const real *W, real *r
         }
 }
 
-/* Reciprocal sizes of the states' equations in a step: of x, of what the stages W add, and of the flows
- * at them, of which the first few are known. */
+/* Reciprocal sizes of the states' equations in a step: of x, of what the stages W add, and of the terms
+ * of the flows at them, of which the first few are known. At rest these cancel. */
 static void mhe_state_reciprocals(const real *x, real h, const real *W, int known,
                                   const mhe_reduced *r, real *per)
 {
+    real states[NX];
     for (int a = 0; a < NX; a++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++) most = mhe_max((real)fabs(W[i * NW + a]), most);
         for (int i = 0; i < known; i++) most = mhe_max(h * (real)fabs(r[i].rate[a]), most);
-        per[a] = (real)fabs(x[a]) + most;
+        states[a] = (real)fabs(x[a]) + most;
+    }
+    for (int a = 0; a < NX; a++) {
+        per[a] = states[a];
+        for (int b = 0; b < NX; b++) {
+            real most = 0;
+            for (int i = 0; i < known; i++)
+                most = mhe_max((real)fabs(r[i].jacobian[a * NX + b]), most);
+            per[a] += h * most * states[b];
+        }
     }
     mhe_reciprocals(NX, per);
 }
@@ -69,7 +79,7 @@ static int mhe_stage_factor(real h, const mhe_reduced *r, const real *per, real 
 static int mhe_stage_sizes(const real *x, real h, const real *W, const real *step,
                             const mhe_reduced *r, const real *M, const int *pivot, real *sizes)
 {
-    real states[NX], equations[NX], inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
+    real states[NX], equations[NX], reach[NX], inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
     for (int a = 0; a < NX; a++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++)
@@ -77,13 +87,17 @@ static int mhe_stage_sizes(const real *x, real h, const real *W, const real *ste
         states[a] = (real)fabs(x[a]) + most;
     }
     for (int a = 0; a < NX; a++) {
+        real own = 1;
         equations[a] = states[a];
         for (int b = 0; b < NX; b++) {
             real most = 0;
             for (int i = 0; i < MHE_STAGES; i++)
                 most = mhe_max((real)fabs(r[i].jacobian[a * NX + b]), most);
             equations[a] += h * most * states[b];
+            if (a == b) own += h * most;
         }
+        /* By single terms: also a state that is 0, at rest, has a size. */
+        reach[a] = states[a] + (equations[a] - states[a]) / own;
     }
     for (int i = 0; i < MHE_UNKNOWNS * MHE_UNKNOWNS; i++)
         inverse[i] = i / MHE_UNKNOWNS == i % MHE_UNKNOWNS;
@@ -93,7 +107,7 @@ static int mhe_stage_sizes(const real *x, real h, const real *W, const real *ste
         for (int j = 0; j < MHE_UNKNOWNS; j++)
             left += (real)fabs(inverse[i * MHE_UNKNOWNS + j]) * equations[j % NX];
         sizes[i] = left < equations[i % NX] ? left : equations[i % NX];
-        if (left > (real)$spread * states[i % NX]) return 0;
+        if (left > (real)$spread * reach[i % NX]) return 0;
     }
     return 1;
 }

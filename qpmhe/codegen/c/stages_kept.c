@@ -124,7 +124,7 @@ static void mhe_kept_moves(const real *x, const real *u, real h, const mhe_reduc
 static int mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const mhe_modes *modes,
                            const real *moves, real *sizes, real *shares)
 {
-    real equations[NX];
+    real equations[NX], reach[NX];
     for (int j = 0; j < NW; j++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++)
@@ -132,15 +132,16 @@ static int mhe_kept_sizes(const real *w, real h, const mhe_reduced *r, const mhe
         sizes[j] = (real)fabs(w[j]) + most;
     }
     for (int a = 0; a < NX; a++) {
-        equations[a] = $real * sizes[a];
-        for (int b = 0; b < NX; b++)
-            equations[a] += h * (real)fabs(r->jacobian[a * NX + b]) * sizes[b];
+        real flows = 0;
+        for (int b = 0; b < NX; b++) flows += h * (real)fabs(r->jacobian[a * NX + b]) * sizes[b];
+        equations[a] = $real * sizes[a] + flows;
+        reach[a] = sizes[a] + flows / (1 + h * (real)fabs(r->jacobian[a * NX + a]));
     }
     for (int a = 0; a < NX; a++) {
         real left = 0;
         for (int b = 0; b < NX; b++) left += (real)fabs(modes->one[b * NX + a]) * equations[b];
         shares[a] = left < equations[a] ? left : equations[a];
-        if (!(left <= (real)$spread * sizes[a])) return 0;
+        if (!(left <= (real)$spread * reach[a])) return 0;
     }
     mhe_algebraic_sizes(r, sizes + NX, shares, shares + NX);
     for (int j = 0; j < NW; j++) shares[j] = shares[j] > 0 ? sizes[j] / shares[j] : 1;

@@ -60,7 +60,7 @@ static void $slope(const real *x, const real *u, real dt, real *next, real *A)
     real W[MHE_STAGE_VALUES], per[NX];
     mhe_reduced r[MHE_STAGES];
     if (mhe_solve_stages(x, u, dt, 1, W, r)) {
-        mhe_state_reciprocals(x, dt, W, 0, r, per);
+        mhe_state_reciprocals(x, dt, W, MHE_STAGES, r, per);
         mhe_step_end(x, W, next);
         if (mhe_step_slope(dt, r, per, A)) return;
     }
