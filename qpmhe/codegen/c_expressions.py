@@ -225,7 +225,8 @@ class Expressions(ABC):
             return REAL, ANY
         if node.type in ("string", "char"):
             return INTEGER, ANY
-        number = int(node.value.rstrip("uUlL"), 0)
+        digits = node.value.rstrip("uUlL")
+        number = int(digits, 8 if digits.isdigit() and digits[0] == "0" else 0)
         return INTEGER, (number, number)
 
     def _of_id(self, node: Any) -> tuple[Any, Any]:
@@ -350,6 +351,8 @@ class Expressions(ABC):
                 return inner, (numbers[0], numbers[0]) if numbers else ANY
             return inner, self._frame.ranges.get(name, ANY) if name else ANY
         if op == "&":
+            if isinstance(node.expr, c_ast.ID) and self._frame.types.get(node.expr.name) == INTEGER:
+                raise UnboundedError(f"{self._frame.name} keeps the address of {node.expr.name}")
             return ("to", kind, None), ANY
         if op == "!":
             truth = truth_of(value)

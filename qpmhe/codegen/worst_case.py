@@ -104,10 +104,11 @@ class WorstCase(Expressions):
         node_of = self._functions.get(name)
         parameters = node_of.decl.type.args.params if node_of and node_of.decl.type.args else []
         for k, one in enumerate(arguments):
-            _, value = self._value(one)
+            variable = self._pointed(one)
+            is_address = isinstance(one, c_ast.UnaryOp) and variable is not None
+            value = ANY if is_address else self._value(one)[1]
             is_own = isinstance(value, Place) and isinstance(value.base, str)
             given.append(ANY if is_own else value)
-            variable = self._pointed(one)
             own = parameters[k].name if k < len(parameters) else None
             if variable is None or own is None:
                 continue
@@ -176,9 +177,7 @@ class WorstCase(Expressions):
         if isinstance(node, c_ast.Decl):
             return _Flow(self._declare(node))
         if isinstance(node, c_ast.Switch):
-            cost, _ = self._measured(node.cond)
-            inside = self._block(node.stmt.block_items or ())
-            return _Flow(cost + (_larger(inside.passed, inside.left) or Counter()))
+            return self._switch(node)
         if isinstance(node, (c_ast.Case, c_ast.Default)):
             # Another case may lead behind what ends this one.
             inside = self._block(node.stmts)
@@ -233,6 +232,18 @@ class WorstCase(Expressions):
             cost + largest(passed) if passed else None, cost + largest(left) if left else None
         )
 
+    def _switch(self, node: Any) -> _Flow:
+        """All cases one after another; any of them may be the first, the last, or none."""
+        cost = Counter(self._measured(node.cond)[0])
+        changed: dict[str, Any] = {}
+        self._collect(node.stmt, changed, False)
+        for one in (*(node.stmt.block_items or ()), None):
+            for name in changed:
+                self._assign(name, ANY)
+            flow = self._statement(one)
+            cost.update(_larger(flow.passed, flow.left) or Counter())
+        return _Flow(cost)
+
     def _loop(self, node: Any) -> _Flow:
         frame = self._frame
         total = Counter[Any]()
@@ -243,7 +254,9 @@ class WorstCase(Expressions):
         following = node.next if isinstance(node, c_ast.For) else None
         start, changes = dict(frame.ranges), self._changes(node)
         never = node.cond is not None and truth_of(self._measured(node.cond)[1]) is False
-        if isinstance(node, c_ast.DoWhile) and never:
+        if isinstance(node, c_ast.DoWhile):
+            if not never or _reads(node.cond):  # what it reads may be another number by then
+                raise UnboundedError(f"{frame.name} has a loop without a bound")
             flow = self._statement(node.stmt)
             return _Flow(_larger(flow.passed, flow.left))
         frame.ranges = dict(start)
@@ -256,6 +269,8 @@ class WorstCase(Expressions):
         if not trips:
             frame.ranges = dict(start)
             return _Flow(total + self._measured(node.cond)[0])
+        if counter and changes.get(counter) != ((0, step) if step > 0 else (-step, 0)):
+            counter = None  # changed elsewhere, too
         inside = dict(frame.ranges)
         for name, change in changes.items():
             low, high = span(start.get(name, ANY))
@@ -414,6 +429,8 @@ class WorstCase(Expressions):
     def _steps(self, node: Any) -> dict[str, int]:
         """The variables that each iteration changes by a number, and this number."""
         loop = node.next if isinstance(node, c_ast.For) else node.stmt
+        if loop is node.stmt and _continues(loop):
+            return {}
         parts = []
         if isinstance(loop, c_ast.ExprList):
             parts = loop.exprs
@@ -504,6 +521,15 @@ def _reads(node: Any) -> bool:
     if isinstance(node, (c_ast.ID, c_ast.FuncCall)):
         return True
     return any(_reads(child) for _, child in node.children())
+
+
+def _continues(node: Any) -> bool:
+    """Whether a loop's body may go on with the next iteration before its end."""
+    if isinstance(node, c_ast.Continue):
+        return True
+    return not isinstance(node, (c_ast.For, c_ast.While, c_ast.DoWhile)) and any(
+        _continues(child) for _, child in node.children()
+    )
 
 
 def _larger(one: Counter[Any] | None, other: Counter[Any] | None) -> Counter[Any] | None:

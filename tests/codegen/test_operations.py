@@ -110,6 +110,10 @@ def test_long_loops_take_their_dearest_iteration():
     ("for (int i = 0; i < 2; i++) for (int j = columns[i]; j != columns[i + 1]; j++) s += 1;",
      (3, 0, 0, 0)),
     ("switch (n) { case 0: s += 1; break; case 1: s *= 2; }", (1, 1, 0, 0)),
+    # Counters that the body moves, too, are not at every step.
+    ("for (int i = 0; i < 10; i += 2) { for (int j = 0; j < i; j++) s += 1; if (s > 1) i += 1; }",
+     (45, 0, 0, 0)),
+    ("for (int i = 0; i < 010; i++) s += 1;", (8, 0, 0, 0)),
 ])
 def test_statements(body, expected):
     assert operations(f"void mhe_f(int n, real s) {{ {body} }}\n") == expected
@@ -119,10 +123,25 @@ def test_statements(body, expected):
     "for (;;) s += 1;", "while (s > 0) s /= 2;", "for (int i = 0; i < n; i++) s += 1;",
     "for (int i = 0; i < 3; i++) { s += 1; i -= 1; }", "again: s += 1; goto again;",
     "int i = 3; while (i > 0) { if (s > 0) i--; s += 1; }",
+    "int i = 3; while (i > 0) { if (s > 0) continue; i--; }",
+    "int again = 0; do { s += 1; again = s > 0; } while (again);",
+    "int i = 3; do { s += 1; } while (i-- > 0);",
+    # Which case ends a switch, only the data know; in each, only those before may have run.
+    "int k = 2; switch (n) { case 0: k = 9; break; case 1: k = 5; } "
+    "for (int i = 0; i < k; i++) s += 1;",
+    "int k = 9; switch (n) { case 0: k = 5; break; case 1: for (int i = 0; i < k; i++) s += 1; }",
 ])
 def test_what_has_no_bound_is_said(body):
     with pytest.raises(UnboundedError, match=r"mhe_f has a (loop without a bound|label|goto)"):
         operations(f"void mhe_f(int n, real s) {{ {body} }}\n")
+
+
+def test_an_address_that_is_kept_is_said():
+    """What is written by it is not followed."""
+    text = "void mhe_f(real s) { int m = 2; int *p = &m; *p = 9; "
+    text += "for (int i = 0; i < m; i++) s += 1; }"
+    with pytest.raises(UnboundedError, match="mhe_f keeps the address of m"):
+        operations(text)
 
 
 def test_what_pointers_and_structures_say():
