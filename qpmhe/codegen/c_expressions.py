@@ -88,6 +88,7 @@ class Expressions(ABC):
         self._globals: dict[str, Any] = {}
         self._numbers: dict[str, Any] = {}
         self._functions: dict[str, Any] = {}
+        self._walked = 0  # loops so far, each time that they are walked
         self._done: dict[Any, tuple[Counter[Any], Any, dict[str, Any]]] = {}
         self._sizes = {REAL: 8, INTEGER: 4}
         # Expressions whose cost is the same in all calls, by their nodes' places in the memory.

@@ -47,5 +47,7 @@ def bounded(text: str, name: str, needs: Needs) -> dict[str, Any]:
         operations = walk.operations("update")
     except UnboundedError as error:
         return {"unbounded": str(error)}
+    except Exception as error:  # of C that the walk does not know: the estimator is written
+        return {"unbounded": f"the walk of its syntax tree ended ({type(error).__name__}: {error})"}
     others = sorted(operations.keys() - set(FLOPS))
     return {"operations": {one: operations[one] for one in (*FLOPS, *others)}}

@@ -27,6 +27,8 @@ __all__ = ["Known", "UnboundedError", "WorstCase"]
 # A loop whose body costs another number in each iteration is summed up to so many iterations; a
 # longer one costs as many times what its dearest iteration may.
 _MOST_SUMMED = 600
+# So many loops are looked at more closely; of later ones, the dearest iteration counts for all.
+_MOST_WALKED = 4_000
 # Neither operations nor functions of libm: signs, tests and copies.
 _FREE = frozenset((
     "fabs", "isfinite", "isnan", "isinf", "signbit", "copysign", "memcmp", "memcpy", "memset",
@@ -352,7 +354,8 @@ class WorstCase(Expressions):
             for one in values:
                 whole.update(once(**{counter: (one, one)}))
             return whole
-        if not is_summed or not whole:
+        self._walked += 1
+        if not is_summed or not whole or self._walked > _MOST_WALKED:
             return _times(trips, whole)
         last, first = (once(**{counter: (one, one)}) for one in (values[-1], values[0]))
         if last == first == whole:
