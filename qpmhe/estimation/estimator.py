@@ -509,9 +509,8 @@ class MovingHorizonEstimator(EstimatorMemory):
 
         With ``engine="auto"``, an estimator without samples first compiles its step if so many are
         to come that this is earned back, by an estimate from its sizes, or takes a library that is
-        in the cache by now. Calls of the compiler take a minute at most; where they fail, the Python
-        step runs.
-        `Run.engine_reason` has the reason.
+        in the cache by now. Calls of the compiler take a minute at most; where they fail,
+        the Python step runs. `Run.engine_reason` has the reason.
 
         Parameters
         ----------
