@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -207,10 +210,29 @@ def solve_qp(
         raise typer.Exit(1)
 
 
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Show our own warnings in one line; their place in the package helps nobody here."""
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if not category.__module__.startswith(("qpmhe.", "qpmhe_solvers.")):
+                usual(message, category, *place, **more)
+                return
+            Console(stderr=True).print(
+                f"[bold yellow]warning:[/] {escape(str(message))}", highlight=False, soft_wrap=True
+            )
+
+        warnings.showwarning = show
+        yield
+
+
 def main() -> None:
-    """Entry point: report our own errors in one line, without a traceback."""
+    """Entry point: report our own errors and warnings in one line, without a traceback."""
     try:
-        app()
+        with _plain_warnings():
+            app()
     except QpmheError as error:
         Console(stderr=True).print(
             f"[bold red]Error:[/] {escape(str(error))}", highlight=False, soft_wrap=True

@@ -32,7 +32,7 @@ from .reach import compared
 from .run import FixedLag, Run, RunSource
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require, with_scaled_constraints
-from .step_length import check_step
+from .step_length import check_step, outermost
 from .time_index import paired_record
 
 Array = NDArray[np.float64]
@@ -216,6 +216,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._sensors = (system.p,)
         self._takes_steps = False  # whether a step of another length has been tried
+        self._tries_inputs = False  # whether `check_inputs` has something to do
         # The system as this estimator evaluates it.
         self._initial_state: Array
         self._initial_state, self._own_system = self._checked_start(initial_state, own)
@@ -224,11 +225,9 @@ class MovingHorizonEstimator(EstimatorMemory):
             check_correction(
                 self._own_system, observer, cost, self._initial_state, self._usual_input
             )
-            for check in check_step, check_branches:
-                check(
-                    self._own_system, cost, observer.initial_covariance(), self._initial_state,
-                    self._usual_input, 3,
-                )
+            place = cost, observer.initial_covariance(), self._initial_state, self._usual_input
+            self._tries_inputs = check_step(self._own_system, *place, 3) and self._inputs > 0
+            check_branches(self._own_system, *place, 3)
             self._own_system = compared(
                 self._own_system, cost, observer.initial_covariance(), self._initial_state,
                 self._usual_input, horizon,
@@ -456,6 +455,39 @@ class MovingHorizonEstimator(EstimatorMemory):
         behind = np.tile(parameters, (samples, 1))
         return behind if inputs is None else np.hstack((inputs, behind))
 
+    def check_inputs(self, inputs: ArrayLike, level: int = 2) -> None:
+        """Warn where inputs make the step of a discretised ODE too long, once.
+
+        The estimator itself looks at its step with inputs of 0, when it is made. `run` calls this;
+        call it before a loop of `update` with inputs that will come.
+
+        Parameters
+        ----------
+        inputs : (T, m) array_like
+            Of these, the first ones and those in which an input is largest or smallest are tried.
+        level : int
+            The level of the stack that the warning names.
+
+        Raises
+        ------
+        ShapeError, InvalidInputError
+            If they have another shape, or are no numbers.
+        """
+        us = numbers("inputs", inputs, finite=False)
+        if us.ndim != 2 or us.shape[1] != self._inputs:
+            raise ShapeError(
+                f"inputs has shape {us.shape}; expected (T, {self._inputs}), a row for each time."
+            )
+        if not self._tries_inputs or not len(us):
+            return
+        self._tries_inputs, tried = False, outermost(us)
+        whole = self._with_parameters(tried, len(tried))
+        assert whole is not None
+        check_step(
+            self._own_system, self.cost, self.observer.initial_covariance(), self._initial_state,
+            whole, level,
+        )
+
     def _check_step_length(self, dt: float) -> None:
         """Check once, before a sample is taken, that the model takes step lengths."""
         if not self._takes_steps:
@@ -557,6 +589,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         )
         if us is None and self._inputs:
             self._input(None, call="run(Y, U)")
+        if us is not None:
+            self.check_inputs(us, 3)
         whole = self._with_parameters(us, len(ys))
         at_once, reason = None, ""
         if may_compile:

@@ -38,7 +38,7 @@ class StepError:
         The difference in standard deviations of G w, or where that has none of the prior.
     component : int
         The state in which it is so large.
-    point : (n,) array
+    point, inputs : (n,) array, (m,) array
         Where it is so large.
     most : float
         The largest difference that does no harm, for this method.
@@ -47,6 +47,7 @@ class StepError:
     deviations: float
     component: int
     point: Array
+    inputs: Array
     most: float
 
     @property
@@ -60,18 +61,21 @@ class StepComparison:
 
     Parameters
     ----------
-    system, cost, covariance, state, u
+    system, cost, covariance, state
         As for `reached`.
+    u : (m,) or (k, m) array
+        The inputs, or several of them, each of which is tried at all points.
     """
 
     def __init__(
         self, system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
     ) -> None:
         self._system, prior = system, prior_deviations(cost, covariance)
-        self._points = prior_points(system, state, prior)
+        points, inputs = prior_points(system, state, prior), np.atleast_2d(u)
+        self._points = np.tile(points, (len(inputs), 1))
+        self._inputs = np.repeat(inputs, len(points), axis=0)
         units = disturbance_deviations(system, cost)
         self._units = np.where(units > 0.0, units, prior)
-        self._inputs = np.tile(u, (len(self._points), 1))
         #: What is too large an error, in standard deviations.
         self.most = _most(system.method)
 
@@ -132,7 +136,9 @@ class StepComparison:
         k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
         if shares[k, j] < 0.0:
             return None
-        return StepError(float(shares[k, j]), int(j), self._points[k], self.most)
+        return StepError(
+            float(shares[k, j]), int(j), self._points[k], self._inputs[k], self.most
+        )
 
 
 def step_error(
@@ -163,19 +169,21 @@ def step_errors(
 
 def check_step(
     system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, level: int
-) -> None:
+) -> bool:
     """Warn, at a level of the stack, where the step of a discretised ODE is too long.
 
-    Other arguments are those of `StepComparison`.
+    Other arguments are those of `StepComparison`. Whether there was nothing to warn of.
     """
     found = _comparison(system, cost, covariance, state, u)
     if found is None or found[1].is_harmless:
-        return
+        return True
     comparison, error = found
     remedies: list[str] = []
     with suppress(Exception), np.errstate(all="ignore"):
         remedies = comparison.remedies()
     point = np.array2string(error.point, precision=4, separator=", ")
+    if error.inputs.any():
+        point += f" with u = {np.array2string(error.inputs, precision=4, separator=', ')}"
     remedy = (
         f"{' or '.join(remedies)} is fine enough" if remedies
         else "Take more substeps (steps=), or for stiff rates method='radau'"
@@ -194,6 +202,14 @@ def check_step(
         ModelWarning,
         stacklevel=level + 1,
     )
+    return False
+
+
+def outermost(inputs: Array) -> Array:
+    """The first of the inputs (T, m), and those with the largest and smallest of each component."""
+    with np.errstate(all="ignore"):
+        rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
+    return inputs[sorted(rows)]
 
 
 def _most(method: str | None) -> float:

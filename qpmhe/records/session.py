@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from .bounds import BoundOptions, RowBounds
 
 _EVERY = 100
+# After so many samples, more inserted ones than measured ones are reported.
+_FEW = 20
 # A mistake in the model's code, rather than a state at which it has no value.
 _MISTAKE = re.compile(
     r" raised (TypeError|NameError|UnboundLocalError|AttributeError|ImportError|"
@@ -428,16 +430,32 @@ class _Session:
                     self._update(None, last, step.length)
                 self._inserted = step.inserted
                 self._summary.inserted += step.inserted
+            elif sample.u.size:
+                self._mhe.check_inputs(sample.u[None])
             if waits:
                 pending = sample
             else:
                 self._advance(sample, None)
             last = sample
+            self._look_at_gaps(sample)
             if self._progress is not None:
                 self._progress(self._reader.position, self._reader.total)
         if pending is not None:
             pending.complete = False  # in a longer record its step has another length
             self._advance(pending, None)
+
+    def _look_at_gaps(self, sample: Measurement) -> None:
+        """Report once, early, that more samples are inserted than measured."""
+        summary = self._summary
+        if self._report is None or summary.samples != _FEW or summary.inserted <= _FEW:
+            return
+        step = 1.0 + summary.inserted / _FEW
+        self._report(
+            f"{self._reader.place(sample)}: {summary.inserted} samples were inserted into gaps "
+            f"between the first {_FEW}: the record's step is about {step:.3g} of the usual steps. "
+            "If the record's unit of time is not the model's, as with seconds and minutes, stop, "
+            "and give --time-scale."
+        )
 
     def _step(self, before: Measurement, after: Measurement) -> Step:
         magnitude = abs(after.time.value) if isinstance(after.time.value, float) else 0.0

@@ -2,6 +2,7 @@
 
 import csv
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -85,6 +86,49 @@ def test_a_bad_option_is_reported_in_a_line(option, value, words, monkeypatch, c
     assert option in error or value == "nonsense"
     for stray in ("Traceback", "Input should", "Value error"):
         assert stray not in error
+
+
+_PUMPED = """
+import warnings
+import numpy as np
+import qpmhe
+
+def make():
+    warnings.warn("of the model's own")
+    def rate(x, u):
+        return np.stack([u[..., 0] * (x[..., 1] - x[..., 0]), -0.1 * x[..., 1]], axis=-1)
+
+    system = qpmhe.System.from_ode(rate, lambda x: x[..., 1:], dt=0.1, n=2, p=1, m=1)
+    cost = qpmhe.QuadraticCost.from_covariances(
+        prior=np.eye(2), disturbance=1e-4 * np.eye(2), noise=[[0.01]])
+    return system, qpmhe.Luenberger([0.0, 0.1]), cost, {"horizon": 5, "initial_state": [0.5, 1.0]}
+"""
+
+
+def test_our_warnings_are_one_line_and_those_of_others_have_their_place(
+    tmp_path, monkeypatch, capsys
+):
+    """A step that the record's inputs make too long; and a record whose unit of time is another."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pumped.py").write_text(_PUMPED)
+    rows = [f"{t},{0.9**t},40.0" for t in range(30)]  # steps of 10 usual ones
+    (tmp_path / "record.csv").write_text("\n".join(["time,y,u", *rows]) + "\n")
+    monkeypatch.setattr(
+        sys, "argv", ["qpmhe", "estimate", "pumped.py:make", "record.csv", "--out", "out.csv"])
+    before = warnings.showwarning
+    with pytest.warns(UserWarning, match="own") as others, pytest.raises(SystemExit):
+        main()
+    assert warnings.showwarning is before
+    printed = capsys.readouterr().err
+    own = [line for line in printed.splitlines() if "too long" in line]
+    assert len(own) == 1
+    assert own[0].startswith("warning: one step of rk4 in dt = 0.1 is too long")
+    assert "with u = [40.]" in own[0]
+    assert [str(one.message) for one in others] == ["of the model's own"]
+    early = next(line for line in printed.splitlines() if "is about 10 of the usual" in line)
+    assert early.startswith("warning: record.csv, line 22 (time 20): 180 samples were inserted")
+    assert "--time-scale" in early
+    assert printed.index(early) < printed.index("30 samples")
 
 
 @pytest.mark.slow

@@ -199,3 +199,46 @@ def test_doctor_shows_the_table():
     assert rows[0][2].startswith("[yellow]")
     assert rows[-1][2].startswith("[default]")
     assert {row[3] for row in rows} == {"at most 0.1"}
+
+
+def pumped(**options):
+    """x1' = -u (x1 - x2), which is stiff where u is large."""
+    def rate(x, u):
+        return np.stack([u[..., 0] * (x[..., 1] - x[..., 0]), -0.1 * x[..., 1]], axis=-1)
+
+    system = qpmhe.System.from_ode(rate, h, dt=0.1, n=2, p=1, m=1, **options)
+    return build(system, *made()[1:])
+
+
+def test_a_step_that_inputs_make_too_long_warns_once_a_run():
+    """The constructor knows no inputs; `run` has them, wherever in the record they are large."""
+    Y = np.ones((6, 1))
+    mild, late = np.ones((6, 1)), np.ones((6, 1))
+    late[4] = 40.0
+    mhe = pumped()
+    mhe.run(Y, mild)
+    with pytest.warns(qpmhe.ModelWarning, match=r"with u = \[40\.\].* in state 0 ") as seen:
+        pumped().run(Y, late)
+    assert len(seen) == 1
+    assert seen[0].filename == __file__
+    mhe = pumped()
+    with pytest.warns(qpmhe.ModelWarning, match=r"method='radau' with steps=2 is fine enough"):
+        mhe.check_inputs(late)
+    mhe.check_inputs(late)
+    mhe.run(Y, late)
+    pumped(method="radau", steps=2).run(Y, late)
+    with pytest.raises(qpmhe.errors.ShapeError, match=r"shape \(6,\); expected \(T, 1\)"):
+        mhe.check_inputs(late[:, 0])
+
+
+def test_the_error_at_inputs_is_that_of_a_system_whose_inputs_they_are():
+    """Of several inputs the worst, at the same points."""
+    mhe = pumped()
+    tried = np.array([[1.0], [40.0], [20.0]])
+    found = step_error(mhe.system, mhe.cost, None, mhe.initial_state, tried)
+    expected = step_error(qpmhe.System.from_ode(
+        lambda x: np.stack([40.0 * (x[..., 1] - x[..., 0]), -0.1 * x[..., 1]], axis=-1),
+        h, dt=0.1, n=2, p=1), mhe.cost, None, mhe.initial_state, np.zeros(0))
+    assert found.inputs.tolist() == [40.0]
+    assert found.deviations == pytest.approx(expected.deviations, rel=1e-9)
+    assert np.array_equal(found.point, expected.point)
