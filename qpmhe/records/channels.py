@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +45,8 @@ class Channels:
         What the file calls its time.
     dates : bool
         Whether times are integers that count nanoseconds since 1970, not numbers.
+    start : datetime, optional
+        The date of time 0.
     notes : list of str
         What the user should know of the file; `load` may add to it.
     hint : str
@@ -56,6 +59,7 @@ class Channels:
     close: Callable[[], None] = lambda: None
     time: str = "time"
     dates: bool = False
+    start: datetime | None = None
     notes: list[str] = field(default_factory=list)
     hint: str = ""
 
@@ -88,6 +92,11 @@ class ChannelTable(Table):
     def units(self) -> list[str]:
         """Units of the time and of the channels; blank where the file does not say."""
         return ["", *(self._channels.units[i] for i in self._chosen)]
+
+    @property
+    def start(self) -> datetime | None:
+        """The date of time 0, where the file states it."""
+        return self._channels.start
 
     def select(self, columns: Sequence[int], held: Sequence[int]) -> dict[int, int]:
         """Read these columns alone."""

@@ -66,7 +66,7 @@ def read_mdf(file: str) -> Channels:
 
     return Channels(
         _distinct([each.name for each in channels], [groups[k] for k, _ in places]),
-        [each.unit or "" for each in channels], load, mdf.close,
+        [each.unit or "" for each in channels], load, mdf.close, start=mdf.start_time,
     )
 
 

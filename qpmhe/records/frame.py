@@ -57,7 +57,8 @@ def read(
     pandas.DataFrame
         Columns of numbers, of texts where a column begins with text. The index is a DatetimeIndex
         where times are dates, else a TimedeltaIndex. ``frame.attrs["units"]`` has the units that
-        the file states, ``frame.attrs["notes"]`` what else there is to know.
+        the file states, ``frame.attrs["notes"]`` what else there is to know. Of an MDF file,
+        ``frame.attrs["start"]`` is the date of time 0: ``frame.index + frame.attrs["start"]``.
 
     Raises
     ------
@@ -89,6 +90,8 @@ def read(
         index=_index(pandas, times, time_scale),
     )
     frame.attrs.update(units=wanted.units, notes=[*reader.notes])
+    if wanted.start is not None:
+        frame.attrs["start"] = pandas.Timestamp(wanted.start)
     return frame
 
 
@@ -99,10 +102,11 @@ class _Wanted:
         self.time, self._given = time, given
         self.names: list[str] = []
         self.units: dict[str, str] = {}
+        self.start: Any = None
 
     def find(self, table: Table) -> Columns:
         """Their positions in a table."""
-        header = Header(table)
+        header, self.start = Header(table), table.start
         remedy = "name it in columns."
         if self._given is None:
             time = header.time(self.time, ())

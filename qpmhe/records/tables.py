@@ -7,6 +7,7 @@ import json
 import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
 from itertools import chain, islice
 from time import perf_counter
 from typing import Any, BinaryIO, NamedTuple
@@ -80,6 +81,11 @@ class Table:
     @property
     def units(self) -> list[str] | None:
         """Units of the columns where they stand apart from the names, which are paths then."""
+        return None
+
+    @property
+    def start(self) -> datetime | None:
+        """The date of time 0, where the file states it."""
         return None
 
     def expect(self, name: str) -> int | None:

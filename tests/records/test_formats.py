@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,22 @@ def test_mdf_has_what_asammdf_reads(here, monkeypatch, fragment):
             columns=["speed"])
     refused("record.mf4", "sample 1, column 'text': 'a' is not a number",
             read=lambda name: estimate(CONTINUOUS, name, outputs="y1=text", inputs="u1=temp"))
+
+
+@pytest.mark.parametrize("version", ["3.30", "4.10"])
+def test_an_mdf_file_says_when_it_started(here, version):
+    asammdf = pytest.importorskip("asammdf")
+    start = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
+    with asammdf.MDF(version=version) as mdf:
+        mdf.start_time = start
+        mdf.append([asammdf.Signal(SLOW, T2, name="y")])
+        mdf.save("record" + (".mdf" if version < "4" else ".mf4"), overwrite=True)
+    frame = read("record" + (".mdf" if version < "4" else ".mf4"))
+    assert frame.attrs["start"] == pd.Timestamp(start)
+    dates = frame.index + frame.attrs["start"]
+    assert (dates[[0, 10]] == pd.to_datetime([start, start + timedelta(seconds=1)])).all()
+    put("record.csv", ["time,y", "0,1"])
+    assert "start" not in read("record.csv").attrs
 
 
 def test_invalid_values_of_mdf_are_left_out(here):
