@@ -58,7 +58,8 @@ def read(
         Columns of numbers, of texts where a column begins with text. The index is a DatetimeIndex
         where times are dates, else a TimedeltaIndex. ``frame.attrs["units"]`` has the units that
         the file states, ``frame.attrs["notes"]`` what else there is to know. Of an MDF file,
-        ``frame.attrs["start"]`` is the date of time 0: ``frame.index + frame.attrs["start"]``.
+        ``frame.attrs["start"]`` is the date of time 0 in ISO 8601:
+        ``frame.index + pandas.Timestamp(frame.attrs["start"])``.
 
     Raises
     ------
@@ -91,7 +92,7 @@ def read(
     )
     frame.attrs.update(units=wanted.units, notes=[*reader.notes])
     if wanted.start is not None:
-        frame.attrs["start"] = pandas.Timestamp(wanted.start)
+        frame.attrs["start"] = wanted.start.isoformat()  # Parquet keeps what JSON has
     return frame
 
 

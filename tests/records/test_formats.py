@@ -137,9 +137,11 @@ def test_an_mdf_file_says_when_it_started(here, version):
         mdf.append([asammdf.Signal(SLOW, T2, name="y")])
         mdf.save("record" + (".mdf" if version < "4" else ".mf4"), overwrite=True)
     frame = read("record" + (".mdf" if version < "4" else ".mf4"))
-    assert frame.attrs["start"] == pd.Timestamp(start)
-    dates = frame.index + frame.attrs["start"]
+    assert pd.Timestamp(frame.attrs["start"]) == pd.Timestamp(start)
+    dates = frame.index + pd.Timestamp(frame.attrs["start"])
     assert (dates[[0, 10]] == pd.to_datetime([start, start + timedelta(seconds=1)])).all()
+    frame.to_parquet("kept.parquet")
+    assert pd.read_parquet("kept.parquet").attrs == frame.attrs
     put("record.csv", ["time,y", "0,1"])
     assert "start" not in read("record.csv").attrs
 
