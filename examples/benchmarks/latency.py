@@ -3,9 +3,10 @@
 A zoo model written in plain NumPy, beside the same model given as CasADi functions. Where other
 programs take the processor within an update, its time is the processor's. Between the
 updates a loop waits for as long as an update usually takes, and does nothing: its tail is the
-machine's. `first` is the median over the first 100 samples of a new estimator, in the best of 15;
-`to CasADi` is its ratio to that of the CasADi model. `own tail` is the 99.99th percentile as a
-multiple of the median, less the machine's share: what the idle loop's is above its own median.
+machine's. The column `first` is the median over the first 100 samples of a new estimator, in the
+best of 15. The column `to CasADi` divides it by that of the CasADi model. The column `own tail`
+subtracts the machine's share from the 99.99th percentile and divides the rest by the median; this
+share is how far the idle loop's percentile lies above its own median.
 """
 
 from __future__ import annotations

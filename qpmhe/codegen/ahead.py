@@ -47,8 +47,8 @@ def compile(
 
     One library serves all weights, gains, bounds, initial states and most options. Another model,
     horizon, kind of sets or of cost, or a time budget needs another. An estimator that exists
-    keeps its engine, unless its first sample is that of a long record, see
-    `qpmhe.MovingHorizonEstimator.run`.
+    keeps its engine, but `qpmhe.MovingHorizonEstimator.run` may change it before the first sample
+    of a long record.
 
     Parameters
     ----------

@@ -219,7 +219,8 @@ class Expressions(ABC):
 
     def _value(self, node: Any) -> tuple[Any, Any]:
         """Type and range of an expression, whose operations are counted."""
-        return getattr(self, f"_of_{type(node).__name__.lower()}")(node)  # type: ignore[no-any-return]
+        found: tuple[Any, Any] = getattr(self, f"_of_{type(node).__name__.lower()}")(node)
+        return found
 
     def _of_constant(self, node: Any) -> tuple[Any, Any]:
         if node.type in ("float", "double", "long double"):

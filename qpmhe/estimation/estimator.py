@@ -216,7 +216,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._sensors = (system.p,)
         self._takes_steps = False  # whether a step of another length has been tried
-        self._tries_inputs = False  # whether `check_inputs` has something to do
+        self._tries_inputs = False  # whether the step may be too long for some inputs
         # The system as this estimator evaluates it.
         self._initial_state: Array
         self._initial_state, self._own_system = self._checked_start(initial_state, own)
@@ -455,7 +455,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         behind = np.tile(parameters, (samples, 1))
         return behind if inputs is None else np.hstack((inputs, behind))
 
-    def check_inputs(self, inputs: ArrayLike, level: int = 2) -> None:
+    def check_inputs(self, inputs: ArrayLike) -> None:
         """Warn where inputs make the step of a discretised ODE too long, once.
 
         The estimator itself looks at its step with inputs of 0, when it is made. `run` calls this;
@@ -464,9 +464,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         Parameters
         ----------
         inputs : (T, m) array_like
-            Of these, the first ones and those in which an input is largest or smallest are tried.
-        level : int
-            The level of the stack that the warning names.
+            Of the finite ones, the first is tried, and those in which an input is largest or
+            smallest.
 
         Raises
         ------
@@ -478,11 +477,14 @@ class MovingHorizonEstimator(EstimatorMemory):
             raise ShapeError(
                 f"inputs has shape {us.shape}; expected (T, {self._inputs}), a row for each time."
             )
-        if not self._tries_inputs or not len(us):
-            return
-        self._tries_inputs, tried = False, outermost(us)
+        self._check_inputs(us, 3)
+
+    def _check_inputs(self, us: Array, level: int) -> None:
+        tried = outermost(us) if self._tries_inputs else us[:0]
         whole = self._with_parameters(tried, len(tried))
-        assert whole is not None
+        if whole is None or not len(tried):
+            return
+        self._tries_inputs = False
         check_step(
             self._own_system, self.cost, self.observer.initial_covariance(), self._initial_state,
             whole, level,
@@ -590,7 +592,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         if us is None and self._inputs:
             self._input(None, call="run(Y, U)")
         if us is not None:
-            self.check_inputs(us, 3)
+            self._check_inputs(us, 3)
         whole = self._with_parameters(us, len(ys))
         at_once, reason = None, ""
         if may_compile:

@@ -583,7 +583,7 @@ class Optimizer:
             began = perf_counter()
             left = outcome.remaining(began)
             if left is not None and left <= 0.0:
-                return solution
+                return None if solution is None or solution.d is None else solution
             solution = self._subproblem.solve(qp, self._solver, left)
             outcome.count(solution.iterations, perf_counter() - began)
             if solution.status in _FACTORISED or not self._subproblem.give_ridge(qp):

@@ -206,9 +206,11 @@ def check_step(
 
 
 def outermost(inputs: Array) -> Array:
-    """The first of the inputs (T, m), and those with the largest and smallest of each component."""
-    with np.errstate(all="ignore"):
-        rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
+    """Of the finite inputs (T, m) the first, and those with a component's largest or smallest."""
+    inputs = inputs[np.isfinite(inputs).all(axis=1)]
+    if not len(inputs):
+        return inputs
+    rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
     return inputs[sorted(rows)]
 
 

@@ -167,7 +167,7 @@ class Scaling:
         self._scales.clear()
 
     def drop(self, key: int) -> None:
-        """Drop the scale of this key, as that of a QP which tells nothing of the next ones."""
+        """Drop the scale of this key."""
         self._scales = [scale for scale in self._scales if scale.key != key]
 
     def _hold(self, sizes: tuple[int, int, int]) -> None:

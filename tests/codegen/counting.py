@@ -7,6 +7,8 @@ import numpy as np
 
 from qpmhe.codegen.operations import FLOPS
 
+from .test_written import DRIVER
+
 COMPILER = shutil.which("c++")
 # Functions that are no operations, as they are none of the bound's.
 _SIGNS = ("fabs",)
@@ -53,25 +55,10 @@ def _class():
     return "\n".join(lines)
 
 
-_DRIVER = r"""
-#include <stdio.h>
-static mhe_estimator e;
-static mhe_workspace k;
-static mhe_estimate out;
-int main(void)
-{
-    mhe_real x0[MHE_NX], y[MHE_NY], u[MHE_NU + 1];
-    if (fread(x0, sizeof x0, 1, stdin) != 1) return 2;
-    mhe_reset(&e, &mhe_default_settings, x0);
-    while (fread(y, sizeof y, 1, stdin) == 1) {
-        if (MHE_NU && fread(u, sizeof *u * MHE_NU, 1, stdin) != 1) return 2;
-        memset(counts, 0, sizeof counts);
-        mhe_update(&e, &k, y, u, &out);
-        fwrite(counts, sizeof counts, 1, stdout);
-    }
-    return 0;
-}
-"""
+# The same program as for values, around the source itself.
+_DRIVER = DRIVER.replace('#include "mhe.h"\n', "").replace(
+    "mhe_update(", "memset(counts, 0, sizeof counts);\n        mhe_update("
+).replace("&out, sizeof out", "counts, sizeof counts")
 
 
 def counted(folder, start, samples):

@@ -68,14 +68,18 @@ def cache(tmp_path):
     return tmp_path / "cache"
 
 
-@pytest.fixture(autouse=True)
-def script(tmp_path, cache, monkeypatch):
+def counting_script(tmp_path, cache, monkeypatch):
     """An empty cache, the usual "auto", and a compiler that counts its calls."""
     monkeypatch.setenv("QPMHE_CACHE_DIR", str(cache))
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(compiler, "_checked", set())
     return Script(tmp_path, monkeypatch)
+
+
+@pytest.fixture(autouse=True)
+def script(tmp_path, cache, monkeypatch):
+    monkeypatch.setattr(compiler, "_checked", set())
+    return counting_script(tmp_path, cache, monkeypatch)
 
 
 def answer(files=ANSWER, **options):

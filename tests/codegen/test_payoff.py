@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import tempfile
 import time
 
 import numpy as np
@@ -12,7 +11,7 @@ import qpmhe
 from qpmhe.codegen import payoff
 from qpmhe.codegen.payoff import samples_that_pay
 
-from .test_compiler import CC, RIGHT, Script
+from .test_compiler import CC, RIGHT, counting_script
 
 pytestmark = pytest.mark.skipif(
     CC is None or os.name != "posix", reason="there is no C compiler, or none that is a script"
@@ -28,12 +27,9 @@ def cache(tmp_path):
 
 @pytest.fixture(autouse=True)
 def script(tmp_path, cache, monkeypatch):
-    """An empty cache, the usual "auto", a compiler that counts, and records that pay soon."""
-    monkeypatch.setenv("QPMHE_CACHE_DIR", str(cache))
-    monkeypatch.delenv("QPMHE_ENGINE", raising=False)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    """As for the compiler's tests, with records that pay soon."""
     monkeypatch.setattr(payoff, "samples_that_pay", lambda *_: ENOUGH)
-    return Script(tmp_path, monkeypatch)
+    return counting_script(tmp_path, cache, monkeypatch)
 
 
 def estimator(f=lambda x: [0.9 * x[0] + 0.1 * x[1], 0.8 * x[1] - 0.1 * x[0] ** 3], **options):

@@ -1,10 +1,15 @@
 """The ridge of a QP whose Hessian is singular up to rounding."""
 
+from time import perf_counter
+
 import numpy as np
 import pytest
 
 import qpmhe
 from qpmhe import Status
+from qpmhe.estimation import optimizer
+from qpmhe.estimation.subproblem import Subproblem
+from qpmhe_solvers import Solution, SolveStatus
 from tests.oracles.nist import regression
 
 
@@ -51,10 +56,33 @@ def test_a_regular_hessian_gets_none():
 
 @pytest.mark.parametrize("name", ["auto", "banded", "daqp", "quadprog"])
 def test_backends_go_on_where_a_hessian_has_no_factor(name):
-    """That of the second QP, at which they had failed or stopped."""
+    """The Hessian of the second QP has none: without a ridge, backends fail or stop there."""
     if name not in qpmhe.solvers.available():
         pytest.skip("it is not installed")
     data = regression("Rat43")
     first, second = (data.fit(data.start, "small", cap, "python", name) for cap in (1, 2))
     assert not second.status & (Status.SOLVER_FAILED | Status.SOLVER_STOPPED)
     assert second.cost < 0.5 * first.cost
+
+
+def test_no_time_for_a_ridge_is_no_failure_of_the_solver(monkeypatch):
+    """The QP without it has failed, and then a clock says that nothing is left."""
+    ahead = [0.0]
+
+    def give_ridge(self, qp):
+        ahead[0] = 1e6
+        return True
+
+    monkeypatch.setattr(optimizer, "perf_counter", lambda: perf_counter() + ahead[0])
+    monkeypatch.setattr(Subproblem, "give_ridge", give_ridge)
+    monkeypatch.setattr(
+        Subproblem, "solve", lambda *_: Solution(None, SolveStatus.FAILED, 0, message="no factor")
+    )
+    system, observer, cost, scenario = qpmhe.models.batch_reactor()
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, observer, cost, horizon=3, initial_state=scenario.initial_estimate,
+        engine="python", time_budget=1.0,
+    )
+    estimate = mhe.update([3.0])
+    assert Status.TIME_UP in estimate.status
+    assert Status.SOLVER_FAILED not in estimate.status

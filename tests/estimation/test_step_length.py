@@ -221,9 +221,13 @@ def test_a_step_that_inputs_make_too_long_warns_once_a_run():
         pumped().run(Y, late)
     assert len(seen) == 1
     assert seen[0].filename == __file__
-    mhe = pumped()
-    with pytest.warns(qpmhe.ModelWarning, match=r"method='radau' with steps=2 is fine enough"):
+    mhe, late[2] = pumped(), np.nan
+    mhe.check_inputs(late[2:3])  # no finite ones, and none that count
+    with pytest.warns(
+        qpmhe.ModelWarning, match=r"method='radau' with steps=2 is fine enough"
+    ) as seen:
         mhe.check_inputs(late)
+    assert seen[0].filename == __file__
     mhe.check_inputs(late)
     mhe.run(Y, late)
     pumped(method="radau", steps=2).run(Y, late)
