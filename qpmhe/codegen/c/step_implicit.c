@@ -29,7 +29,7 @@ static int mhe_solve_stages(const real *x, const real *u, real h, int wanted, re
         mhe_start_stages(w, W);
         found = 1;
         for (int part = 1; part <= $parts && found; part++)
-            found = mhe_iterate_stages(w, u, part * h / $parts, 0, $following, W);
+            found = mhe_iterate_stages(w, u, (real)part * h / $parts, 0, $following, W);
     }
     return found && (!wanted || mhe_stage_rates(x, u, W, r));
 }
