@@ -38,7 +38,7 @@ from .estimation.estimator import MovingHorizonEstimator
 from .estimation.run import Run
 from .estimation.settings import Settings
 from .model.coloured_noise import ColouredNoise, augment_noise
-from .model.constraints import Constraint
+from .model.constraint import Constraint
 from .model.noisy_inputs import noisy_inputs
 from .model.parameters import augment_parameters
 from .model.residuals import angles

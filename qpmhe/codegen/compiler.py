@@ -377,7 +377,7 @@ def _run(
 def _end(process: subprocess.Popen[str]) -> None:
     """End a compiler and those that it has started, which do the work."""
     if hasattr(os, "killpg"):
-        with suppress(ProcessLookupError):
+        with suppress(ProcessLookupError, PermissionError):  # ended by itself
             os.killpg(process.pid, signal.SIGKILL)
     else:
         process.kill()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .algebraic import AlgebraicStates, of_rows
-from .constraints import Constraint
+from .constraint import Constraint
 from .evaluation import Evaluator, VirtualMachine
 from .expressions import import_casadi
 from .sets import ConvexSet, SoftSet

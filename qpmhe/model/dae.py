@@ -18,7 +18,7 @@ from ..errors import InvalidInputError, ModelError, QpmheError, ShapeError
 from .accuracy import TOLERANCE, TRIED, Choice, choice
 from .algebraic import AlgebraicStates, of_rows
 from .algebraic_set import AlgebraicSet
-from .constraints import checked_constraints
+from .constraint import checked_constraints
 from .derivatives import Jacobian
 from .discretize import AUTO, Discretization, of_any_shape
 from .functions import BatchedFunction, Trusted

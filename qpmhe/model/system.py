@@ -16,7 +16,8 @@ from qpmhe_solvers.values import shown
 
 from .._checks import dimension
 from ..errors import InvalidInputError, ModelError
-from .constraints import Constraint, ConstraintFunctions, checked_constraints
+from .constraint import Constraint, checked_constraints
+from .constraints import ConstraintFunctions
 from .continuous import ContinuousTime
 from .derivatives import Jacobian
 from .functions import BatchedFunction, Trusted

@@ -12,7 +12,7 @@ from qpmhe_solvers.values import shown
 
 from .._checks import SINGULAR, numbers, vector
 from ..errors import ModelError, OptionError, SetError, ShapeError
-from .constraints import Constraint
+from .constraint import Constraint
 from .derivatives import Jacobian
 from .functions import BatchedFunction, check_inputs
 from .model import Expression, Functions

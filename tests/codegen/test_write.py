@@ -10,7 +10,7 @@ import pytest
 import qpmhe
 from qpmhe import codegen
 from qpmhe.errors import InvalidInputError, OptionError, QpmheError
-from qpmhe.model import constraints
+from qpmhe.model import constraint
 
 from .cases import case
 from .test_written import STRICT
@@ -40,9 +40,9 @@ def test_sources_with_other_weights_and_options_differ_in_the_data_only(tmp_path
 
 
 def test_constraints_are_traced_again_only_where_they_have_changed(monkeypatch):
-    traces, trace = [], constraints.traced
+    traces, trace = [], constraint.traced
     monkeypatch.setattr(
-        constraints, "traced", lambda *args, **options: traces.append(1) or trace(*args, **options)
+        constraint, "traced", lambda *args, **options: traces.append(1) or trace(*args, **options)
     )
     limit = [1.0]
     mhe = linear(constraints=[
