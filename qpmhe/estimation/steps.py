@@ -53,11 +53,11 @@ class Steps:
                 "make the model with that step."
             )
 
-    def between(self, spacing: float, magnitude: float) -> Step:
+    def between(self, spacing: float, digit: float) -> Step:
         """The step from one sample to the next, whose times differ by `spacing`.
 
-        `magnitude` is the size of the times, which are rounded to some digits. Raises ValueError,
-        with the remedy, if it is not a step.
+        The last digit to which the times are rounded is `digit`. Raises ValueError, with the
+        remedy, if it is not a step.
         """
         length = spacing * self._scale
         if self.usual is None:
@@ -71,7 +71,7 @@ class Steps:
                 "model's"
             )
         each = length / number
-        rounding = _ROUNDING * self.usual + 4e-16 * magnitude * self._scale
+        rounding = _ROUNDING * self.usual + digit * self._scale
         self._steps += 1
         self._short += each < _SHORT * self.usual
         if self.any_length:

@@ -165,7 +165,7 @@ def _filled(
     rows, before, after, lengths = [*first], [*first], [0.0] * len(first), []
     for row, spacing in enumerate(spacings):
         try:
-            step = steps.between(float(spacing), float(seconds[-1]))
+            step = steps.between(float(spacing), max(1e-9, 4e-16 * float(seconds[-1])))
         except ValueError as error:
             raise InvalidInputError(f"{names[0]} at {times[row + 1]}: {error}.") from error
         count = step.inserted + 1

@@ -21,7 +21,7 @@ from .algebraic_set import AlgebraicSet
 from .constraint import checked_constraints
 from .derivatives import Jacobian
 from .discretize import AUTO, Discretization, of_any_shape
-from .functions import BatchedFunction, Trusted
+from .functions import BatchedFunction, Trusted, check_default
 from .implicit_steps import COLLOCATIONS, ImplicitStep
 from .index import check_index, unsolved
 from .model import Origin
@@ -317,6 +317,8 @@ def _takes_input(
             f"{name}{inspect.signature(function)} cannot be called as {expected}; write it so."
             + ("" if m else " Pass m if there are inputs.")
         )
+    if m > 0 and len(positional) > least:
+        check_default(name, positional[least])
     return m > 0 and (len(positional) > least or rest)
 
 

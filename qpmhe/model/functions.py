@@ -284,7 +284,7 @@ def missing_input(name: str, inputs: int) -> InvalidInputError:
 def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
     """Whether a model function is one of x and u, by its parameters.
 
-    The second positional parameter is the input, whatever its name and default are.
+    The second positional parameter is the input, whatever its name is.
     """
     if isinstance(function, np.ufunc):
         if function.nin > 1 + (inputs > 0):
@@ -324,12 +324,7 @@ def takes_input(name: str, function: Callable[..., Any], inputs: int) -> bool:
                 f"{name} has a parameter u, but its second one is {second.name}; make u the "
                 "second parameter, or bind the other with functools.partial."
             )
-        if second.default is not second.empty and not _may_be_input(second.default, inputs):
-            raise ModelError(
-                f"{name} is called as {name}(x, u), but the default of its second parameter, "
-                f"{second.name} = {second.default!r}, is no input of {inputs} numbers. Make u the "
-                f"second parameter, or bind {second.name} with functools.partial."
-            )
+        check_default(name, second)
     return True
 
 
@@ -343,12 +338,13 @@ def check_inputs(m: int, **takes_input: bool) -> None:
         )
 
 
-def _may_be_input(default: Any, inputs: int) -> bool:
-    """Whether a default could be an input: None, a number, or m of them."""
-    if default is None:
-        return True
-    try:
-        array = np.asarray(default, dtype=np.float64)
-    except (TypeError, ValueError):
-        return False
-    return array.ndim == 0 or array.shape == (inputs,)
+def check_default(name: str, parameter: inspect.Parameter) -> None:
+    """Reject a default where the input stands, which would take its place; None says nothing."""
+    default = parameter.default
+    if parameter.name == "u" or default is parameter.empty or default is None:
+        return
+    raise ModelError(
+        f"{name} has the parameter {parameter.name}={shown(default)} in the place of the input u. "
+        f"If it is a constant, bind it: functools.partial({name}, {parameter.name}="
+        f"{shown(default)}); if it is the input, name it u, or leave out its default."
+    )

@@ -56,7 +56,7 @@ class System(ContinuousTime):
         symbols finds, for a whole window at once; a function that cannot be traced is called state
         by state, with a copy of its arguments. Only for its differences is it called once for many
         states, as (K, n), if that gives the same at the initial state and others. With inputs, the
-        second positional parameter is u, whatever its name and default.
+        second positional parameter is u, whatever its name.
     h : callable
         h(x) or h(x, u): maps x (n,) to (p,), or to a scalar if p is 1. With inputs, f or h must
         take them.

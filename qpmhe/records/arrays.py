@@ -10,7 +10,7 @@ import numpy as np
 
 from .._checks import Array
 from ..estimation.steps import Steps
-from .measurements import ColumnNames, Measurement, RecordReader, seconds_between
+from .measurements import ColumnNames, Measurement, RecordReader, spacing
 from .readers import ReadingOptions
 from .record_model import RecordModel
 
@@ -65,10 +65,8 @@ def _read(
     try:
         for sample in reader.samples():
             if before is not None:
-                value = sample.time.value
-                size = abs(value) if isinstance(value, float) else 0.0
                 try:
-                    step = steps.between(seconds_between(before.time, sample.time), size)
+                    step = steps.between(*spacing(before.time, sample.time))
                 except ValueError as error:
                     raise reader.error(f"{error}.", sample.line) from error
                 ys += [np.full(sample.y.size, np.nan)] * step.inserted

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,11 +46,13 @@ class Channels:
     dates : bool
         Whether times are integers that count nanoseconds since 1970, not numbers.
     start : datetime, optional
-        The date of time 0.
+        The date of time 0, where times are seconds since then.
     notes : list of str
         What the user should know of the file; `load` may add to it.
     hint : str
         What an error about its columns adds.
+    same_clock : str
+        What else an error about two clocks advises.
     """
 
     names: list[str]
@@ -62,6 +64,7 @@ class Channels:
     start: datetime | None = None
     notes: list[str] = field(default_factory=list)
     hint: str = ""
+    same_clock: str = ""
 
 
 class ChannelTable(Table):
@@ -142,9 +145,14 @@ class ChannelTable(Table):
 
     def _times(self, times: NDArray[Any]) -> list[str]:
         """Times as a CSV file would have them."""
-        if not self._channels.dates:
+        zone, start = "Z", self._channels.start
+        if start is not None:
+            zone = "" if start.tzinfo is None else zone
+            since = start.replace(tzinfo=start.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+            times = np.round(1e9 * times).astype(np.int64) + 1000 * (since // timedelta(microseconds=1))
+        elif not self._channels.dates:
             return _texts(times)
-        return [f"{text}Z" for text in np.datetime_as_string(times.astype("M8[ns]")).tolist()]
+        return [f"{text}{zone}" for text in np.datetime_as_string(times.astype("M8[ns]")).tolist()]
 
     def _in_order(self, signals: list[Signal]) -> tuple[list[Signal], RecordError | None]:
         """The signals up to the first time that goes backwards, and the error that says so."""
@@ -181,10 +189,9 @@ class ChannelTable(Table):
                 total = (end - begin) + (stop - start)
                 if total > 0 and start - end > total:
                     a, b, c, d = self._times(np.array([begin, end, start, stop]))
-                    remedy = ", or give --log-time" if self._channels.dates else ""
                     raise RecordError(
                         f"{name!r} lasts from {a} to {b}, and {other!r} from {c} to {d}: these are "
-                        f"two clocks; take channels of one clock{remedy}.", self.name,
+                        f"two clocks; take channels of one clock{self._channels.same_clock}.", self.name,
                     )
 
     def _width(self, times: list[NDArray[Any]]) -> float:

@@ -21,11 +21,13 @@ from .tables import TIMES, RecordError, first_line
 _LONGEST = 64
 # What is read at once: bytes of an MDF file, and messages of a bag.
 _FRAGMENT, _MESSAGES = 2**22, 2**14
+# The year of MDF: an earlier date is that of a clock that nobody had set.
+_FIRST_MDF = 1991
 _Path = tuple[str | int, ...]
 
 
 def read_mdf(file: str) -> Channels:
-    """MDF 3 and 4 of measurement systems: seconds since the start of the measurement."""
+    """MDF 3 and 4 of measurement systems: dates, or seconds since a start that is not known."""
     asammdf = need("asammdf", "an MDF file", "mf4")
     with open(file, "rb") as stream:
         if stream.read(8) not in (b"MDF     ", b"UnFinMF "):
@@ -66,7 +68,8 @@ def read_mdf(file: str) -> Channels:
 
     return Channels(
         _distinct([each.name for each in channels], [groups[k] for k, _ in places]),
-        [each.unit or "" for each in channels], load, mdf.close, start=mdf.start_time,
+        [each.unit or "" for each in channels], load, mdf.close,
+        start=mdf.start_time if mdf.start_time.year >= _FIRST_MDF else None,
     )
 
 
@@ -311,7 +314,7 @@ def read_bag(file: str, log_time: bool = False) -> Channels:
 
     return Channels(
         _distinct(names, [f"connection {c.id}" for c, _ in found]), [""] * len(names), load,
-        reader.close, dates=True, notes=notes,
+        reader.close, dates=True, notes=notes, same_clock=", or give --log-time",
     )
 
 

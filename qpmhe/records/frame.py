@@ -57,9 +57,9 @@ def read(
     pandas.DataFrame
         Columns of numbers, of texts where a column begins with text. The index is a DatetimeIndex
         where times are dates, else a TimedeltaIndex. ``frame.attrs["units"]`` has the units that
-        the file states, ``frame.attrs["notes"]`` what else there is to know. Of an MDF file,
-        ``frame.attrs["start"]`` is the date of time 0 in ISO 8601:
-        ``frame.index + pandas.Timestamp(frame.attrs["start"])``.
+        the file states, ``frame.attrs["notes"]`` what else there is to know. Of an MDF file that
+        states when the measurement started, ``frame.attrs["start"]`` is this date, in ISO 8601:
+        ``frame.index - pandas.Timestamp(frame.attrs["start"])`` are the seconds since then.
 
     Raises
     ------
@@ -150,6 +150,8 @@ def _index(pandas: Any, times: list[Time], scale: float) -> Any:
         factor = 1e9 * scale
         exact = int(factor) if factor.is_integer() else factor  # times may have more digits
         index = pandas.to_timedelta([round(exact * each.value) for each in times], unit="ns")
+    elif times[0].kind == "duration":
+        index = pandas.to_timedelta([each.value for each in times], unit="ns")
     else:
         has_zone = times[0].kind == "date with a zone"
         index = pandas.to_datetime([each.value for each in times], unit="ns", utc=has_zone)

@@ -6,6 +6,7 @@ import csv
 import math
 import re
 from collections.abc import Container, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from difflib import SequenceMatcher
@@ -38,6 +39,10 @@ _WHOLE = re.compile(r"[+-]?[0-9]{1,19}")
 _NANOSECONDS = re.compile(r":\d\d[.,]\d{6}(\d{1,3})(?!\d)")
 # 04.05.2026, the fourth of May; a date with slashes may begin with the month.
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?=\s|T|$)")
+# What pandas writes of a duration, and what Python does: 1 days 00:00:00.25, 1 day, 0:00:00
+_DURATION = re.compile(
+    r"(?=.)(?:([+-]?\d+) days?,?)?(?:(?:^| )\+?(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d{1,9}))?)?"
+)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -424,7 +429,7 @@ def _chosen(
 
 
 class Time(NamedTuple):
-    """A number, or a date in nanoseconds since 1970.
+    """A number; or a date in nanoseconds since 1970, or a duration in nanoseconds.
 
     Whole numbers stay integers: nanoseconds since 1970 do not fit into a float.
     """
@@ -434,10 +439,12 @@ class Time(NamedTuple):
     text: str
 
 
-def seconds_between(before: Time, after: Time) -> float:
-    """Difference of two times of one kind: numbers in their unit, dates in seconds."""
+def spacing(before: Time, after: Time) -> tuple[float, float]:
+    """Difference of two times of one kind, and their last digit: numbers in their unit, else s."""
     difference = after.value - before.value
-    return float(difference) if after.kind == "number" else difference / 1e9
+    if after.kind != "number":
+        return difference / 1e9, 1e-9
+    return float(difference), 4e-16 * abs(after.value) if isinstance(after.value, float) else 0.0
 
 
 class FieldReader:
@@ -482,7 +489,7 @@ class FieldReader:
         return math.nan if value in self._numbers else value
 
     def time(self, field: str) -> Time:
-        """The time in a field, a number or a date; ValueError where it is neither."""
+        """The time in a field: a number, a date or a duration; else ValueError."""
         text = field.strip()
         if text.lower() in _MISSING:
             raise ValueError("is blank; every line needs its time")
@@ -498,13 +505,12 @@ class FieldReader:
         except ValueError:
             day = _DAY_FIRST.match(text)
             iso = f"{day[3]}-{day[2]:0>2}-{day[1]:0>2}{text[day.end():]}" if day else text
-            try:
-                moment = datetime.fromisoformat(iso)
-            except ValueError:
-                pass
-            else:
-                return _date(moment, text)
-            raise
+            with suppress(ValueError):
+                return _date(datetime.fromisoformat(iso), text)
+            duration = _DURATION.fullmatch(text)
+            if duration is None:
+                raise
+            return Time("duration", _nanoseconds(duration), text)
         if not math.isfinite(value):
             raise ValueError("is not finite")
         return Time("number", value, text.replace(",", "."))
@@ -522,6 +528,12 @@ def _parse(text: str) -> tuple[float, str]:
     if comma and point:
         raise ValueError("has two kinds of decimal marks; leave out the thousands separator")
     return value, "," if comma else "." if point else ""
+
+
+def _nanoseconds(duration: re.Match[str]) -> int:
+    days, hours, minutes, seconds, rest = duration.groups("0")
+    whole = ((24 * int(days) + int(hours)) * 60 + int(minutes)) * 60 + int(seconds)
+    return 10**9 * whole + int(rest.ljust(9, "0"))
 
 
 def _date(moment: datetime, text: str) -> Time:

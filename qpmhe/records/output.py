@@ -11,6 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
@@ -21,6 +22,7 @@ from ..errors import InvalidInputError, OptionError
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from .checkpoints import CheckpointError, WriteError
+from .measurements import FieldReader
 from .readers import is_json
 
 if TYPE_CHECKING:
@@ -308,22 +310,34 @@ def _to_parquet(source: Path, target: Path, time_type: Any) -> None:
     arrow, arrow_csv, parquet = (
         need(module, "a Parquet file") for module in ("pyarrow", "pyarrow.csv", "pyarrow.parquet")
     )
-    if time_type is None:
+    with source.open(encoding="utf-8", newline="") as file:
+        lines = csv.reader(file)
+        types = dict.fromkeys(next(lines), arrow.float64())
+        are_durations = FieldReader().time(next(lines)[0]).kind == "duration"
+    if are_durations:
+        wanted, time_type = time_type or arrow.duration("ns"), arrow.string()
+    elif time_type is None:
         only_time = arrow_csv.ConvertOptions(include_columns=["time"])
         time_type = arrow_csv.read_csv(source, convert_options=only_time).schema.types[0]
-    with source.open(encoding="utf-8", newline="") as file:
-        types = dict.fromkeys(next(csv.reader(file)), arrow.float64())
     types |= {
         "time": time_type, "status": arrow.string(), "qps": arrow.int32(),
         "inserted": arrow.int32(),
     }
+
+    def converted(batch: Any) -> Any:
+        if not are_durations:
+            return batch
+        times = [FieldReader().time(text).value for text in batch["time"].to_pylist()]
+        columns = arrow.array(times, arrow.duration("ns")).cast(wanted)
+        return batch.set_column(0, "time", columns)
+
     options = arrow_csv.ConvertOptions(column_types=types)
-    with (
-        arrow_csv.open_csv(source, convert_options=options) as reader,
-        parquet.ParquetWriter(target, reader.schema) as writer,
-    ):
-        for batch in reader:
-            writer.write_batch(batch)
+    with arrow_csv.open_csv(source, convert_options=options) as reader:
+        batches = map(converted, reader)
+        first = next(batches)
+        with parquet.ParquetWriter(target, first.schema) as writer:
+            for batch in chain([first], batches):
+                writer.write_batch(batch)
 
 
 @contextlib.contextmanager

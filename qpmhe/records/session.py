@@ -24,7 +24,7 @@ from ..estimation.steps import MAX_GAP, Step, Steps
 from .checkpoints import Checkpoint, CheckpointError, WriteError, load, plain, save, versions
 from .kept_run import KeptRun
 from .latency import Latency
-from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, seconds_between
+from .measurements import ColumnNames, FieldReader, Measurement, RecordReader, spacing
 from .output import Output, RowFormat, standard_output_for_rows
 from .readers import ReadingOptions
 from .record_model import RecordModel, load_record_model
@@ -131,8 +131,8 @@ def estimate_record(
         A file that `qpmhe.records.read` reads, ``-`` is CSV on standard input; and a new file in
         .csv, .parquet or .jsonl, ``-`` is standard output.
     time, outputs, inputs : str, optional
-        Columns of the time, numbers or ISO dates (whose differences count in seconds), and of y
-        and u, as ``y1=column,y2=column``, or columns in order.
+        Columns of the time, numbers, or dates and durations (whose differences count in seconds),
+        and of y and u, as ``y1=column,y2=column``, or columns in order.
     dt, time_scale : float, optional
         Usual step of a discrete-time model, in its unit of time; the record's unit in the model's.
     equal_steps : bool
@@ -458,9 +458,8 @@ class _Session:
         )
 
     def _step(self, before: Measurement, after: Measurement) -> Step:
-        magnitude = abs(after.time.value) if isinstance(after.time.value, float) else 0.0
         try:
-            return self._steps.between(seconds_between(before.time, after.time), magnitude)
+            return self._steps.between(*spacing(before.time, after.time))
         except ValueError as error:
             raise self._reader.error(f"{error}.", after.line) from error
 

@@ -4,6 +4,7 @@ Functions are called state by state, with copies; estimators evaluate their expr
 """
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -65,6 +66,7 @@ def test_inputs():
         lambda x, u: x @ A.T + u @ B.T + x * u,
         lambda x, u: np.inner(A, x) + np.inner(B, u) + x * u,
         lambda x, force=None, gain=1.0: A @ x + gain * (B @ force) + x * force,
+        partial(lambda x, u, gain: A @ x + gain * (B @ u) + x * u, gain=1.0),
     ):
         system = qpmhe.System(f, lambda x, u: x[0] * u[0] + u[1], n=2, p=1, m=2)
         for own in (system, system.model().functions):
@@ -88,9 +90,20 @@ def test_what_is_no_clear_input_is_refused():
         (lambda x, scale=2.0, u=0.0: x, "make u the second"),
         (lambda x, *, u=0.0: x + u, "by keyword only"),
         (lambda x, u, w: x + u + w, "needs 3 arguments"), (lambda: 1.0, "takes no argument"),
+        # A constant, which u would replace: a number, or what the input is.
+        (lambda x, k=0.1: k * x, r"k=0.1 in the place of the input u.*bind it"),
+        (lambda x, k=np.ones(1): k * x, "k=.* in the place of the input u"),
+        (lambda x, i=0: x[..., i:], "i=0 in the place"), (lambda x, sin=np.sin: sin(x), "sin="),
     ):
         with pytest.raises(ModelError, match=words):
             qpmhe.System(f, lambda x: x, n=1, p=1, m=1)
+        if "place" in words:
+            qpmhe.System(f, lambda x: x, n=1, p=1)
+            with pytest.raises(ModelError, match=words):
+                qpmhe.System(lambda x, u: x + u, f, n=1, p=1, m=1)
+    with pytest.raises(ModelError, match=r"h has the parameter k=0.1 in the place of the input u"):
+        qpmhe.System.from_dae(lambda x, z, u: u - z, lambda x, z: z - x, lambda x, z, k=0.1: k * x,
+                              dt=0.1, n=1, k=1, p=1, m=1, algebraic_guess=[0.0])
 
 
 def test_a_function_defined_far_away_is_tried_at_the_initial_state():

@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,14 @@ pd = pytest.importorskip("pandas")
 T1, T2 = np.arange(40) * 0.05, np.arange(20) * 0.1
 FAST, SLOW = np.sin(T1), np.cos(3 * T2)
 EPOCH = 1_780_000_000 * 10**9
+UNSET = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-def mf4(name, groups, **options):
-    """An MDF file; groups of (times, {name: values}) with the unit V."""
+def mf4(name, groups, start=UNSET, version="4.10"):
+    """An MDF file; groups of (times, {name: values}) with the unit V. Its clock is not set."""
     asammdf = pytest.importorskip("asammdf")
-    mdf = asammdf.MDF(version="4.10")
+    mdf = asammdf.MDF(version=version)
+    mdf.start_time = start
     for k, (times, channels) in enumerate(groups):
         signals = [
             asammdf.Signal(values, times, name=one, unit="V",
@@ -128,27 +130,44 @@ def test_mdf_has_what_asammdf_reads(here, monkeypatch, fragment):
             read=lambda name: estimate(CONTINUOUS, name, outputs="y1=text", inputs="u1=temp"))
 
 
-@pytest.mark.parametrize("version", ["3.30", "4.10"])
-def test_an_mdf_file_says_when_it_started(here, version):
-    asammdf = pytest.importorskip("asammdf")
-    start = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
-    with asammdf.MDF(version=version) as mdf:
-        mdf.start_time = start
-        mdf.append([asammdf.Signal(SLOW, T2, name="y")])
-        mdf.save("record" + (".mdf" if version < "4" else ".mf4"), overwrite=True)
-    frame = read("record" + (".mdf" if version < "4" else ".mf4"))
+@pytest.mark.parametrize(("name", "version"), [("r.mdf", "3.30"), ("r.mf4", "4.10")])
+def test_times_are_dates_where_an_mdf_file_says_when_it_started(here, name, version):
+    berlin = timezone(timedelta(hours=2))
+    start = datetime(2026, 7, 2, 8, 0, 0, 250_000, tzinfo=berlin)
+    values = {"y1": SLOW, "y2": SLOW}
+    mf4(name, [(T2, values)], start, version)
+    frame = read(name)
+    dates = [start + timedelta(seconds=0.1 * k) for k in range(20)]
+    assert (frame.index == pd.DatetimeIndex(dates)).all()
     assert pd.Timestamp(frame.attrs["start"]) == pd.Timestamp(start)
-    dates = frame.index + pd.Timestamp(frame.attrs["start"])
-    assert (dates[[0, 10]] == pd.to_datetime([start, start + timedelta(seconds=1)])).all()
+    np.testing.assert_allclose((frame.index - pd.Timestamp(start)).total_seconds(), T2, atol=1e-9)
     frame.to_parquet("kept.parquet")
     assert pd.read_parquet("kept.parquet").attrs == frame.attrs
-    put("record.csv", ["time,y", "0,1"])
-    assert "start" not in read("record.csv").attrs
+    # Estimates have the dates, and are those of the seconds.
+    mf4("seconds.mf4", [(T2, values)])
+    assert "start" not in read("seconds.mf4").attrs
+    for one in (name, "seconds.mf4"):
+        estimate(DISCRETE, one, f"{one}.csv")
+        estimate(DISCRETE, one, f"{one}.parquet")
+    table, numbers = read(f"{name}.csv"), read("seconds.mf4.csv")
+    for each in (table, read(f"{name}.parquet"), pd.read_parquet(f"{name}.parquet")):
+        found = each.index if each.index.name else pd.DatetimeIndex(each["time"])
+        assert (found == pd.DatetimeIndex(dates)).all()
+    pd.testing.assert_frame_equal(table.reset_index(drop=True), numbers.reset_index(drop=True))
+    assert seconds(numbers)[-1] == pytest.approx(1.9)
+
+
+def test_local_dates_of_mdf_have_no_zone(here):
+    mf4("local.mf4", [(T2, {"y": SLOW})], datetime(2026, 7, 2, 8, 0))
+    index = read("local.mf4").index
+    assert index.tz is None
+    assert index[10] == pd.Timestamp("2026-07-02T08:00:01")
 
 
 def test_invalid_values_of_mdf_are_left_out(here):
     asammdf = pytest.importorskip("asammdf")
     mdf = asammdf.MDF(version="4.10")
+    mdf.start_time = UNSET
     invalid = np.arange(20) % 5 == 3
     mdf.append([asammdf.Signal(SLOW, T2, name="y", invalidation_bits=invalid)])
     mdf.save("record.mf4", overwrite=True)
@@ -296,6 +315,38 @@ def test_text_and_parquet_as_frames(here):
     np.testing.assert_array_equal(
         read("record.parquet")["y"], [1.5, np.nan, 2.5, np.nan, 1.5, 1.5] * 1000
     )
+
+
+@pytest.mark.parametrize("step", ["1ms", "250ms", "1.000000001s", "36h", "1D"])
+def test_durations_that_pandas_writes_come_back(here, step):
+    index = (pd.timedelta_range("-2D", periods=12, freq=step)).rename("time")
+    frame = pd.DataFrame({"y1": SLOW[:12], "y2": FAST[:12]}, index)
+    frame.to_csv("record.csv")
+    frame.to_parquet("record.parquet")
+    dt = {"dt": index.to_series().diff().median().total_seconds()}
+    for name in ("record.csv", "record.parquet"):
+        found = read(name)
+        assert (found.index == index).all()
+        np.testing.assert_array_equal(found, frame)
+        for out in ("out.csv", "out.parquet"):
+            estimate(DISCRETE, name, out, overwrite=True, **dt)
+            assert (read(out).index == index).all()
+    assert pd.read_parquet("out.parquet")["time"].dtype == index.dtype  # that of its record
+    put("seconds.csv", ["time,y1,y2", *(f"{t},{a},{b}" for t, a, b in zip(
+        index.total_seconds(), SLOW, FAST, strict=False))])
+    estimate(DISCRETE, "seconds.csv", **dt, overwrite=True)
+    numbers = read("out.csv").reset_index(drop=True)
+    estimate(DISCRETE, "record.csv", overwrite=True, **dt)
+    pd.testing.assert_frame_equal(read("out.csv").reset_index(drop=True), numbers)
+
+
+def test_durations_of_python_and_spreadsheets(here):
+    forms = ["-1 day, 23:59:58.5", "0:00:00", "00:00:02,25", "1 day, 1:02:03", "2 days"]
+    put("record.csv", ["time;y", *(f"{one};1" for one in forms)])
+    assert read("record.csv").index.total_seconds().tolist() == [
+        -1.5, 0.0, 2.25, 86_400 + 3723, 172_800]
+    put("record.csv", ["time,y", "0:00:01,1", "0.5,1"])
+    refused("record.csv", "its time is a number, and in line 2 a duration")
 
 
 @pytest.mark.parametrize("seed", range(4))
