@@ -149,7 +149,8 @@ class ChannelTable(Table):
         if start is not None:
             zone = "" if start.tzinfo is None else zone
             since = start.replace(tzinfo=start.tzinfo or UTC) - datetime(1970, 1, 1, tzinfo=UTC)
-            times = np.round(1e9 * times).astype(np.int64) + 1000 * (since // timedelta(microseconds=1))
+            first = 1000 * (since // timedelta(microseconds=1))
+            times = first + np.round(1e9 * times).astype(np.int64)
         elif not self._channels.dates:
             return _texts(times)
         return [f"{text}{zone}" for text in np.datetime_as_string(times.astype("M8[ns]")).tolist()]
@@ -191,7 +192,8 @@ class ChannelTable(Table):
                     a, b, c, d = self._times(np.array([begin, end, start, stop]))
                     raise RecordError(
                         f"{name!r} lasts from {a} to {b}, and {other!r} from {c} to {d}: these are "
-                        f"two clocks; take channels of one clock{self._channels.same_clock}.", self.name,
+                        f"two clocks; take channels of one clock{self._channels.same_clock}.",
+                        self.name,
                     )
 
     def _width(self, times: list[NDArray[Any]]) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 
 from .._checks import Array
 from ..errors import InvalidInputError, OptionError
+from .quaternions import SignChanges
 from .readers import ReadingOptions, open_table
 from .tables import TIMES, RecordError, Table, TableRow
 
@@ -90,11 +91,13 @@ class RecordReader:
         self.columns = Columns(places[columns.time], *(
             tuple(places[i] for i in each) for each in (columns.outputs, columns.inputs)
         ))
+        self._signs = SignChanges(len(columns.outputs))
 
     @property
     def notes(self) -> list[str]:
         """What the user should know of the file."""
-        return self._table.notes
+        names = [self._table.header[i] if i >= 0 else "" for i in self.columns.outputs]
+        return [*self._table.notes, *self._signs.notes(self.name, names)]
 
     @property
     def time_type(self) -> Any:
@@ -158,6 +161,7 @@ class RecordReader:
                 )
             u[missing] = held[missing]
             self.held += int(missing.sum())
+        self._signs.look(y, time.text)
         return Measurement(
             row.line, time, y, u, row.ended, self._table.arrived or perf_counter()
         )

@@ -92,7 +92,7 @@ def test_what_is_no_clear_input_is_refused():
         (lambda x, u, w: x + u + w, "needs 3 arguments"), (lambda: 1.0, "takes no argument"),
         # A constant, which u would replace: a number, or what the input is.
         (lambda x, k=0.1: k * x, r"k=0.1 in the place of the input u.*bind it"),
-        (lambda x, k=np.ones(1): k * x, "k=.* in the place of the input u"),
+        (lambda x, k=(1.0,): k * x, "k=.* in the place of the input u"),
         (lambda x, i=0: x[..., i:], "i=0 in the place"), (lambda x, sin=np.sin: sin(x), "sin="),
     ):
         with pytest.raises(ModelError, match=words):
