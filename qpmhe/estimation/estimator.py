@@ -32,7 +32,7 @@ from .reach import compared
 from .run import FixedLag, Run, RunSource
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require, with_scaled_constraints
-from .step_length import check_step, outermost
+from .step_length import TriedInputs, check_step, explosion
 from .time_index import paired_record
 
 Array = NDArray[np.float64]
@@ -216,7 +216,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
         self._sensors = (system.p,)
         self._takes_steps = False  # whether a step of another length has been tried
-        self._tries_inputs = False  # whether the step may be too long for some inputs
+        self._tried = None if is_copy or not self._inputs else TriedInputs()
+        self._step_error = 0.0  # of which the user has been warned
         # The system as this estimator evaluates it.
         self._initial_state: Array
         self._initial_state, self._own_system = self._checked_start(initial_state, own)
@@ -226,7 +227,7 @@ class MovingHorizonEstimator(EstimatorMemory):
                 self._own_system, observer, cost, self._initial_state, self._usual_input
             )
             place = cost, observer.initial_covariance(), self._initial_state, self._usual_input
-            self._tries_inputs = check_step(self._own_system, *place, 3) and self._inputs > 0
+            self._step_error = check_step(self._own_system, *place, 3)
             check_branches(self._own_system, *place, 3)
             self._own_system = compared(
                 self._own_system, cost, observer.initial_covariance(), self._initial_state,
@@ -456,10 +457,12 @@ class MovingHorizonEstimator(EstimatorMemory):
         return behind if inputs is None else np.hstack((inputs, behind))
 
     def check_inputs(self, inputs: ArrayLike) -> None:
-        """Warn where inputs make the step of a discretised ODE too long, once.
+        """Warn where inputs make the step of a discretised ODE too long.
 
         The estimator itself looks at its step with inputs of 0, when it is made. `run` calls this;
-        call it before a loop of `update` with inputs that will come.
+        call it before a loop of `update` with inputs that will come, or with each one: inputs are
+        tried where they lie beyond those before, and there is a second warning only of an error
+        that is ten times as large.
 
         Parameters
         ----------
@@ -480,14 +483,34 @@ class MovingHorizonEstimator(EstimatorMemory):
         self._check_inputs(us, 3)
 
     def _check_inputs(self, us: Array, level: int) -> None:
-        tried = outermost(us) if self._tries_inputs else us[:0]
-        whole = self._with_parameters(tried, len(tried))
-        if whole is None or not len(tried):
+        if self._tried is None:
             return
-        self._tries_inputs = False
-        check_step(
-            self._own_system, self.cost, self.observer.initial_covariance(), self._initial_state,
-            whole, level,
+        tried = self._tried.new(us)
+        whole = self._with_parameters(tried, len(tried))
+        if whole is not None and len(tried):
+            self._step_error = check_step(
+                self._own_system, self.cost, self.observer.initial_covariance(),
+                self._initial_state, whole, level, self._step_error,
+            )
+
+    def step_fault(self, estimate: Estimate) -> str:
+        """Whether the model failed by the step of a discretised ODE, and what to do about it.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            The newest one, whose status has MODEL_FAILED.
+
+        Returns
+        -------
+        str
+            A sentence; blank where the step is not far too long near the initial state and the
+            observer's states in the window, with the newest inputs.
+        """
+        finite = np.isfinite(estimate.candidate).all(axis=1)
+        return explosion(
+            self._own_system, self.cost, self.observer.initial_covariance(),
+            (self._initial_state, *estimate.candidate[finite]), self._full_input,
         )
 
     def _check_step_length(self, dt: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 # a coarse map by choice, which often is what the data were simulated with.
 _TOO_LONG = {"euler": 10.0}
 _USUALLY_TOO_LONG = 0.1
+# So many of them say that it is the step by which a model fails.
+_FAR_TOO_LONG = 100.0
 # Numbers of substeps that a warning tries, by method.
 _EXPLICIT, _IMPLICIT = (2, 4, 8, 16, 32, 64), (1, 2, 4, 8, 16)
 
@@ -168,50 +170,99 @@ def step_errors(
 
 
 def check_step(
-    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, level: int
-) -> bool:
+    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, level: int,
+    known: float = 0.0,
+) -> float:
     """Warn, at a level of the stack, where the step of a discretised ODE is too long.
 
-    Other arguments are those of `StepComparison`. Whether there was nothing to warn of.
+    Other arguments are those of `StepComparison`. What was warned of before, an error of `known`
+    deviations, is worth a second warning where it is ten times as large. The error of which the
+    user has been warned; 0 without any.
     """
     found = _comparison(system, cost, covariance, state, u)
-    if found is None or found[1].is_harmless:
-        return True
+    if found is None or found[1].is_harmless or not found[1].deviations > 10.0 * known:
+        return known
     comparison, error = found
-    remedies: list[str] = []
-    with suppress(Exception), np.errstate(all="ignore"):
-        remedies = comparison.remedies()
     point = np.array2string(error.point, precision=4, separator=", ")
     if error.inputs.any():
         point += f" with u = {np.array2string(error.inputs, precision=4, separator=', ')}"
-    remedy = (
-        f"{' or '.join(remedies)} is fine enough" if remedies
-        else "Take more substeps (steps=), or for stiff rates method='radau'"
-    )
     differs = (
         f"differs from that of half the length by {error.deviations:.2g} standard deviations of "
         f"the disturbance in state {error.component} (expected at most {error.most:g})"
         if np.isfinite(error.deviations) else
         f"and that of half the length are not both finite in state {error.component}"
     )
-    steps = f"{system.steps} substeps" if system.steps > 1 else "one step"
     warnings.warn(
-        f"{steps} of {system.method} in dt = {system.dt:g} is too long: from x = {point} the "
-        f"result {differs}, so estimates may be wrong though each step improves its cost. "
-        f"{remedy}. Or make the covariance of the disturbance as large as the error.",
+        f"{_named(system)} is too long: from x = {point} the result {differs}, so estimates may be "
+        f"wrong though each step improves its cost: {_remedy(comparison)}. Or make the covariance "
+        "of the disturbance as large as the error.",
         ModelWarning,
         stacklevel=level + 1,
     )
-    return False
+    return error.deviations
 
 
-def outermost(inputs: Array) -> Array:
-    """Of the finite inputs (T, m) the first, and those with a component's largest or smallest."""
-    inputs = inputs[np.isfinite(inputs).all(axis=1)]
-    if not len(inputs):
-        return inputs
-    rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
-    return inputs[sorted(rows)]
+def explosion(
+    system: System, cost: Cost, covariance: Array | None, states: Iterable[Array], u: Array
+) -> str:
+    """Why a model may fail: a step that is far too long near some states, and the remedy.
+
+    Blank where it is not. Other arguments are those of `StepComparison`.
+    """
+    for state in states:
+        found = _comparison(system, cost, covariance, state, u)
+        if found is not None and found[1].deviations > _FAR_TOO_LONG:
+            step = _named(system)
+            return (
+                f"{step[0].upper()}{step[1:]} is far too long near such states: "
+                f"{_remedy(found[0])}."
+            )
+    return ""
+
+
+def _named(system: System) -> str:
+    steps = f"{system.steps} substeps" if system.steps > 1 else "one step"
+    return f"{steps} of {system.method} in dt = {system.dt:g}"
+
+
+def _remedy(comparison: StepComparison) -> str:
+    remedies: list[str] = []
+    with suppress(Exception), np.errstate(all="ignore"):
+        remedies = comparison.remedies()
+    return (
+        f"{' or '.join(remedies)} is fine enough" if remedies
+        else "take more substeps (steps=), or for stiff rates method='radau'"
+    )
+
+
+class TriedInputs:
+    """The range of the inputs with which a step was compared: what lies beyond it is new."""
+
+    def __init__(self) -> None:
+        self._range: tuple[Array, Array] | None = None
+        self._known: tuple[Array, Array] | None = None  # the range, and half of it beyond
+
+    def new(self, inputs: Array) -> Array:
+        """Of the finite inputs (T, m), the outermost ones if they lie beyond the range, by half.
+
+        An input that creeps or jitters is new a few times, not at each sample.
+        """
+        if self._known is not None:
+            low, high = self._known
+            if (inputs >= low).all() and (inputs <= high).all():
+                return inputs[:0]
+        inputs = inputs[np.isfinite(inputs).all(axis=1)]
+        if not len(inputs):
+            return inputs
+        least, most = inputs.min(axis=0), inputs.max(axis=0)
+        if self._range is not None and self._known is not None:
+            if (least >= self._known[0]).all() and (most <= self._known[1]).all():
+                return inputs[:0]
+            least, most = np.minimum(least, self._range[0]), np.maximum(most, self._range[1])
+        margin = 0.5 * (most - least)
+        self._range, self._known = (least, most), (least - margin, most + margin)
+        rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
+        return inputs[sorted(rows)]
 
 
 def _most(method: str | None) -> float:

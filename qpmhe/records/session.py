@@ -430,7 +430,7 @@ class _Session:
                     self._update(None, last, step.length)
                 self._inserted = step.inserted
                 self._summary.inserted += step.inserted
-            elif sample.u.size:
+            if sample.u.size:
                 self._mhe.check_inputs(sample.u[None])
             if waits:
                 pending = sample
@@ -484,6 +484,8 @@ class _Session:
         remedy = "Bound the states, or make the model defined on all of them."
         if is_mistake:
             remedy = "Correct the model."
+        elif fault := self._mhe.step_fault(estimate):
+            remedy = fault
         elif estimate.message.startswith("the observer"):
             remedy = "Check the observer's covariances or gain, and the units."
         elif self._mhe.system.states is not None:

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 import qpmhe
 from qpmhe.cli import doctor
+from qpmhe.estimation import estimator
 from qpmhe.estimation.step_length import step_error, step_errors
 from qpmhe.models import catalogue
 
@@ -43,7 +44,7 @@ def build(system, observer, cost, options):
 
 
 _TOO_LONG = (
-    r"one step of rk4 in dt = 0.1 is too long.* state 0 .*\. "
+    r"one step of rk4 in dt = 0.1 is too long.* state 0 .* cost: "
     r"steps=8 or method='radau' with steps=2 is fine enough\."
 )
 
@@ -230,9 +231,46 @@ def test_a_step_that_inputs_make_too_long_warns_once_a_run():
     assert seen[0].filename == __file__
     mhe.check_inputs(late)
     mhe.run(Y, late)
+    mhe.check_inputs([[60.0]])  # an error that is not ten times as large is no news
     pumped(method="radau", steps=2).run(Y, late)
     with pytest.raises(qpmhe.errors.ShapeError, match=r"shape \(6,\); expected \(T, 1\)"):
         mhe.check_inputs(late[:, 0])
+
+
+def test_later_inputs_are_tried_where_they_lie_beyond_those_before(monkeypatch):
+    """Whoever streams has no record; and a second run may have other inputs."""
+    Y, tried = np.ones((6, 1)), []
+    checked = estimator.check_step
+    monkeypatch.setattr(
+        estimator, "check_step", lambda *args: tried.append(args[4]) or checked(*args))
+    mhe = pumped()
+    tried.clear()
+    mhe.run(Y, np.ones((6, 1)))
+    mhe.run(Y, np.ones((6, 1)))
+    assert np.concatenate(tried).tolist() == [[1.0]]
+    for k in range(1000):  # slowly up: a few times
+        mhe.check_inputs([[1.0 + 1e-3 * k + 1e-6 * (-1) ** k]])
+    assert 10 <= len(tried) <= 25
+    with pytest.warns(qpmhe.ModelWarning, match=r"with u = \[20\.\].*by (.*) standard") as seen:
+        mhe.check_inputs([[20.0]])
+    with pytest.warns(qpmhe.ModelWarning, match=r"with u = \[2000\.\]"):
+        mhe.run(Y, np.full((6, 1), 2000.0))
+    assert len(seen) == 1
+    copy.deepcopy(mhe).check_inputs([[1e5]])  # whose user knows
+
+
+def test_a_failure_of_the_step_is_told_from_those_of_the_model():
+    mhe, Y = pumped(), np.ones((60, 1))
+    mhe.update(Y[0], [1.0])
+    for y in Y:
+        estimate = mhe.update(y, [400.0])
+        if qpmhe.Status.MODEL_FAILED in estimate.status:
+            break
+    fault = mhe.step_fault(estimate)
+    assert fault.startswith("One step of rk4 in dt = 0.1 is far too long near such states: ")
+    assert "method='radau'" in fault
+    fine = pumped(method="radau", steps=2)
+    assert fine.step_fault(fine.update(Y[0], [1.0])) == ""
 
 
 def test_the_error_at_inputs_is_that_of_a_system_whose_inputs_they_are():

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qpmhe.errors import InvalidInputError, OptionError
+from qpmhe.errors import InvalidInputError, ModelWarning, OptionError
 from qpmhe.records.record_model import load_record_model as load_model
 
 from .tools import estimate, put, shell
@@ -131,3 +131,35 @@ def test_a_model_that_fails_on_the_way_is_reported(here, body, system, words, is
     assert (code, out.count("\n")) == (3 if is_mistake else 0, 51)  # bad luck stops nothing
     assert error.startswith("warning: the model failed at" if is_mistake else "")
     assert bool(error) == is_mistake
+
+
+PUMPED = """
+import numpy as np
+import qpmhe
+
+def rate(x, u):
+    return 1.0 - u * x**2
+
+def make():
+    system = qpmhe.System.from_ode(rate, lambda x: x, dt=0.5, n=1, p=1, m=1{how})
+    covariances = {{"disturbance": 0.1, "noise": 0.01}}
+    return (system, qpmhe.ExtendedKalman(prior=0.1, **covariances),
+            qpmhe.QuadraticCost.from_covariances(**covariances),
+            {{"horizon": 5, "initial_state": [1.0]}})
+"""
+
+
+def test_a_step_that_explodes_at_a_later_input_is_blamed_not_the_weights(here):
+    """In a stream no input is known before its line; and what failed was the integration."""
+    put("record.csv", ["time,y,u", *(f"{0.5 * t},1.0,{1.0 if t < 9 else 60.0}" for t in range(30))])
+    put("model.py", [PUMPED.format(how="")])
+    reports = []
+    with pytest.warns(ModelWarning, match=r"one step of rk4 in dt = 0.5 .* u = \[60\.\]") as seen:
+        summary = estimate("model.py:make", report=reports.append)
+    assert len([one for one in seen if "u = [60.]" in str(one.message)]) == 1
+    assert summary.failed > 1
+    assert "One step of rk4 in dt = 0.5 is far too long near such states: " in summary.failure
+    assert "method='radau'" in reports[0]
+    assert "covariances" not in summary.failure
+    put("stiff.py", [PUMPED.format(how=", method='radau', steps=8")])
+    assert estimate("stiff.py:make", out="stiff.csv").failed == 0
