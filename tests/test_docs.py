@@ -162,8 +162,8 @@ def fetched_by_styles(text):
     return [target for target in found if not target.startswith("data:")]
 
 
-# A command, a delimiter of arithmatex, or one of those that docstrings have.
-RAW = re.compile(r"\\[a-zA-Z(\[]|\$\S|:math:|\.\. math::")
+# A command, a delimiter of arithmatex, or one of those that docstrings have; another markup's table.
+RAW = re.compile(r"\\[a-zA-Z(\[]|\$\S|:math:|\.\. math::|={6,}")
 
 
 @pytest.mark.slow

@@ -26,12 +26,10 @@ def read(
     one time, NaN where a channel has none: nothing is interpolated, so held inputs are
     ``frame[inputs].ffill()``. By the end of the name:
 
-    ====================== ======================================= ===========================
-    .mf4, .mdf             MDF of measurement systems              ``pip install 'qpmhe[mf4]'``
-    .mat                   MAT, v4 to v7.3: variables and structs  v7.3: ``'qpmhe[mat]'``
-    .h5, .hdf5, .hdf       HDF5: datasets and tables in groups     ``'qpmhe[hdf5]'``
-    .mcap, .db3, .bag      ROS 2 and ROS 1 bags, a ROS 2 folder    ``'qpmhe[ros]'``
-    ====================== ======================================= ===========================
+    - ``.mf4``, ``.mdf``: MDF of measurement systems (``pip install 'qpmhe[mf4]'``);
+    - ``.mat``: MAT, v4 to v7.3, variables and structs (v7.3: ``'qpmhe[mat]'``);
+    - ``.h5``, ``.hdf5``, ``.hdf``: HDF5, datasets and tables in groups (``'qpmhe[hdf5]'``);
+    - ``.mcap``, ``.db3``, ``.bag``, the folder of a bag: ROS 2 and ROS 1 (``'qpmhe[ros]'``).
 
     In MAT and HDF5 files, the time of an array is the variable of a usual name (``time``, ``t``,
     ...) with its length in its own group, or in the nearest one around that. Of arrays with two
