@@ -162,7 +162,7 @@ def fetched_by_styles(text):
     return [target for target in found if not target.startswith("data:")]
 
 
-# A command, a delimiter of arithmatex, or one of those that docstrings have; another markup's table.
+# A command, a delimiter of arithmatex or of docstrings, or a table in another markup.
 RAW = re.compile(r"\\[a-zA-Z(\[]|\$\S|:math:|\.\. math::|={6,}")
 
 

@@ -64,10 +64,12 @@ class Diagnosis(Examination):
 
     @property
     def verdict(self) -> str:
-        """How many findings there are."""
+        """How many findings there are, and which date is time 0, where the record has dates."""
         count = len(self.findings)
         head = f"{count} finding{'s' * (count != 1)}" if count else "No fault was found"
-        return f"{head} in {len(self.run)} samples."
+        dates = self.run.index if hasattr(self.run.index, "tz") else None
+        since = "" if dates is None else f"; times are counted from {dates[0]}"
+        return f"{head} in {len(self.run)} samples{since}."
 
     def __repr__(self) -> str:
         found = ", ".join(one.kind for one in self.findings)

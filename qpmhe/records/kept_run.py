@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +13,7 @@ from ..estimation.estimate import Estimate, Status
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
 from ..estimation.steps import Steps
+from .measurements import Measurement, Time
 
 Array = NDArray[np.float64]
 
@@ -44,13 +47,18 @@ class KeptRun:
         self._y: list[Array] = []
         self._u: list[Array] = []
         self._lengths: list[float | None] = []
+        self._times: list[Time] = []  # of the samples of the record
+        self._rows: list[int] = []  # which samples these are
 
-    def add(self, y: Any, u: Array, length: float | None, estimate: Estimate) -> None:
-        """Take a sample; its measurement is None where it was inserted."""
+    def add(self, y: Any, sample: Measurement, length: float | None, estimate: Estimate) -> None:
+        """Take a sample; its measurement is None where it was inserted behind another one."""
+        if y is not None:
+            self._rows.append(len(self._estimates))
+            self._times.append(sample.time)
         system, usual = self._estimator.system, self._estimator.usual
         self._y.append(np.full(system.p, np.nan) if y is None else np.array(y, np.float64))
         parameters = np.zeros(0) if usual.parameters is None else usual.parameters
-        self._u.append(np.append(u, parameters))
+        self._u.append(np.append(sample.u, parameters))
         self._lengths.append(length)
         self._estimates.append(_Kept(
             estimate.state.copy(), estimate.filtered.copy(), estimate.observer_state.copy(),
@@ -69,4 +77,22 @@ class KeptRun:
         inputs = np.array(self._u).reshape(len(run), system.m) if system.m else None
         y = np.array(self._y).reshape(len(run), system.p)
         run.source = self._estimator.run_source(y, inputs, steps, self._time_unit)
+        run.index = self._index(len(run))
         return run
+
+    def _index(self, samples: int) -> Any:
+        """Times of the states where they are dates or durations; None without pandas."""
+        times, rows = self._times, self._rows
+        if len(times) < 2 or times[0].kind == "number" or find_spec("pandas") is None:
+            return None
+        first = int(times[0].value)
+        since = np.array([int(one.value) - first for one in times], np.int64)
+        pace = float(np.median(np.diff(since) / np.diff(rows)))
+        # A resumed run may begin in a gap, and x(T) comes after the last sample.
+        known = np.concatenate(([-rows[0] * pace], since, [since[-1] + pace]))
+        found = np.interp(np.arange(samples + 1), [-1e-9, *rows, samples], known)
+        nanoseconds = first + found.round().astype(np.int64)
+        pandas = import_module("pandas")
+        if times[0].kind == "duration":
+            return pandas.to_timedelta(nanoseconds, unit="ns")
+        return pandas.to_datetime(nanoseconds, unit="ns", utc=times[0].kind == "date with a zone")

@@ -466,7 +466,7 @@ class _Session:
     def _update(self, y: Any, sample: Measurement, length: float | None) -> Any:
         estimate = self._mhe.update(y, sample.u if sample.u.size else None, dt=length)
         if self._kept is not None:
-            self._kept.add(y, sample.u, length, estimate)
+            self._kept.add(y, sample, length, estimate)
         if self._bounds is not None:
             self._bounds.check(estimate, sample.u, length, sample.time.text)
         if Status.MODEL_FAILED in estimate.status:

@@ -9,6 +9,7 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError, OptionError
 from qpmhe.records import CheckpointError
+from qpmhe.records.record_model import load_record_model
 
 from .oscillator import DT, continuous, discrete, lines
 from .tools import CONTINUOUS, DISCRETE, command, cut_off, estimate, get, put
@@ -175,3 +176,31 @@ def test_standard_output_is_the_default_and_files_are_resumed_or_replaced(here):
     assert get("out.csv") == whole
     piped = command(CONTINUOUS, "-", *options, "--quiet", text=get("record.csv"))
     assert (piped.stdout_bytes, piped.stderr) == (whole, "")
+
+
+@pytest.mark.slow
+def test_a_kept_run_has_the_dates_of_its_record(here):
+    """Those that `run` has of a frame, gaps included; a resumed one, too."""
+    index = pd.date_range("2026-05-04 12:00", periods=40, freq="100ms", tz="UTC")
+    index = index.delete([9, 20, 21])
+    frame = pd.DataFrame({"y1": np.sin(np.arange(37.0)), "y2": np.arange(37) % 3.0}, index)
+    frame.rename_axis("time").to_csv("record.csv")
+    parts = load_record_model(DISCRETE)
+    kept = estimate(DISCRETE, keep_run=True, dt=0.1).run
+    expected = parts.estimator.run(frame)
+    assert (kept.index == expected.index).all()
+    np.testing.assert_array_equal(kept.states, expected.states)
+    found = qpmhe.diagnose(kept)
+    assert "times are counted from 2026-05-04 12:00:00+00:00" in found._repr_html_()
+    lines = Path("record.csv").read_text().splitlines()
+    for name, length in (("durations.csv", "0:00:{:06.3f}"), ("numbers.csv", "{}")):
+        put(name, [lines[0], *(f"{length.format(0.1 * k)},1.0,2.0" for k in range(5))])
+    durations = estimate(DISCRETE, "durations.csv", "a.csv", keep_run=True).run.index
+    assert durations.total_seconds().round(9).tolist() == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    assert estimate(DISCRETE, "numbers.csv", "b.csv", keep_run=True).run.index is None
+    put("record.csv", lines[:10])
+    estimate(DISCRETE, "record.csv", "c.csv", dt=0.1, checkpoint_every=3)
+    put("record.csv", lines)
+    resumed = estimate(DISCRETE, "record.csv", "c.csv", dt=0.1, resume=True, keep_run=True,
+                       checkpoint_every=3).run
+    assert (resumed.index == expected.index[9:]).all()
