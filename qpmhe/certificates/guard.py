@@ -27,8 +27,9 @@ from ..model.sets import ConvexSet
 from ..model.system import System
 from ..observers.projection import NearestPoint
 from .evidence import CertificateError, Evidence
-from .observer_bound import ObserverBound, Tube
+from .observer_bound import ObserverBound
 from .sizes import OUTWARD, UNIT, Sizes, weighted_lengths
+from .tube import Tube
 
 # Of a written guard: how many samples have bounds of their own at most, and when they end: once the
 # bounds are so close to their limits, as shares of these, and change so little.
@@ -71,17 +72,19 @@ class Guard:
     def c_form(self, sizes: Sizes, tube: Tube) -> GuardForm:
         """Its numbers for written C, with the bounds in advance from a first one on."""
         bound, region = self._bound, self._bound.region
-        given = sizes.disturbance, sizes.noise
-        tubes = tubes_in_advance(bound, sizes, tube, projected=False)
-        balls = tubes_in_advance(bound, sizes, tube, projected=True)
-        count = max(len(tubes), len(balls))
-        tubes, balls = (each + each[-1:] * (count - len(each)) for each in (tubes, balls))
+        # And behind the first projection, of an observer that is projected in P.
+        kinds = [
+            tubes_in_advance(bound, sizes, tube, projected=each)
+            for each in ((False, True) if bound.projects else (False,))
+        ]
+        count = max(map(len, kinds))
+        kinds = [each + each[-1:] * (count - len(each)) for each in kinds]
         initial = ", ".join(f"|e{i + 1}| <= {b:.4g}" for i, b in enumerate(tube.box))
         return GuardForm(
-            bound.metric, self._covariance, bound.gain, bound.slopes, region.lower, region.upper,
-            region.states, self._states, bound.projects, np.array([each.radius for each in tubes]),
-            np.array([each.box for each in tubes]), np.array([each.radius for each in balls]),
-            f"{Sizes(*given)}; {initial}, "
+            bound.metric, self._covariance, bound.gain, region.lower, region.upper,
+            region.states, self._states, np.array([[one.radius for one in each] for each in kinds]),
+            np.array([[one.box for one in each] for each in kinds]),
+            f"{Sizes(sizes.disturbance, sizes.noise)}; {initial}, "
             f"|e|_P <= {tube.radius:.4g} with P = mhe_guard_metric",
         )
 
@@ -160,20 +163,22 @@ def tubes_in_advance(
         return bound.followed(one, entering, added, projected=projected)
 
     def within(one: Tube, other: Tube) -> bool:
-        return one.radius <= other.radius and bool((one.box <= other.box).all())
+        sides = zip(one[1:], other[1:], strict=True)
+        return one.radius <= other.radius and all((low <= high).all() for low, high in sides)
 
-    def lasting(radius: float, box: Array) -> Tube:
-        """One that contains these and that a step makes no larger; by the ball, if no other."""
-        made = Tube(radius * (1.0 + _CLOSE), box * (1.0 + _CLOSE))
-        if within(after(made), made):
-            return made
-        return Tube(made.radius, bound.components(made.radius))
+    def largest(one: Tube, other: Tube) -> Tube:
+        return Tube(max(one.radius, other.radius), *map(np.maximum, one[1:], other[1:]))
 
-    limit = bound.limit(*given)
-    box = bound.components(limit)
+    def lasting(one: Tube) -> Tube:
+        """One that contains it and that a step makes no larger; by the ball, if no other."""
+        made = Tube(one.radius * (1.0 + _CLOSE), *((1.0 + _CLOSE) * each for each in one[1:]))
+        return made if within(after(made), made) else bound.tube(made.radius)
+
+    last, found = bound.tube(bound.limit(*given)), [tube]
     for _ in range(_MOST_SAMPLES):
-        box = np.minimum(box, after(Tube(limit, box)).box)
-    last, found = lasting(limit, box), [tube]
+        reached = after(last)
+        last = Tube(last.radius, *map(np.minimum, last[1:], reached[1:]))
+    last = lasting(last)
     while len(found) < _MOST_SAMPLES:
         tube = after(found[-1])
         same = abs(tube.radius - found[-1].radius) <= _LITTLE * tube.radius
@@ -182,7 +187,7 @@ def tubes_in_advance(
             break
         found.append(tube)
     if not within(found[-1], last):
-        last = lasting(max(last.radius, found[-1].radius), np.maximum(last.box, found[-1].box))
+        last = lasting(largest(last, found[-1]))
     return [*found, last]
 
 

@@ -25,8 +25,9 @@ from .evidence import MismatchError
 from .guard import Guard, check_guarded
 from .measured_cost import MeasuredCost
 from .norms import largest_ratio
-from .observer_bound import ObserverBound, Tube
+from .observer_bound import ObserverBound
 from .sizes import Size, Sizes
+from .tube import Tube
 
 _RELATIVE = 1e-6
 _UNITS = 8.0 * float(np.finfo(np.float64).eps)
@@ -261,7 +262,8 @@ class Monitor:
                 reason = _MOVED
             if reason:
                 self.lost, self.reason = t, reason
-                self._tube = Tube(math.nan, np.full_like(z, math.nan))
+                unknown = (np.full_like(each, math.nan) for each in self._tube[1:])
+                self._tube = Tube(math.nan, *unknown)
         self._time, self._z = t + 1, z.copy()
         if not again:
             self.steps += 1
@@ -275,7 +277,7 @@ class Monitor:
                 reason = _RESTORED
             if reason and not self.barred:
                 self.barred = f"from sample {t} on: {reason}"
-        (radius, box), z = self._tube, self._z
+        (radius, box, _), z = self._tube, self._z
         lower, upper = self.bound.around(radius, z, box)
         state, filtered, guarded = self._guarded(estimate, again, before, first)
         error = float(self.bound.farthest(radius, state - z, z, box))
@@ -449,7 +451,8 @@ class Monitor:
             )
         return {
             "time": self._time, "observer": self._z.copy(), "radius": self._tube.radius,
-            "box": self._tube.box.copy(), "lost": self.lost, "reason": self.reason,
+            "box": self._tube.box.copy(), "oblique": self._tube.oblique.copy(),
+            "lost": self.lost, "reason": self.reason,
             "metric": self.bound.metric.copy(), "moved": self.moved, "unguarded": self.unguarded,
         }
 
@@ -464,6 +467,7 @@ class Monitor:
             z = np.array(state["observer"], np.float64).reshape(self._z.shape)
             time, radius = int(state["time"]), float(state["radius"])
             box = np.array(state["box"], np.float64).reshape(self._z.shape)
+            oblique = np.array(state["oblique"], np.float64).reshape(self._tube.oblique.shape)
             lost = None if state["lost"] is None else int(state["lost"])
             reason, unguarded = str(state["reason"]), str(state["unguarded"])
             moved = int(state["moved"])
@@ -472,11 +476,12 @@ class Monitor:
                 raise ValueError(f"its bounds are {radius} and {box.tolist()}, not lost")
             if not np.array_equal(metric, mine):  # another search found another P
                 radius *= largest_ratio(mine, metric)
+                oblique = self.bound.tube(radius, box).oblique
         except (KeyError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the state does not come from a monitor of this observer: {error}."
             ) from error
-        self._time, self._z, self._tube = time, z, Tube(radius, box)
+        self._time, self._z, self._tube = time, z, Tube(radius, box, oblique)
         self.lost, self.reason, self.moved = lost, reason, moved
         if self._guard is not None and unguarded != _NO_GUARD:
             self.unguarded = unguarded

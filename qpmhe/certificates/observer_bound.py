@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,7 @@ from .contraction import certify_observer, gain_if_constant
 from .deadline import PART_SECONDS, Deadline
 from .events import CONTRADICTION, REINITIALIZED, check_model, first_event
 from .evidence import Evidence, MismatchError, json_ready
+from .faces import Faces
 from .headline import condition, headline
 from .inequalities import Matrices, definite
 from .invariance import Invariance, certify_invariance, inner_region
@@ -52,23 +53,15 @@ from .sizes import (
     lengths_of,
     weighted_lengths,
 )
+from .tube import Tube, across
 
 # How close to its limit the bound is when it is called settled, and in how many samples at most.
 _SETTLED, _MOST_SAMPLES = 0.1, 10**6
 # Of each component: how many steps its limit may take, and by how little they change at the end.
 _MOST_STEPS, _LITTLE = 3000, 1e-5
-# Boxes of more states are bounded by sums over their sides.
-_MOST_SIGNS = 10
 # How much of the time is for the contraction, of the rest for the components' step, and of what
 # that leaves for the region itself.
 _CONTRACTION, _ROWS, _INVARIANCE = 0.8, 0.5, 0.6
-
-
-class Tube(NamedTuple):
-    """Bounds at one time: |x - z|_P <= radius, and |x_i - z_i| <= box[i]."""
-
-    radius: float
-    box: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +181,10 @@ class ObserverBound:
 
     def with_rows(self, system: System, seconds: float | Deadline = math.inf) -> ObserverBound:
         """The same with the step of its components, of the certified system."""
-        rows = RowwiseStep(system, self.region, self.gain, self._inverse, seconds)
+        faces, X = None, system.states
+        if X is not None:
+            faces = Faces(X, self.region, self.metric, self.slopes, self.limit())
+        rows = RowwiseStep(system, self.region, self.gain, self._inverse, faces, seconds)
         return replace(self, rowwise=rows)
 
     @cached_property
@@ -267,7 +263,10 @@ class ObserverBound:
         return min(reached + length, math.hypot(reached, root)) * OUTWARD
 
     def added(self, disturbances: Size | None = None, noises: Size | None = None) -> Array:
-        """What w and v add to each component, always (n,) or at each sample (T, n)."""
+        """What w and v add to each component, always (n,) or at each sample (T, n).
+
+        And, of a system with an X, along the directions of its `Faces`, behind them.
+        """
         w = self.sizes.disturbance if disturbances is None else disturbances
         v = self.sizes.noise if noises is None else noises
         if self.rowwise is None:
@@ -278,7 +277,13 @@ class ObserverBound:
         """The bounds at first, from x(0) - z(0) as in `initial`."""
         radius = self.initial(error)
         extent = extent_of("initial_error", error, self.region.n)
-        return Tube(radius, np.minimum(extent * OUTWARD, self.components(radius)))
+        return self.tube(radius, np.minimum(extent * OUTWARD, self.components(radius)))
+
+    def tube(self, radius: float, box: Array | None = None) -> Tube:
+        """Bounds on |x - z|_P and on its components, of the ball if left out."""
+        box = self.components(radius) if box is None else box
+        faces = None if self.rowwise is None else self.rowwise.faces
+        return Tube(radius, box) if faces is None else Tube(radius, box, faces.oblique(box))
 
     def followed(
         self, tube: Tube, entering: ArrayLike, added: Array, *, projected: bool,
@@ -288,43 +293,62 @@ class ObserverBound:
 
         Where it is ``projected``, |e_i| may have grown though |e|_P has not.
         """
-        radius = self.advanced(tube.radius, entering)
-        box: Array = self.components(radius)
-        if self.rowwise is not None and not projected:
-            within = np.minimum(tube.box, self.widths * OUTWARD)
-            step = self.rowwise.step(within, tube.radius, observer, u)
-            box = np.minimum(box, (step + added) * OUTWARD)
-        return Tube(min(radius, self._across(box)), box)
+        return self._after(
+            tube, self.advanced(tube.radius, entering), added, projected, observer, u
+        )
 
-    def _across(self, box: Array) -> float:
-        """The largest |e|_P in a box."""
-        if box.size > _MOST_SIGNS:
-            return float(weighted_lengths(box, np.abs(self.metric)))
-        return float(weighted_lengths(self._signs * box, self.metric).max())
-
-    @cached_property
-    def _signs(self) -> Array:
-        n = self.region.n
-        negative = (np.arange(2 ** (n - 1))[:, None] >> np.arange(n)) & 1
-        return np.where(negative, -1.0, 1.0)
+    def _after(
+        self, tube: Tube, radius: float, added: Array, projected: bool,
+        observer: Array | None = None, u: Array | None = None,
+    ) -> Tube:
+        """The bounds one sample later, from those now and a bound on |x - z|_P then."""
+        if self.rowwise is None:
+            return self.tube(radius)
+        now = tube._replace(box=np.minimum(tube.box, self.widths * OUTWARD))
+        reached = (self.rowwise.step(now, observer, u) + added) * OUTWARD
+        n, faces = self.region.n, self.rowwise.faces
+        reached[:n] = np.minimum(reached[:n], self.components(radius))
+        radius = min(radius, across(reached[:n], self.metric))
+        box, oblique = reached[:n], reached[n:]
+        if projected:
+            ball = self.components(radius)
+            box, oblique = (ball, oblique[:0]) if faces is None else (
+                faces.projected(reached, radius)
+            )
+        if faces is not None:
+            oblique = np.minimum(oblique, faces.oblique(box))
+        return Tube(radius, box, oblique)
 
     @property
     def unprojected(self) -> bool:
         """Whether the observer is shown never to be projected onto X, if the `condition` holds."""
+        return self.begins_within or not self._reaches_faces
+
+    @property
+    def _reaches_faces(self) -> bool:
+        """Whether a face of X may be active in the limit, for all states of the region."""
         system = self.stability.system
         if system is None or system.states is None:
-            return system is not None
+            return system is None
+        faces = None if self.rowwise is None else self.rowwise.faces
+        return faces is None or faces.reached
+
+    @property
+    def begins_within(self) -> bool:
+        """Whether `settled` needs an initial error within the limit of |x - z|_P.
+
+        Where it rests on an inner region, around which the observer is not projected.
+        """
+        system = self.stability.system
+        if self.inner is None or system is None or system.states is None or (
+            not self._reaches_faces
+        ):
+            return False
         X = Region(system.states, system.states.lower, system.states.upper)
         states = Region(self.region.states, *(
             each[: system.n] for each in (self.region.lower, self.region.upper)
         ))
-        return self.inner is not None and not beyond(states, X)
-
-    @property
-    def begins_within(self) -> bool:
-        """Whether `settled` needs an initial error within the limit of |x - z|_P."""
-        system = self.stability.system
-        return self.unprojected and system is not None and system.states is not None
+        return not beyond(states, X)
 
     @cached_property
     def settled(self) -> Tube:
@@ -334,22 +358,21 @@ class ObserverBound:
         makes of it, and so at most what any number of steps make of a larger one.
         """
         radius = self.limit()
-        tube = Tube(radius, np.minimum(self.components(radius), self.widths * OUTWARD))
-        return self._iterated(tube, _MOST_STEPS)[0] if self.unprojected else tube
+        tube = self.tube(radius, np.minimum(self.components(radius), self.widths * OUTWARD))
+        return self._iterated(tube, _MOST_STEPS)[0]
 
     def _iterated(self, tube: Tube, most: int, until: Array | None = None) -> tuple[Tube, int]:
         """Steps of a tube that holds at all times, up to a box or until they change little."""
-        added = self.added()
+        added, projected = self.added(), not self.unprojected
         for k in range(most):
             if self.rowwise is None or (until is not None and (tube.box <= until).all()):
                 return tube, k
-            step = self.rowwise.step(tube.box, tube.radius) + added
-            box = np.minimum(tube.box, step * OUTWARD)
-            following = Tube(min(tube.radius, self._across(box)), box)
+            following = self._after(tube, tube.radius, added, projected)
+            box = np.minimum(tube.box, following.box)
             little = _LITTLE if until is None else 0.0
             if (box >= (1.0 - little) * tube.box).all():
-                return following, k
-            tube = following
+                return following._replace(box=box), k
+            tube = following._replace(box=box)
         return tube, most
 
     def limit(self, disturbances: Size | None = None, noises: Size | None = None) -> float:
@@ -475,7 +498,7 @@ class ObserverBound:
         projected = (run.flags & Status.OBSERVER_PROJECTED.value) != 0
         tube = self.begun(initial_error)
         for t in range(steps + 1):
-            radius[t], box[t] = tube
+            radius[t], box[t] = tube.radius, tube.box
             if not within[t]:
                 break
             tube = self.followed(
@@ -520,7 +543,7 @@ class ObserverBound:
         radius, limit = self.initial(Box(-self.widths, self.widths)), self.limit()
         if not limit > 0.0:
             return None
-        rows = self.rowwise is not None and self.unprojected
+        rows = self.rowwise is not None
         entering, samples, room = self.entering(), 0, 0.5 * _SETTLED if rows else _SETTLED
         if self.begins_within:
             radius = limit
@@ -531,7 +554,7 @@ class ObserverBound:
         # Then the components, which follow the radius.
         box = np.minimum(self.components(radius), self.widths * OUTWARD)
         until = (1.0 + _SETTLED) * self.settled.box
-        reached, after = self._iterated(Tube(radius, box), _MOST_STEPS, until)
+        reached, after = self._iterated(self.tube(radius, box), _MOST_STEPS, until)
         return samples + after if (reached.box <= until).all() else None
 
     @property

@@ -30,9 +30,11 @@ from ..model.system import System
 from .branch_and_bound import halves_of
 from .deadline import Deadline
 from .enclosures import Enclosure, SmoothModel
+from .faces import Faces
 from .inequalities import Matrices
 from .regions import Region, inequalities, support
-from .sizes import OUTWARD, UNIT, Size, sides_of, weighted_lengths
+from .sizes import OUTWARD, UNIT, Size, extent_of, sides_of, weighted_lengths
+from .tube import Tube
 
 # Pieces of the region; numbers that their rows may take; what of a row's size may stay as error.
 _MOST_CELLS, _HELD, _SHARP = 512, 3_000_000, 0.01
@@ -55,6 +57,8 @@ class RowwiseStep:
         L.
     inverse : (n, n) array
         A matrix that is at least the inverse of P.
+    faces : Faces, optional
+        Of a system with an X: its directions g have rows as well, behind those of the states.
     seconds : float or Deadline
         How long the region may be divided for: coarser rows give a larger step. If the time is over
         before f has been compared with its expression everywhere, no rows are known.
@@ -62,9 +66,11 @@ class RowwiseStep:
 
     def __init__(
         self, system: System, region: Region, gain: Array, inverse: Array,
-        seconds: float | Deadline = math.inf,
+        faces: Faces | None = None, seconds: float | Deadline = math.inf,
     ) -> None:
         self._region, self._gain, self._inverse = region, gain, inverse
+        self.faces = faces
+        self._directions = np.zeros((0, system.n)) if faces is None else faces.directions
         self._model: SmoothModel | None = SmoothModel(system, region)
         self._free, n = self._model.free, system.n
         G = system.disturbance_matrix
@@ -87,24 +93,32 @@ class RowwiseStep:
         return vars(self) | {"_model": None}
 
     def added(self, disturbances: Size, noises: Size) -> Array:
-        """What w and v add to each component at most, always (n,) or at each sample (T, n)."""
-        w = _reaches("disturbances", disturbances, self._matrix)
-        v = _reaches("noises", noises, self._gain)
+        """What w and v add to each component and direction, always (n + r,) or (T, n + r)."""
+        w = self._reach("disturbances", disturbances, self._matrix)
+        v = self._reach("noises", noises, self._gain)
         return (w + v) * OUTWARD
 
-    def step(
-        self, box: Array, radius: float, observer: Array | None = None, u: Array | None = None
-    ) -> Array:
-        """Bounds (n,) of what becomes of e without w and v; infinite where they are not known.
+    def _reach(self, name: str, given: Size, matrix: Array) -> Array:
+        """The largest of each row of a matrix and of each direction's rows."""
+        D, size = self._directions, matrix.shape[1]
+        found = _reaches(name, given, np.vstack((matrix, D @ matrix)))
+        if len(D):
+            rounding = (len(matrix) + 4) * UNIT * (np.abs(D) @ np.abs(matrix))
+            found[..., len(matrix) :] += rounding @ extent_of(name, given, size)
+        return found
 
-        Of |e_i| <= box[i] and |e|_P <= radius, and with the observer's state and input for states
+    def step(self, tube: Tube, observer: Array | None = None, u: Array | None = None) -> Array:
+        """Bounds (n + r,) of what becomes of e without w and v; infinite where they are not known.
+
+        Of its components and along the directions; with the observer's state and input for states
         within this distance alone.
         """
+        box = tube.box
         n = len(box)
-        found = np.full(n, np.inf)
+        found = np.full(n + len(self._directions), np.inf)
         if self.rows is None:
             return found
-        found = self._reached(self.rows, box, radius)
+        found = self._reached(self.rows, tube)
         if observer is None or self._model is None or not self.varies:
             return found
         region, margin = self._region, UNIT * (np.abs(observer) + box)
@@ -114,42 +128,76 @@ class RowwiseStep:
         if u is not None and u.size:
             lower[n:] = upper[n:] = u
         rows, _ = self._rows(self._model.enclose(lower[None], upper[None]))
-        return found if rows is None else np.minimum(found, self._reached(rows, box, radius))
+        return found if rows is None else np.minimum(found, self._reached(rows, tube))
 
-    def _reached(self, rows: Rows, box: Array, radius: float) -> Array:
-        """The largest |m e| of all rows of each state."""
-        n, free, slopes = len(box), self._free, np.sqrt(self._inverse.diagonal())
-        found, own = box.copy(), box[free]  # states that the region fixes stay as they are
+    def _reached(self, rows: Rows, tube: Tube) -> Array:
+        """The largest |m e| of all rows of each state, and of each direction."""
+        free, D, own = self._free, self._directions, tube.box[self._free]
+        found = np.append(tube.box, np.abs(D) @ tube.box)  # states that the region fixes stay
+        outward = 1.0 + len(tube.box) * _STEP
+        by_directions, rest = np.zeros((0, 0)), np.zeros(0, np.intp)
+        if len(D):
+            assert self.faces is not None
+            oblique = self.faces.oblique(tube.box)
+            if tube.oblique.size:
+                oblique = np.minimum(oblique, tube.oblique)
+            kept = np.isin(self.faces.rest, free)
+            rest = np.searchsorted(free, self.faces.rest[kept])
+            oblique, by_directions = oblique[kept], D[kept][:, free]
+        which = np.append(free, np.arange(len(tube.box), len(found)))
+        for i, (middle, error) in zip(which, rows, strict=True):
+            least = self._split(middle, own, tube.radius)
+            if len(rest):
+                # All of a row that is not in the block by directions.
+                parts = middle[:, rest]
+                left = middle - parts @ by_directions
+                missed = len(own) * _STEP * (np.abs(middle) + np.abs(parts) @ np.abs(by_directions))
+                other = np.abs(parts) @ oblique + self._split(left, own, tube.radius)
+                least = np.minimum(least, other + missed @ own)
+            found[i] = (least + error @ own).max() * outward
+        if len(D):
+            fixed = np.setdiff1d(np.arange(len(tube.box)), free)
+            found[len(tube.box) :] += np.abs(D[:, fixed]) @ tube.box[fixed]
+        return found
+
+    def _split(self, rows: Array, own: Array, radius: float) -> Array:
+        """The largest |m e| of rows (k, n): the least of n + 1 splits between ball and box."""
+        free, slopes = self._free, np.sqrt(self._inverse.diagonal())
         inverse = self._inverse[np.ix_(free, free)]
         with np.errstate(all="ignore"):
             share = own / (slopes[free] * radius)
-        # By the box where it is narrow beside the ball, by the ball elsewhere: n + 1 splits.
+        # By the box where it is narrow beside the ball, by the ball elsewhere.
         order = np.argsort(np.nan_to_num(share, nan=np.inf))
-        for i, (middle, error) in zip(free, rows, strict=True):
-            size = np.abs(middle)
-            least = size @ own
-            for k in range(len(order)):
-                kept = order[k:]
-                ball = weighted_lengths(middle[:, kept], inverse[np.ix_(kept, kept)]) * radius
-                rest = order[:k]
-                least = np.minimum(least, ball + size[:, rest] @ own[rest])
-            found[i] = (least + error @ own).max() * (1.0 + n * _STEP)
-        return found
+        size = np.abs(rows)
+        least: Array = size @ own
+        for k in range(len(order)):
+            kept, rest = order[k:], order[:k]
+            ball = weighted_lengths(rows[:, kept], inverse[np.ix_(kept, kept)]) * radius
+            least = np.minimum(least, ball + size[:, rest] @ own[rest])
+        return least
 
     def _rows(self, enclosure: Enclosure) -> tuple[Rows | None, Array]:
-        """Rows of A - L C whose hull, widened by the errors, holds all; and each cell's errors."""
+        """Rows of A - L C whose hull, widened by the errors, holds all; and each cell's errors.
+
+        And behind them those of g (A - L C) for each direction g.
+        """
         free, L = self._free, Matrices.exact(self._gain[self._free])
         n = free.size
         corners, error = enclosure.corners()
         J = Matrices(corners, np.broadcast_to(error[:, None], corners.shape))
         M = J[..., :n, :] - L @ J[..., n:, :]
+        along = Matrices.exact(self._directions[:, free]) @ M
         # In parts of the region's width: which cells are worth dividing.
         spread = np.max(M.radius[:, 0] @ self._scales / self._scales, axis=1)
         if not np.isfinite(M.middle).all() or not np.isfinite(M.radius).all():
             return None, spread
         rows = []
-        for i in range(n):
-            both = np.concatenate((M.middle[..., i, :], M.radius[..., i, :]), axis=-1)
+        middle, radius = (
+            np.concatenate((getattr(M, part), getattr(along, part)), axis=-2)
+            for part in ("middle", "radius")
+        )
+        for i in range(middle.shape[-2]):
+            both = np.concatenate((middle[..., i, :], radius[..., i, :]), axis=-1)
             both = np.unique(both.reshape(-1, 2 * n), axis=0)
             rows.append((both[:, :n], both[:, n:]))
         return rows, spread

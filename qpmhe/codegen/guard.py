@@ -92,17 +92,14 @@ class GuardForm:
         P and its inverse.
     gain : (n, p) array
         The certified gain.
-    slopes : (n,) array
-        :math:`|e_j| \le s_j |e|_P`.
     lower, upper : (n + m,) array
         Bounds on states and inputs that were certified.
     region, states : ConvexSet
         The region, and the region within X.
-    projects : bool
-        Whether the bound holds for a projected observer.
-    radius, box, ball : (T,), (T, n) and (T,) array
+    radius, box : (k, T) and (k, T, n) array
         Bounds on |x - z|_P and on each component, as long as the observer has not been projected,
-        and on the former in any case. The last ones hold at all later times.
+        and behind its first projection, if the bound holds for a projected one (k = 2). The last
+        ones hold at all later times.
     assumed : str
         The sizes that were stated, in words.
     """
@@ -110,15 +107,12 @@ class GuardForm:
     metric: Array
     covariance: Array
     gain: Array
-    slopes: Array
     lower: Array
     upper: Array
     region: ConvexSet
     states: ConvexSet
-    projects: bool
     radius: Array
     box: Array
-    ball: Array
     assumed: str
 
 
@@ -145,11 +139,12 @@ def guarded_files(files: dict[str, str], name: str, form: GuardForm) -> dict[str
     rows = len(form.states.matrix)
     data: dict[str, Any] = {
         one: _numbers(getattr(form, one))
-        for one in ("metric", "covariance", "gain", "slopes", "lower", "upper", "radius", "ball")
+        for one in ("metric", "covariance", "gain", "lower", "upper")
     }
+    kinds, samples = form.radius.shape
     data |= {
-        "samples": len(form.radius), "projects": int(form.projects),
-        "box": ", ".join(f"{{{_numbers(each)}}}" for each in form.box),
+        "samples": samples, "kinds": kinds, "projects": int(kinds > 1),
+        "radius": _nested(form.radius), "box": _nested(form.box),
         "states": _set(form.states, rows), "region": _set(form.region, rows),
     }
     nearest = _MACROS.sub("GUARD_", _OWN.sub("mhe_guard_", template("nearest.c")))
@@ -181,6 +176,13 @@ def _set(states: ConvexSet, rows: int) -> str:
         states.lower, states.upper, matrix, np.append(states.row_lower, -free),
         np.append(states.row_upper, free),
     ))
+
+
+def _nested(values: Array) -> str:
+    """The initialiser of an array of arrays."""
+    if values.ndim < 2:
+        return _numbers(values)
+    return ", ".join(f"{{{_nested(each)}}}" for each in values)
 
 
 def _numbers(values: Array) -> str:

@@ -8,7 +8,8 @@ import pytest
 import qpmhe
 from qpmhe.certificates import CertificateError, Monitor, Sizes
 from qpmhe.certificates.guard import Guard, Guarded
-from qpmhe.certificates.observer_bound import Tube, bound_observer
+from qpmhe.certificates.observer_bound import bound_observer
+from qpmhe.certificates.tube import Tube
 from qpmhe_solvers import Backend, RawSolution
 
 from .helpers import box, unit_cost

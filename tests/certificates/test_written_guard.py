@@ -9,7 +9,8 @@ import pytest
 import qpmhe
 from qpmhe.certificates import CertificateError, MismatchError, Monitor, Sizes
 from qpmhe.certificates.guard import Guard, tubes_in_advance
-from qpmhe.certificates.observer_bound import Tube, bound_observer
+from qpmhe.certificates.observer_bound import bound_observer
+from qpmhe.certificates.tube import Tube
 from qpmhe.codegen.guard import GuardForm
 from qpmhe.errors import InvalidInputError, OptionError
 
@@ -137,8 +138,8 @@ def test_a_run_is_guarded_by_the_bounds_in_advance(bound, written):
     mhe, moved = estimator(bound, cost=ROUGH, initial_state=start), 0
     for t, (y, row) in enumerate(zip(measured, found, strict=True)):
         before, estimate = mhe.observer_state, mhe.update(y)
-        tubes = [Tube(form.radius[k], form.box[k]) for k in np.minimum(
-            [t, t + 1], len(form.radius) - 1)]
+        tubes = [Tube(form.radius[0, k], form.box[0, k]) for k in np.minimum(
+            [t, t + 1], form.radius.shape[1] - 1)]
         later, now = guard(estimate.state, estimate.observer_state, tubes[1]), guard(
             estimate.filtered, before, tubes[0])
         np.testing.assert_allclose(row[:4], [*later.point, *now.point], rtol=1e-9, atol=1e-9)
@@ -168,7 +169,7 @@ def test_a_run_is_guarded_by_the_bounds_in_advance(bound, written):
 @pytest.mark.slow
 @pytest.mark.parametrize("projects", [True, False])
 def test_a_projected_observer_and_inputs(projects, tmp_path):
-    """In the certified metric, the ball alone counts from the first projection on."""
+    """In the certified metric, other bounds count from the first projection on."""
     X, inputs = box([-1.0, -1.0], [1.0, 1.0]), box(-0.1, 0.1)
     system = qpmhe.System(
         lambda x, u: x @ A.T + 0.05 * np.sin(x[..., :1]) * np.array([0.0, 1.0]) + u,
@@ -232,12 +233,12 @@ def test_an_fmu_has_the_guarded_estimates(bound, tmp_path):
         bound.sizes, bound.begun(START))
     unit = Unit(mhe, tmp_path, guard=Monitor(bound, mhe, initial_error=START, guard=True))
     unit.start()
-    assert unit.get("error") == form.box[0].tolist()
+    assert unit.get("error") == form.box[0, 0].tolist()
     guard, rng, moved = Guard(bound, plant()), np.random.default_rng(2), 0
     for t in range(12):
         y, z = rng.uniform(-0.3, 0.3, 1), mhe.observer_state
         state, estimate = unit.take(t, y=y), mhe.update(y)
-        tubes = [Tube(form.radius[k], form.box[k]) for k in (t, t + 1)]
+        tubes = [Tube(form.radius[0, k], form.box[0, k]) for k in (t, t + 1)]
         later = guard(estimate.state, estimate.observer_state, tubes[1])
         now = guard(estimate.filtered, z, tubes[0])
         np.testing.assert_allclose(state, later.point, rtol=1e-8, atol=1e-9)

@@ -36,6 +36,10 @@ def test_a_gain_is_found_and_its_bound_is_proved(name):
     assert bound.rate < 1.0
     assert bound.headline.count("guarded, x_hat is within") == 1
     assert (bound.settled.box < bound.widths).all()
+    if name == "battery_cell":  # projected at the full charge, it has the box in advance
+        ball = bound.components(bound.limit())
+        assert bound.rowwise.faces.block.tolist() == [0]
+        assert bound.settled.box[1] < 0.4 * ball[1]
 
 
 @pytest.mark.slow

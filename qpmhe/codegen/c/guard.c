@@ -8,20 +8,19 @@
 #define OUTWARD (1 + 16 * EPSILON)
 
 #define GUARD_SAMPLES $samples /* of the bounds: the last ones hold from there on */
+#define GUARD_KINDS $kinds /* of the bounds: those behind a projection as well, or not */
 
 static const real mhe_guard_metric[NX * NX] = {$metric};       /* P */
 static const real mhe_guard_covariance[NX * NX] = {$covariance}; /* its inverse */
 static const real mhe_guard_gain[NX * NY] = {$gain};
-static const real mhe_guard_slopes[NX] = {$slopes}; /* |e_j| <= slopes[j] |e|_P */
 /* The region of the proof, states and then inputs, and the rows of K. */
 static const real mhe_guard_lower[NX + NU] = {$lower};
 static const real mhe_guard_upper[NX + NU] = {$upper};
 static const mhe_guard_set mhe_guard_states = {$states};
 static const mhe_guard_set mhe_guard_region = {$region};
-/* Bounds on |x - z|_P and |x_j - z_j|; and on the former whether or not the observer was projected. */
-static const real mhe_guard_radius[GUARD_SAMPLES] = {$radius};
-static const real mhe_guard_box[GUARD_SAMPLES][NX] = {$box};
-static const real mhe_guard_ball[GUARD_SAMPLES] = {$ball};
+/* Bounds on |x - z|_P and |x_j - z_j|: before the observer was projected, and from then on. */
+static const real mhe_guard_radius[GUARD_KINDS][GUARD_SAMPLES] = {$radius};
+static const real mhe_guard_box[GUARD_KINDS][GUARD_SAMPLES][NX] = {$box};
 
 typedef struct {
     real radius, box[NX];
@@ -30,10 +29,9 @@ typedef struct {
 static void mhe_tube_at(const mhe_guard *g, int64_t time, mhe_tube *tube)
 {
     const int k = time < GUARD_SAMPLES ? (int)time : GUARD_SAMPLES - 1;
-    tube->radius = g->projected ? mhe_guard_ball[k] : mhe_guard_radius[k];
-    for (int j = 0; j < NX; j++)
-        tube->box[j] = g->projected ? mhe_guard_ball[k] * mhe_guard_slopes[j] * OUTWARD
-                                    : mhe_guard_box[k][j];
+    const int kind = GUARD_KINDS > 1 && g->projected;
+    tube->radius = mhe_guard_radius[kind][k];
+    for (int j = 0; j < NX; j++) tube->box[j] = mhe_guard_box[kind][k][j];
 }
 
 /* |s|_P, rounded up. */
@@ -144,7 +142,7 @@ void mhe_guard_start(mhe_guard *g, const mhe_estimator *e)
     memcpy(g->state, e->z_end, sizeof g->state);
     memcpy(g->filtered, e->z_end, sizeof g->filtered);
     if (e->time) g->off = MHE_GUARD_OTHER_SAMPLE;
-    for (int j = 0; j < NX; j++) g->error[j] = g->off ? NAN : mhe_guard_box[0][j];
+    for (int j = 0; j < NX; j++) g->error[j] = g->off ? NAN : mhe_guard_box[0][0][j];
 }
 
 void mhe_guard_check(mhe_guard *g, const mhe_estimator *e, const mhe_estimate *estimate)
