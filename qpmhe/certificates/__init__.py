@@ -13,12 +13,13 @@ from .evidence import (
 )
 from .lyapunov import Design, design
 from .monitor import Monitor, Reading
-from .observer_bound import Band, ObserverBound
+from .observer_bound import ObserverBound
 from .properties import Detectability, ObserverStability
 from .regions import Region
 from .sizes import Sizes
 from .stored import load, save
 from .theorem import DecayingSums, TheoremConstants
+from .tube import Band
 
 __all__ = [
     "Assumption", "Band", "Certificate", "CertificateError", "Content", "DecayingSums", "Design",

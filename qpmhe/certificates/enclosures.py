@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -140,39 +141,32 @@ class SmoothModel:
 
     def __init__(self, system: System, region: Region) -> None:
         self._system, self._region, self.n = system, region, system.n
-        graph = self._graph = Graph(system.n + system.m)
         wide = region.lower < region.upper
         self.free = np.flatnonzero(wide[: self.n])
-        for k in np.flatnonzero(~wide):
-            graph.variables[k] = graph.constant(region.lower[k])
         self.points = region.sample(_SAMPLES, np.random.default_rng(_SEED))
-        self._programs: dict[str, Program] = {}
         self._unknown: tuple[Array, Array] | None = None
         self.compared, self.late = len(self.points), ""
-        self.reason, output = self._read("h")
-        following: list[int] = []
-        if not self.reason:
-            self.reason, following = self._read("f")
-        slopes, self._plan = Slopes(graph), None
-        self.affine_output = not (
-            self.reason
-            or any(
-                slopes.of(slope) or graph.comparisons([slope])
-                for root in output for slope in slopes.of(root).values()
-            )
-            or self._programs["h"].obstacle(region.lower, region.upper)
+        functions, missing = _functions(system)
+        given = (*functions, *(each.serialize() for each in functions.values()))
+        fixed = tuple((int(k), float(region.lower[k])) for k in np.flatnonzero(~wide))
+        self._own = own = _expressions(_Source(system.n, system.m, fixed, given, functions))
+        self._programs = own.programs
+        self.reason = next(filter(None, map(self._refused, functions)), missing)
+        self.affine_output = not self.reason and own.affine_output and not (
+            own.programs["h"].obstacle(region.lower, region.upper)
         )
-        if not self.reason:
-            self._values = Program(graph, following + output)
-            rows = [*(following[i] for i in self.free), *output]
-            self._plan = _Plan(graph, slopes, rows, self.free.tolist())
-        fixed = np.flatnonzero(~wide[: self.n])
-        if self.reason and fixed.size:
-            ahead = evaluated("f", system.f, self.points, self.n)[:, fixed]
-            kept = (ahead == region.lower[fixed]).all(axis=0)
+        held = np.flatnonzero(~wide[: self.n])
+        if self.reason and held.size:
+            ahead = evaluated("f", system.f, self.points, self.n)[:, held]
+            kept = (ahead == region.lower[held]).all(axis=0)
         else:
-            kept = np.array([graph.value(following[i]) == region.lower[i] for i in fixed], np.bool_)
-        self.moved = fixed[~kept]
+            kept = np.array([own.following(int(i)) == region.lower[i] for i in held], np.bool_)
+        self.moved = held[~kept]
+
+    def _refused(self, name: str) -> str:
+        """Why a function that has an expression has no enclosure; blank if it has one."""
+        obstacle = self._programs[name].obstacle(self.points[0], self.points[0])
+        return f"{name} has {obstacle}" if obstacle else self._differs(name, self.points)
 
     def jacobians(self, points: Array) -> Array:
         """The joint Jacobians at some points: of the expressions, or of the functions."""
@@ -187,17 +181,6 @@ class SmoothModel:
         true = self.enclose(points, points).centre
         return np.where(np.isfinite(true), true, joint)
 
-    def _read(self, name: str) -> tuple[str, list[int]]:
-        """Why a function has no enclosure, or the nodes of its values."""
-        expression = expression_of(self._system, name)
-        if expression.function is None:
-            helps = "" if expression.reason.endswith(SOLVES) else f". {_TRACEABLE}"
-            return f"{name} is not traced: {expression.reason}{helps}", []
-        roots = read(self._graph, expression.function)
-        self._programs[name] = Program(self._graph, roots)
-        obstacle = self._programs[name].obstacle(self.points[0], self.points[0])
-        return f"{name} has {obstacle}" if obstacle else self._differs(name, self.points), roots
-
     @property
     def unknown(self) -> str:
         """The last cell that could not be enclosed, and why, as the rest of a sentence."""
@@ -210,10 +193,13 @@ class SmoothModel:
 
     def obstacle(self, lower: Array, upper: Array) -> str:
         """What has no enclosure on a cell (N,), in words; blank if everything has one."""
-        parts = {**{f"{name} has": one for name, one in self._programs.items()},
-                 "a derivative has": self._plan}
+        parts: dict[str, Program | _Plan] = {
+            f"{name} has": one for name, one in self._programs.items()
+        }
+        if not self.reason:
+            parts["a derivative has"] = self._own.plan
         for words, part in parts.items():
-            found = part.obstacle(lower, upper) if part is not None else ""
+            found = part.obstacle(lower, upper)
             if found:
                 return f"{words} {found}"
         return ""
@@ -226,7 +212,6 @@ class SmoothModel:
         these points are within, others of the region are added. ``reason`` says where they differ,
         and ``late`` how far it came if the time is over before.
         """
-        assert self._plan is not None
         lower, upper = (np.concatenate([each[k] for each in cells]) for k in range(2))
         own, compared, self.late = len(lower), 0, ""
         lower, upper = (np.tile(each, (-(-_LEAST // own), 1)) for each in (lower, upper))
@@ -240,7 +225,7 @@ class SmoothModel:
             low, high = lower[k : k + _TOGETHER], upper[k : k + _TOGETHER]
             inner, share = rng.uniform(low, high), rng.integers(2, size=low.shape)
             corner = np.where(share == 1, high, low)
-            points = np.vstack((inner, corner, *self._plan.around_kinks(low, high, rng)))
+            points = np.vstack((inner, corner, *self._own.plan.around_kinks(low, high, rng)))
             points = points[self._region.contains(points[:, : self.n])]
             compared += len(points)
             if k == parts[-1] and compared < _LEAST:
@@ -281,7 +266,7 @@ class SmoothModel:
 
     def values(self, lower: Array, upper: Array) -> Interval:
         """Enclosures (B, n + p) of f and h over cells (B, N); NaN where there are none."""
-        found = self._values(lower, upper)
+        found = self._own.values(lower, upper)
         return Interval(found.low.T, found.high.T)
 
     def enclose(self, lower: Array, upper: Array) -> Enclosure:
@@ -298,8 +283,7 @@ class SmoothModel:
         return found
 
     def _enclosed(self, lower: Array, upper: Array) -> Enclosure:
-        plan = self._plan
-        assert plan is not None
+        plan = self._own.plan
         found, open_ends = plan.enclosed(lower, upper)
         count = open_ends.sum(axis=1)
         kinked = (count > 0) & (count <= _MOST_KINKS) & np.isfinite(found.error).all(axis=(1, 2))
@@ -314,6 +298,73 @@ class SmoothModel:
         )
         # Cells are divided by what the sides of a kink leave open, not by the kink.
         return replace(found, sides=sides, excess=np.max([side.excess for side in sides], axis=0))
+
+
+def _functions(system: System) -> tuple[dict[str, Any], str]:
+    """CasADi's functions h and f, as far as there are some, and why there is not the next one."""
+    found: dict[str, Any] = {}
+    for name in ("h", "f"):
+        expression = expression_of(system, name)
+        if expression.function is None:
+            helps = "" if expression.reason.endswith(SOLVES) else f". {_TRACEABLE}"
+            return found, f"{name} is not traced: {expression.reason}{helps}"
+        found[name] = expression.function
+    return found, ""
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What the programs of a model are made of; ``given`` are its functions as text."""
+
+    n: int
+    m: int
+    fixed: tuple[tuple[int, float], ...]  # coordinates that a region fixes
+    given: tuple[str, ...]
+    functions: dict[str, Any] = field(compare=False)
+
+
+class _Expressions:
+    """The programs of f and h: the same for each region that fixes the same coordinates."""
+
+    def __init__(self, source: _Source) -> None:
+        graph = self._graph = Graph(source.n + source.m)
+        for k, value in source.fixed:
+            graph.variables[k] = graph.constant(value)
+        fixed = dict(source.fixed)
+        self._free = [i for i in range(source.n) if i not in fixed]
+        self._roots = {name: read(graph, each) for name, each in source.functions.items()}
+        self.programs = {name: Program(graph, roots) for name, roots in self._roots.items()}
+        self._slopes = Slopes(graph)
+
+    def following(self, i: int) -> float | None:
+        """The next value of a state, if that is a number."""
+        return self._graph.value(self._roots["f"][i])
+
+    @cached_property
+    def affine_output(self) -> bool:
+        """Whether no second derivative of h, nor a condition in a first one, is left."""
+        slopes, graph = self._slopes, self._graph
+        return not any(
+            slopes.of(slope) or graph.comparisons([slope])
+            for root in self._roots["h"] for slope in slopes.of(root).values()
+        )
+
+    @cached_property
+    def values(self) -> Program:
+        """F and h together."""
+        return Program(self._graph, self._roots["f"] + self._roots["h"])
+
+    @cached_property
+    def plan(self) -> _Plan:
+        """The joint Jacobian."""
+        rows = [*(self._roots["f"][i] for i in self._free), *self._roots["h"]]
+        return _Plan(self._graph, self._slopes, rows, self._free)
+
+
+@lru_cache(maxsize=2)
+def _expressions(source: _Source) -> _Expressions:
+    """Made once for the parts of a certificate, which ask one after another."""
+    return _Expressions(source)
 
 
 class _Plan:

@@ -53,7 +53,7 @@ from .sizes import (
     lengths_of,
     weighted_lengths,
 )
-from .tube import Tube, across
+from .tube import Band, Tube, across
 
 # How close to its limit the bound is when it is called settled, and in how many samples at most.
 _SETTLED, _MOST_SAMPLES = 0.1, 10**6
@@ -62,37 +62,6 @@ _MOST_STEPS, _LITTLE = 3000, 1e-5
 # How much of the time is for the contraction, of the rest for the components' step, and of what
 # that leaves for the region itself.
 _CONTRACTION, _ROWS, _INVARIANCE = 0.8, 0.5, 0.6
-
-
-@dataclass(frozen=True, eq=False)
-class Band:
-    """The bound along a run, at the times 0, ..., T.
-
-    Attributes
-    ----------
-    radius : (T + 1,) array
-        b(t), which bounds |x(t) - z(t)|_P; NaN once the bound no longer holds.
-    lower, upper : (T + 1, n) array
-        Sides of a box that holds the true state.
-    error : (T + 1,) array
-        Upper bound on |x(t) - x_hat(t)|.
-    lost : int or None
-        The sample after which it no longer holds.
-    reason : str
-        Why; empty while it holds.
-    """
-
-    radius: Array
-    lower: Array
-    upper: Array
-    error: Array
-    lost: int | None = None
-    reason: str = ""
-
-    def __str__(self) -> str:
-        if self.lost is None:
-            return f"the bound holds at all {len(self.radius) - 1} samples"
-        return f"the bound holds up to sample {self.lost}: there {self.reason}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +153,7 @@ class ObserverBound:
         faces, X = None, system.states
         if X is not None:
             faces = Faces(X, self.region, self.metric, self.slopes, self.limit())
-        rows = RowwiseStep(system, self.region, self.gain, self._inverse, faces, seconds)
+        rows = RowwiseStep(system, self.region, self.gain, self._inverse, seconds, faces)
         return replace(self, rowwise=rows)
 
     @cached_property

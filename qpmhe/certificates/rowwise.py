@@ -57,16 +57,16 @@ class RowwiseStep:
         L.
     inverse : (n, n) array
         A matrix that is at least the inverse of P.
-    faces : Faces, optional
-        Of a system with an X: its directions g have rows as well, behind those of the states.
     seconds : float or Deadline
         How long the region may be divided for: coarser rows give a larger step. If the time is over
         before f has been compared with its expression everywhere, no rows are known.
+    faces : Faces, optional
+        Of a system with an X: its directions g have rows as well, behind those of the states.
     """
 
     def __init__(
         self, system: System, region: Region, gain: Array, inverse: Array,
-        faces: Faces | None = None, seconds: float | Deadline = math.inf,
+        seconds: float | Deadline = math.inf, faces: Faces | None = None,
     ) -> None:
         self._region, self._gain, self._inverse = region, gain, inverse
         self.faces = faces

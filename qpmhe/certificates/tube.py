@@ -1,7 +1,8 @@
-"""Bounds on an observer's error at one time: in the norm of P, and by component."""
+"""Bounds on an observer's error, in the norm of P and by component: at one time, along a run."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,37 @@ class Tube(NamedTuple):
     radius: float
     box: Array
     oblique: Array = np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The bound along a run, at the times 0, ..., T.
+
+    Attributes
+    ----------
+    radius : (T + 1,) array
+        b(t), which bounds |x(t) - z(t)|_P; NaN once the bound no longer holds.
+    lower, upper : (T + 1, n) array
+        Sides of a box that holds the true state.
+    error : (T + 1,) array
+        Upper bound on |x(t) - x_hat(t)|.
+    lost : int or None
+        The sample after which it no longer holds.
+    reason : str
+        Why; empty while it holds.
+    """
+
+    radius: Array
+    lower: Array
+    upper: Array
+    error: Array
+    lost: int | None = None
+    reason: str = ""
+
+    def __str__(self) -> str:
+        if self.lost is None:
+            return f"the bound holds at all {len(self.radius) - 1} samples"
+        return f"the bound holds up to sample {self.lost}: there {self.reason}"
 
 
 def across(box: Array, metric: Array) -> float:

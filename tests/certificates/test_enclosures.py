@@ -10,15 +10,22 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import Evidence, certify_detectability, certify_observer, enclosures
+from qpmhe.certificates import (
+    Evidence,
+    Sizes,
+    certify_detectability,
+    certify_observer,
+    enclosures,
+)
 from qpmhe.certificates.deadline import Deadline
 from qpmhe.certificates.enclosures import SmoothModel
 from qpmhe.certificates.invariance import certify_invariance
+from qpmhe.certificates.observer_bound import bound_observer
 from qpmhe.certificates.regions import Region, bounded_region
 from qpmhe.certificates.rowwise import RowwiseStep
 from qpmhe.errors import ModelError
 
-from .helpers import GAIN, box, scalar, smooth, unit_box
+from .helpers import GAIN, box, scalar, smooth, unit_box, unit_cost
 from .random_expressions import made, value
 
 mpmath.mp.dps = 40
@@ -327,3 +334,22 @@ def test_nothing_is_enclosed_where_values_or_derivatives_are_not_finite():
     corners, error = model.enclose(np.array([[0.0], [0.5]]), np.array([[0.1], [1.0]])).corners()
     assert np.isnan(error[1]).all()
     assert corners[0].max() + error[0].max() >= 2e307
+
+
+def test_programs_are_made_once_for_all_parts_of_a_certificate(monkeypatch):
+    """Of the same expressions, whichever region asks; of a changed model, anew."""
+    made, begin = [], enclosures._Expressions.__init__
+    monkeypatch.setattr(
+        enclosures._Expressions, "__init__", lambda *given: (made.append(1), begin(*given))[1])
+    slope = np.array([[0.8123]])
+    system = qpmhe.System(lambda x: x @ slope.T + 0.01 * np.sin(x), lambda x: 1.0 * x, n=1, p=1)
+    bound = bound_observer(
+        system, qpmhe.Luenberger([[0.2]]), unit_cost(), box(-1.0, 1.0), sizes=Sizes(0.01, 0.01))
+    assert bound.inner is not None or bound.invariance is not None
+    assert len(made) == 1
+    slope[0, 0] = 0.7
+    region = Region(box(-1.0, 1.0), np.array([-1.0]), np.array([1.0]))
+    model = SmoothModel(system, region)
+    assert len(made) == 2
+    assert model.jacobians(np.zeros((1, 1)))[0, 0, 0] == pytest.approx(0.71, rel=1e-12)
+    assert not model.reason
