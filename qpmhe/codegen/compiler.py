@@ -78,6 +78,11 @@ def _processor() -> str:
     return "\n".join((platform.machine(), platform.processor(), *sorted(wanted)))
 
 
+def has_vectors() -> bool:
+    """Whether the processor computes with four numbers at once, as ``factor_vectors.c`` does."""
+    return " avx2" in _processor()
+
+
 def compiled_library(
     files: dict[str, str] | Callable[[], dict[str, str]], main: str, key: str | None = None,
     check: Callable[[ctypes.CDLL], str] | None = None, patience: float | None = None,

@@ -30,6 +30,7 @@ from ..terms.base import TermForm
 from ..terms.prior import PriorWeights
 from ..terms.rows import Rows
 from ..terms.soft import SOFT
+from .compiler import has_vectors
 from .directions import Directions
 
 SET_NAMES = ("disturbances", "noises", "states")
@@ -45,8 +46,9 @@ _CLOCK_TEXT = """
  *
  * To keep time_budget, set `clock` in a copy of the settings to a function that returns seconds."""
 _MOST = int(np.iinfo(np.int32).max)
-# From so many states on, LAPACK's calls take less time than loops that a compiler made.
-_LAPACK_STATES = 40
+# From so many states on, LAPACK's calls take less time than loops that a compiler made, and than
+# tiles in a processor's registers; and tiles less than loops.
+_LAPACK_STATES, _LAPACK_AFTER_TILES, _TILED_STATES = 40, 100, 4
 _PROJECTIONS = (None, "observer", "diagonal")
 # In single precision rounding makes eigenvalues of correlations of this size.
 _LEAST_SINGLE = 1e-6
@@ -97,8 +99,9 @@ class Layout:
     observer_prior: bool = False
     #: Which terms have a user's loss, in the order of `TERMS`, as bits.
     own_losses: int = 0
-    #: Whether the factorisation calls LAPACK.
+    #: Whether the factorisation calls LAPACK, or computes with a processor's vectors.
     lapack: bool = False
+    vectors: bool = False
     #: Whether there is a time budget, and a clock to keep it.
     clock: bool = False
     #: Whether a candidate outside of the sets is restored into them at a higher cost.
@@ -134,10 +137,10 @@ class Layout:
     @classmethod
     def of(
         cls, directions: Directions, horizon: int, real: str = "double",
-        lapack: bool = False, clock: bool = False, restores: bool = False,
+        native: bool = False, clock: bool = False, restores: bool = False,
         restarts: bool = False,
     ) -> Layout:
-        """The sizes and features of an estimator. `lapack` allows it where it is quicker."""
+        """The sizes and features of an estimator; if `native`, by all that is quick here."""
         system, observer, cost = directions.system, directions.observer, directions.cost
         form = cost.c_form
         losses = () if form is None else form.losses
@@ -154,6 +157,8 @@ class Layout:
         rule, functions = own.innovation, system.constraints
         constrained = functions is not None or any(there for there, _ in sets)
         terms = directions.terms_of(system, cost)
+        native = native and directions.free is None
+        vectors = native and _TILED_STATES <= system.n < _LAPACK_AFTER_TILES and has_vectors()
         return cls(
             system.n, system.p, system.m, horizon, sets, real, observer=own.name,
             widened=any(one.graduation > 1.0 for one in losses[1:]),
@@ -165,7 +170,8 @@ class Layout:
             innovation="" if rule is None or rule.c_name is None else rule.c_name,
             sensors=len(observer.sensors), rejects=observer.rejects,
             observer_prior=cost.observer_prior is not None,
-            lapack=lapack and system.n >= _LAPACK_STATES and directions.free is None, clock=clock,
+            lapack=native and system.n >= _LAPACK_STATES and not vectors, vectors=vectors,
+            clock=clock,
             restores=restores and constrained, restarts=restarts,
             residuals=(_kind(system.output_residual), _kind(system.state_residual)),
             turns=system.turns is not None, quiet=directions.quiet, numbers=numbers,

@@ -190,7 +190,7 @@ def symbolic_model(system: System, observer: Observer, cost: Cost) -> CasadiMode
 
 def planned(
     system: System, observer: Observer, cost: Cost, settings: Settings, real: str = "double",
-    lapack: bool = False, usual: Conditions = USUAL,
+    native: bool = False, usual: Conditions = USUAL,
 ) -> tuple[Layout, NDArray[Any]]:
     """Layout and settings of an estimator's C code; raises if it has no C form."""
     system, cost = usual.applied(system, cost)
@@ -200,7 +200,7 @@ def planned(
     assert system.symbolic is not None
     directions = Directions(system, observer, cost)
     layout = Layout.of(
-        directions, settings.horizon, real, lapack,
+        directions, settings.horizon, real, native,
         settings.time_budget is not None, settings.infeasible == "restore", settings.restart,
     )
     return layout, settings_record(
@@ -286,7 +286,7 @@ class EstimatorLibrary:
         patience: float | None = None,
     ) -> None:
         self.layout, self.settings = layout, record = planned(
-            system, observer, cost, settings, lapack=True
+            system, observer, cost, settings, native=True
         )
         self.observer, self._options = observer, settings
         #: How the user's disturbances are those of C.
@@ -325,7 +325,7 @@ class EstimatorLibrary:
     ) -> EstimatorLibrary | None:
         """The same functions with other settings; None where these need other code."""
         try:
-            layout, record = planned(system, observer, cost, settings, lapack=True)
+            layout, record = planned(system, observer, cost, settings, native=True)
         except OptionError:
             return None
         if layout != self.layout:

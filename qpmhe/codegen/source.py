@@ -168,6 +168,7 @@ def _search_parts(layout: Layout) -> tuple[str, ...]:
     soft, constrained = SOFT in layout.terms, layout.has_rows
     if layout.free is None:
         factor, blocks = "factor", ["factor_lapack" if layout.lapack else "factor_loops"]
+        blocks = ["factor_vectors", *blocks] if layout.vectors else blocks
         blocks += ["constraints_factor"] if layout.constraints else []
     else:
         factor, bends = "elimination", _or_none("constraints_elimination", layout.constraints)

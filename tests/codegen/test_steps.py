@@ -83,7 +83,7 @@ def test_a_budget_that_is_spent_at_once_leaves_the_candidate():
 
 def test_a_hessian_that_is_not_finite_keeps_the_candidate(tmp_path):
     """LAPACK, which only the engine uses, gets infinities: it fails, and the step goes on."""
-    n = 42
+    n = 102
     system = qpmhe.from_casadi(
         lambda x: 0.5 * x + 1e-3 * ca.sin(1e150 * x), lambda x: x[:3], n=n, compiled=False
     )
