@@ -1,12 +1,15 @@
 """The latency of single updates of the compiled step: medians, tails, and the machine's own spikes.
 
 A zoo model written in plain NumPy, beside the same model given as CasADi functions. Where other
-programs take the processor within an update, its time is the processor's. Between the
-updates a loop waits for as long as an update usually takes, and does nothing: its tail is the
+programs take the processor within an update, its time is the processor's. Between the updates an
+empty loop runs so many passes that it usually takes as long as an update: its tail is the
 machine's. The column `first` is the median over the first 100 samples of a new estimator, in the
 best of 15. The column `to CasADi` divides it by that of the CasADi model. The column `own tail`
 subtracts the machine's share from the 99.99th percentile and divides the rest by the median; this
-share is how far the idle loop's percentile lies above its own median.
+share is how far the empty loop's percentile lies above its own median. The column `left alone` is
+the same of those updates in which the system's scheduler did not take the processor away, and
+`taken` says in how many of a million it did: after that, caches are cold. Interrupts of the machine
+count neither, and the empty loop meets as many of them.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import argparse
 import gc
 import json
 import os
+import resource
 from pathlib import Path
 from time import perf_counter, thread_time
 
@@ -58,10 +62,12 @@ def main() -> None:
     table = Table(title="Microseconds an update", title_justify="left")
     table.add_column("estimator", no_wrap=True)
     columns = "first", *(f"{one:g} %" for one in PERCENTILES), "idle", "to CasADi", "own tail"
+    columns += "left alone", "taken"
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
     for row in rows:
         numbers = *row["microseconds"], row["first_to_casadi"], row["own_tail_to_median"]
+        numbers += row["left_alone_to_median"], row["taken_in_a_million"]
         table.add_row(row["estimator"], *(f"{one:,.2f}" for one in numbers))
     Console(width=120).print(table)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -93,28 +99,50 @@ def measured(name: str, steps: int) -> list[dict[str, object]]:
     first = dict.fromkeys(systems, np.inf)
     for _ in range(RECORDS):
         for kind in systems:
-            took, _ = timed(made(kind), samples, RECORD, 0.0)
+            took, *_ = timed(made(kind), samples, RECORD, 0)
             first[kind] = min(first[kind], float(np.median(took)))
     rows = []
     for kind in systems:
         mhe = made(kind)
         gc.collect()
         gc.disable()
-        took, idle = timed(mhe, samples, steps, first[kind])
+        passes = int(first[kind] / seconds_a_pass())
+        took, idle, taken = timed(mhe, samples, steps, passes)
         gc.enable()
         found = [first[kind], *np.percentile(took, PERCENTILES), np.percentile(idle, 99.99)]
         machine = found[-1] - np.median(idle)
+        alone = np.percentile(took[~taken[0]], 99.99)
+        machine_alone = np.percentile(idle[~taken[1]], 99.99) - np.median(idle)
         rows.append({
             "estimator": f"{name}, {kind}", "microseconds": [1e6 * one for one in found],
             "first_to_casadi": first[kind] / first["CasADi"],
             "own_tail_to_median": float((found[-2] - machine) / found[1]),
+            "left_alone_to_median": float((alone - machine_alone) / found[1]),
+            "taken_in_a_million": 1e6 * float(taken[0].mean()),
         })
     return rows
 
 
-def timed(mhe: qpmhe.MovingHorizonEstimator, samples: list, steps: int, wait: float) -> tuple:
-    """Seconds of each update, and of waiting for so many seconds in between."""
+def seconds_a_pass(passes: int = 10_000) -> float:
+    """The least time of a pass of an empty loop."""
+    least = np.inf
+    for _ in range(RECORDS):
+        began = perf_counter()
+        for _ in range(passes):
+            pass
+        least = min(least, (perf_counter() - began) / passes)
+    return float(least)
+
+
+def timed(mhe: qpmhe.MovingHorizonEstimator, samples: list, steps: int, passes: int) -> tuple:
+    """Seconds of each update, of so many passes of an empty loop, and who was interrupted.
+
+    The last is an array (2, steps): whether another thread had the processor within the update,
+    and within the loop.
+    """
     took, idle, clock, count = np.empty(steps), np.empty(steps), perf_counter, len(samples)
+    switches, usage = np.empty((2, steps + 1), np.int64), resource.getrusage
+    switches[1, 0] = usage(resource.RUSAGE_THREAD).ru_nivcsw
     busy = thread_time
     for t in range(steps):
         sample = samples[t % count]
@@ -124,12 +152,16 @@ def timed(mhe: qpmhe.MovingHorizonEstimator, samples: list, steps: int, wait: fl
         ended = clock()
         # The processor's clock takes longer to read, and around the other one reads more.
         took[t] = min(ended - began, busy() - before)
+        switches[0, t + 1] = usage(resource.RUSAGE_THREAD).ru_nivcsw
         before = busy()
-        began = ended = clock()
-        while ended - began < wait:
-            ended = clock()
+        began = clock()
+        for _ in range(passes):
+            pass
+        ended = clock()
         idle[t] = min(ended - began, busy() - before)
-    return took, idle
+        switches[1, t + 1] = usage(resource.RUSAGE_THREAD).ru_nivcsw
+    taken = switches[0, 1:] > switches[1, :-1], switches[1, 1:] > switches[0, 1:]
+    return took, idle, np.array(taken)
 
 
 if __name__ == "__main__":
