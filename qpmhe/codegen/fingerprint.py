@@ -14,6 +14,7 @@ from typing import Any
 from .._version import __version__
 from ..model.algebraic import AlgebraicStates
 from ..model.expressions import CasadiModel, import_casadi
+from ..model.flows import flow_pattern
 from ..model.implicit_steps import ImplicitStep
 from ..model.products import with_slope
 from .layout import Layout
@@ -59,7 +60,7 @@ def _generator() -> str:
     digest = hashlib.sha256(__version__.encode())
     models = [
         Path(sys.modules[one.__module__].__file__ or "")
-        for one in (AlgebraicStates, CasadiModel, ImplicitStep, with_slope)
+        for one in (AlgebraicStates, CasadiModel, ImplicitStep, flow_pattern, with_slope)
     ]
     here = files(__package__)
     for folder in (here, here.joinpath("c")):

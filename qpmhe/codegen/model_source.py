@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -20,6 +21,7 @@ from ..model.algebraic import (
     SMALL,
 )
 from ..model.expressions import CasadiModel, import_casadi
+from ..model.flows import few_fill_ins, flow_pattern
 from ..model.implicit_steps import (
     COLLOCATIONS,
     CONTRACTION,
@@ -35,6 +37,8 @@ from .templates import filled, prologue, template
 
 # Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
+# Rows need not be exchanged where the sum of the squares of all multipliers is at most this.
+_LARGEST_MULTIPLIERS = 100.0
 
 
 def model_source(model: CasadiModel, single: bool = False) -> str:
@@ -98,7 +102,7 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
             "converged as a root; use engine='python', which reports a failure."
         )
     return "\n".join((
-        *_quieted(code, single), *calls, *_model_parts(model), *_algebraic_set(model),
+        *_quieted(code, single), *calls, *_model_parts(model, single), *_algebraic_set(model),
     ))
 
 
@@ -200,7 +204,7 @@ def own_losses(model: CasadiModel) -> str:
     )
 
 
-def _model_parts(model: CasadiModel) -> list[str]:
+def _model_parts(model: CasadiModel, single: bool) -> list[str]:
     """The parts of C that make f and h of CasADi's functions: see `_step_parts`."""
     output = {"value": "mhe_h", "slope": "mhe_h_jacobian", "width": "NX"}
     if model.guess:
@@ -208,35 +212,48 @@ def _model_parts(model: CasadiModel) -> list[str]:
             "value": "mhe_output", "slope": "mhe_output_jacobian",
             "width": f"(NX + {len(model.guess)})",
         }
-    return [filled("model", output), *_step_parts(model)]
+    return [filled("model", output), *_step_parts(model, single)]
 
 
-def _step_parts(model: CasadiModel) -> list[str]:
+def _step_parts(model: CasadiModel, single: bool) -> list[str]:
     """The parts of C that make a map of f: f itself, or substeps of a method."""
     how = model.how
     if how is None:
         return [filled("step_map", {"value": "mhe_f", "slope": "mhe_f_jacobian"})]
-    single = how.steps == 1
     names = {
-        "value": "mhe_f" if single else "mhe_substep",
-        "slope": "mhe_f_jacobian" if single else "mhe_substep_jacobian",
+        "value": "mhe_f" if how.steps == 1 else "mhe_substep",
+        "slope": "mhe_f_jacobian" if how.steps == 1 else "mhe_substep_jacobian",
     }
-    substeps = [] if single else [filled("substeps", {"steps": how.steps})]
+    substeps = [] if how.steps == 1 else [filled("substeps", {"steps": how.steps})]
     if not how.is_implicit:
         return [filled(f"step_{how.method}", names), *substeps]
+    pattern = flow_pattern(model)
+    columns, rows = np.nonzero(pattern.T)
+    tables = "".join(_tables("flow", rows.tolist(), columns.tolist()))
+    coarser = 2.0**29 if single else 1.0  # rounding, in that of double precision
     values = {
-        "iterations": MOST_ITERATIONS, "halvings": MOST_HALVINGS, "rounding": repr(ROUNDING),
-        "small": repr(SMALL), "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
+        "iterations": MOST_ITERATIONS, "halvings": MOST_HALVINGS,
+        "rounding": repr(coarser * ROUNDING), "small": repr(math.sqrt(coarser) * SMALL), "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
         "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),
         "kept": MOST_KEPT, "contraction": repr(CONTRACTION), "few": repr(FEW_ROUNDINGS),
-        "spread": repr(LARGEST_SPREAD), "parts": FOLLOWED, "whole": MOST_WHOLE,
+        "spread": repr(LARGEST_SPREAD / coarser), "parts": FOLLOWED, "whole": MOST_WHOLE,
         "following": MOST_FOLLOWING,
-        "step_slope": template(f"slope_{how.method}.c"),
-    } | names | _collocation(COLLOCATIONS[how.method])
+    } | names | _elimination(pattern) | _collocation(COLLOCATIONS[how.method])
     rate = filled("algebraic", values) if model.guess else template("rate.c")
-    parts = "equations", "stages", "stages_kept", "step_implicit"
-    first, *others = (filled(part, values) for part in parts)
-    return [first, rate, *others, *substeps]
+    parts = "equations", "blocks", "stages", "stages_kept", "step_implicit"
+    first, blocks, *others = (filled(part, values) for part in parts)
+    return [tables, first, blocks, rate, *others, *substeps]
+
+
+def _elimination(pattern: NDArray[np.bool_]) -> dict[str, object]:
+    """In which order the states are eliminated, and the others that each one then is beside."""
+    order, near = few_fill_ins(pattern)
+    ends = np.cumsum([0, *map(len, near)]).tolist()
+    return {
+        "order": ", ".join(map(str, order)), "start": ", ".join(map(str, ends)),
+        "near": ", ".join(str(one) for some in near for one in some) or "0",
+        "multipliers": repr(_LARGEST_MULTIPLIERS),
+    }
 
 
 def _collocation(method: Collocation) -> dict[str, object]:
@@ -260,7 +277,7 @@ def _collocation(method: Collocation) -> dict[str, object]:
         "ends": ", ".join(map(repr, method.d.tolist())),
         "from_modes": matrix(modes), "to_modes": matrix(np.linalg.inv(modes)), "real": repr(first),
         "shift": repr(float(shift.real)), "turning": repr(float(pair.imag)),
-        "square": repr(float(abs(shift) ** 2)),
+        "square": repr(float(abs(shift) ** 2)), "rest": repr(float(1.0 - method.d.sum())),
     }
 
 

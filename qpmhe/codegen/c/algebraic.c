@@ -8,7 +8,7 @@ static const real mhe_algebraic_guess[NZ] = {$guess};
 /* f, linearised at some w, as a rate of x alone: the rate at the z that solves the linearised
  * equations, its Jacobian, Newton's correction of z, and the derivative of z by x. */
 typedef struct {
-    real rate[NX], jacobian[NX * NX], step[NZ], slope[NZ * NX];
+    real rate[NX], jacobian[SIZE(MHE_FLOW_NONZEROS)], step[NZ], slope[NZ * NX];
     real full[NW * NW], factors[NZ * NZ];
     real values[NW];
     int pivot[NZ], side; /* the sign of det(dg/dz), which changes where solutions meet */
@@ -46,12 +46,13 @@ static int mhe_reduce(const real *w, const real *u, mhe_reduced *r)
     for (int i = 0; i < NX; i++) {
         const real *row = r->full + i * NW;
         r->rate[i] = r->values[i];
-        for (int j = 0; j < NX; j++) r->jacobian[i * NX + j] = row[j];
-        for (int l = 0; l < NZ; l++) {
-            r->rate[i] += row[NX + l] * r->step[l];
-            for (int j = 0; j < NX; j++)
-                r->jacobian[i * NX + j] += row[NX + l] * r->slope[l * NX + j];
-        }
+        for (int l = 0; l < NZ; l++) r->rate[i] += row[NX + l] * r->step[l];
+    }
+    for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
+        const int i = mhe_flow_row[q], j = mhe_flow_column[q];
+        const real *row = r->full + i * NW;
+        r->jacobian[q] = row[j];
+        for (int l = 0; l < NZ; l++) r->jacobian[q] += row[NX + l] * r->slope[l * NX + j];
     }
     return 1;
 }

@@ -3,15 +3,13 @@
 #define NW NX
 
 typedef struct {
-    real rate[NX], values[NW], jacobian[NX * NX];
+    real rate[NX], values[NW], jacobian[SIZE(MHE_FLOW_NONZEROS)];
     int side;
 } mhe_reduced;
 
 static int mhe_reduce(const real *w, const real *u, mhe_reduced *r)
 {
-    real nonzeros[SIZE(MHE_F_NONZEROS)];
-    mhe_call_f_jacobian(w, u, r->values, nonzeros);
-    mhe_spread(NX * NX, MHE_F_NONZEROS, mhe_f_place, nonzeros, r->jacobian);
+    mhe_call_f_jacobian(w, u, r->values, r->jacobian);
     r->side = 1;
     for (int i = 0; i < NX; i++) {
         r->rate[i] = r->values[i];

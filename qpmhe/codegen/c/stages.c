@@ -35,6 +35,14 @@ static void mhe_stage_residual(const real *rates, real h, const real *W, real *r
         }
 }
 
+/* The largest of an entry of the Jacobians at the first few stages. */
+static real mhe_largest_slope(const mhe_reduced *r, int known, int q)
+{
+    real most = 0;
+    for (int i = 0; i < known; i++) most = mhe_max((real)fabs(r[i].jacobian[q]), most);
+    return most;
+}
+
 /* Reciprocal sizes of the states' equations in a step: of x, of what the stages W add, and of the terms
  * of the flows at them, of which the first few are known. At rest these cancel. */
 static void mhe_state_reciprocals(const real *x, real h, const real *W, int known,
@@ -47,15 +55,9 @@ static void mhe_state_reciprocals(const real *x, real h, const real *W, int know
         for (int i = 0; i < known; i++) most = mhe_max(h * (real)fabs(r[i].rate[a]), most);
         states[a] = (real)fabs(x[a]) + most;
     }
-    for (int a = 0; a < NX; a++) {
-        per[a] = states[a];
-        for (int b = 0; b < NX; b++) {
-            real most = 0;
-            for (int i = 0; i < known; i++)
-                most = mhe_max((real)fabs(r[i].jacobian[a * NX + b]), most);
-            per[a] += h * most * states[b];
-        }
-    }
+    for (int a = 0; a < NX; a++) per[a] = states[a];
+    for (int q = 0; q < MHE_FLOW_NONZEROS; q++)
+        per[mhe_flow_row[q]] += h * mhe_largest_slope(r, known, q) * states[mhe_flow_column[q]];
     mhe_reciprocals(NX, per);
 }
 
@@ -64,13 +66,14 @@ static int mhe_stage_factor(real h, const mhe_reduced *r, const real *per, real 
 {
     real all[MHE_UNKNOWNS];
     for (int i = 0; i < MHE_UNKNOWNS; i++) all[i] = per[i % NX];
-    for (int i = 0; i < MHE_STAGES; i++)
-        for (int a = 0; a < NX; a++)
-            for (int j = 0; j < MHE_STAGES; j++)
-                for (int b = 0; b < NX; b++)
-                    M[(j * NX + b) * MHE_UNKNOWNS + i * NX + a] =
-                        (i == j && a == b) -
-                        h * mhe_stage_weights[i][j] * r[j].jacobian[a * NX + b];
+    for (int i = 0; i < MHE_UNKNOWNS * MHE_UNKNOWNS; i++)
+        M[i] = i / MHE_UNKNOWNS == i % MHE_UNKNOWNS;
+    for (int j = 0; j < MHE_STAGES; j++)
+        for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
+            real *column = M + (j * NX + mhe_flow_column[q]) * MHE_UNKNOWNS + mhe_flow_row[q];
+            for (int i = 0; i < MHE_STAGES; i++)
+                column[i * NX] -= h * mhe_stage_weights[i][j] * r[j].jacobian[q];
+        }
     return mhe_factor_equations(MHE_UNKNOWNS, M, all, pivot);
 }
 
@@ -79,7 +82,7 @@ static int mhe_stage_factor(real h, const mhe_reduced *r, const real *per, real 
 static int mhe_stage_sizes(const real *x, real h, const real *W, const real *step,
                             const mhe_reduced *r, const real *M, const int *pivot, real *sizes)
 {
-    real states[NX], equations[NX], reach[NX], inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
+    real states[NX], equations[NX], reach[NX], own[NX], inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
     for (int a = 0; a < NX; a++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++)
@@ -87,18 +90,17 @@ static int mhe_stage_sizes(const real *x, real h, const real *W, const real *ste
         states[a] = (real)fabs(x[a]) + most;
     }
     for (int a = 0; a < NX; a++) {
-        real own = 1;
         equations[a] = states[a];
-        for (int b = 0; b < NX; b++) {
-            real most = 0;
-            for (int i = 0; i < MHE_STAGES; i++)
-                most = mhe_max((real)fabs(r[i].jacobian[a * NX + b]), most);
-            equations[a] += h * most * states[b];
-            if (a == b) own += h * most;
-        }
-        /* By single terms: also a state that is 0, at rest, has a size. */
-        reach[a] = states[a] + (equations[a] - states[a]) / own;
+        own[a] = 1;
     }
+    for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
+        const int a = mhe_flow_row[q], b = mhe_flow_column[q];
+        const real flow = h * mhe_largest_slope(r, MHE_STAGES, q);
+        equations[a] += flow * states[b];
+        if (a == b) own[a] += flow;
+    }
+    /* By single terms: also a state that is 0, at rest, has a size. */
+    for (int a = 0; a < NX; a++) reach[a] = states[a] + (equations[a] - states[a]) / own[a];
     for (int i = 0; i < MHE_UNKNOWNS * MHE_UNKNOWNS; i++)
         inverse[i] = i / MHE_UNKNOWNS == i % MHE_UNKNOWNS;
     mhe_solve_columns(MHE_UNKNOWNS, M, pivot, MHE_UNKNOWNS, inverse);

@@ -53,7 +53,45 @@ static void $value(const real *x, const real *u, real dt, real *next)
     for (int a = 0; a < NX; a++) next[a] = NAN;
 }
 
-$step_slope
+/* The derivative of x + sum_i d_i Z_i by x, from the Jacobians at all stages; whether it exists. With
+ * B = 1/A, (B_ii - h J_i) S_i + sum_(j != i) B_ij S_j = (sum_j B_ij) I for S_i = d(x + Z_i)/dx. The
+ * states' reciprocal sizes are in `per`. */
+static int mhe_step_slope(real h, const mhe_reduced *r, real *per, real *S)
+{
+    enum { BLOCK = MHE_STAGES * MHE_STAGES };
+    real M[NX * NX * BLOCK], z[MHE_UNKNOWNS * NX];
+    int pivot[MHE_UNKNOWNS], stride = NX, between = MHE_STAGES * NX;
+    for (int i = 0; i < NX * NX * BLOCK; i++) M[i] = 0;
+    for (int i = 0; i < MHE_UNKNOWNS * NX; i++) z[i] = 0;
+    for (int a = 0; a < NX; a++)
+        for (int i = 0; i < MHE_STAGES; i++)
+            for (int j = 0; j < MHE_STAGES; j++) {
+                M[(a * NX + a) * BLOCK + i * MHE_STAGES + j] = mhe_stage_inverse[i][j];
+                z[(a * MHE_STAGES + i) * NX + a] += mhe_stage_inverse[i][j];
+            }
+    for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
+        real *block = M + (mhe_flow_row[q] * NX + mhe_flow_column[q]) * BLOCK;
+        for (int i = 0; i < MHE_STAGES; i++) block[i * (MHE_STAGES + 1)] -= h * r[i].jacobian[q];
+    }
+    if (mhe_factor_blocks(MHE_STAGES, M, per)) {
+        mhe_solve_blocks(MHE_STAGES, M, z);
+    } else {
+        if (!mhe_stage_factor(h, r, per, M, pivot)) return 0;
+        for (int i = 0; i < MHE_UNKNOWNS * NX; i++) z[i] = i / NX % NX == i % NX;
+        mhe_solve_columns(MHE_UNKNOWNS, M, pivot, NX, z);
+        stride = NX * NX;
+        between = NX;
+    }
+    for (int a = 0; a < NX; a++)
+        for (int b = 0; b < NX; b++) {
+            real sum = a == b ? $rest : 0;
+            for (int i = 0; i < MHE_STAGES; i++)
+                sum += mhe_step_weights[i] * z[a * between + i * stride + b];
+            S[a * NX + b] = sum;
+        }
+    return 1;
+}
+
 /* f and its Jacobian with respect to x, by rows. */
 static void $slope(const real *x, const real *u, real dt, real *next, real *A)
 {
