@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_index
 
+from .sparse_stages import SparseStages
+
 Array = NDArray[np.float64]
 
 
@@ -97,8 +99,8 @@ class StageTerms:
     """
 
     __slots__ = (
-        "_flat", "_gradient_column", "_next_column", "_panel_index", "_square", "_weighted",
-        "_zeros", "gradient", "linear", "next_gradient", "panel", "residuals",
+        "_flat", "_gradient_column", "_next_column", "_panel_index", "_sparse", "_square",
+        "_weighted", "_zeros", "gradient", "linear", "next_gradient", "panel", "residuals",
     )
 
     def __init__(self, stages: int, n: int, p: int, *arrays: Array) -> None:
@@ -116,9 +118,16 @@ class StageTerms:
         # First columns: that of M^T W M is -G^T W r below its corner, that of W M begins with Q w.
         self._gradient_column, self._next_column = self._square[1:, 0], self._weighted[:n, 0]
         self._panel_index = _panel_index(n, p)
+        self._sparse = SparseStages.of(n)
 
     def set_stage(self, stage: Stage, weight: Array) -> float:
         """Compute a stage's terms from its ``linear``; return its cost, NaN if they overflow."""
+        if self._sparse is not None:
+            cost = self._sparse.set_stage(
+                stage.linear, weight, stage.panel, stage.gradient, stage.next_gradient
+            )
+            if cost is not None:
+                return cost
         flat, weighted = self._flat, self._weighted
         weight.dot(stage.linear, weighted)
         stage.transposed.dot(weighted, self._square)
