@@ -6,6 +6,7 @@ from problems import Problem
 
 from .base import Array, Peer, UnavailableError, WindowData
 from .casadi_fatrop import CasadiFatrop
+from .casadi_gauss_newton import CasadiGaussNewton
 from .casadi_ipopt import CasadiIpopt
 from .casadi_sqp import CasadiSqp
 from .do_mpc_mhe import DoMpc
@@ -16,7 +17,7 @@ from .qpmhe_variants import Qpmhe
 __all__ = ["GROUPS", "Array", "Peer", "UnavailableError", "WindowData", "make"]
 
 #: What ``--peers`` takes.
-GROUPS = ("ipopt", "sqpmethod", "fatrop", "do-mpc", "gekko", "filterpy", "qpmhe")
+GROUPS = ("ipopt", "sqpmethod", "gauss-newton", "fatrop", "do-mpc", "gekko", "filterpy", "qpmhe")
 
 # With few states w is better eliminated; with many, derivatives stage by stage are cheaper.
 _FEW_STATES = 4
@@ -45,6 +46,7 @@ def make(groups: tuple[str, ...], problem: Problem, compiled: bool, start: str) 
     table: dict[str, list[Peer]] = {
         "ipopt": [CasadiIpopt("states", start=start), CasadiIpopt("shooting", start=start)],
         "sqpmethod": [CasadiSqp("states", start=start), CasadiSqp("shooting", start=start)],
+        "gauss-newton": [CasadiGaussNewton(start=start)],
         "fatrop": [CasadiFatrop(start=start)],
         "do-mpc": [DoMpc()],
         "gekko": [Gekko()],
@@ -59,6 +61,7 @@ def make(groups: tuple[str, ...], problem: Problem, compiled: bool, start: str) 
     if compiled:
         table["ipopt"].append(CasadiIpopt(form, True, start))
         table["sqpmethod"].append(CasadiSqp(form, True, start))
+        table["gauss-newton"].append(CasadiGaussNewton(True, start))
         table["fatrop"].append(CasadiFatrop(True, start))
         table["do-mpc"].append(DoMpc(True))
     return [peer for group in GROUPS if group in groups for peer in table[group]]
