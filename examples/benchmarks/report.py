@@ -126,6 +126,7 @@ def _row(result: Measurement, one: Series, base: float | None) -> dict[str, Any]
         "kind": one.peer.kind,
         "package": one.peer.package,
         "median_us": median,
+        "mean_us": 1e6 * float(np.mean([*one.times.values()])),
         "quartiles_us": [low, high],
         "ratio": None if base is None or same is False else base / median,
         "is_reference": one is result.reference,
@@ -159,13 +160,13 @@ def show(console: Console, result: Measurement) -> None:
         title=result.problem.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
     for name in (
-        "estimator", "median\nus", "quartiles\nus", "x faster\nthan Ipopt",
+        "estimator", "median\nus", "mean\nus", "quartiles\nus", "x faster\nthan Ipopt",
         "J above\nconverged", "RMSE", "setup\ns",
     ):
         table.add_column(name, justify="left" if name == "estimator" else "right", no_wrap=True)
     for row in sorted(table_rows, key=lambda row: row["median_us"]):
         table.add_row(
-            row["estimator"], _short(row["median_us"]),
+            row["estimator"], _short(row["median_us"]), _short(row["mean_us"]),
             " ".join(_short(q) for q in row["quartiles_us"]),
             "reference" if row["is_reference"] else _or_dash(row["ratio"], "{:.3g}"),
             _excess(row["excess"]), _or_dash(row["rmse"], "{:.4f}"),
