@@ -58,12 +58,11 @@ class Case(NamedTuple):
         """Estimate the record."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", qpmhe.PriorWarning)
+            warnings.simplefilter("ignore", qpmhe.ModelWarning)  # of a Q that is too small
             mhe = qpmhe.MovingHorizonEstimator(
                 self.system, self.observer, self.cost, engine=engine, **self.settings
             )
-            # A fault may drive it away, and a Q too small make steps too long.
-            warnings.simplefilter("ignore", qpmhe.ObserverWarning)
-            warnings.simplefilter("ignore", qpmhe.ModelWarning)
+            warnings.simplefilter("ignore", qpmhe.ObserverWarning)  # a fault may drive it away
             return mhe.run(self.measurements, self.inputs)
 
     @property

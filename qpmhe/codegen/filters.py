@@ -204,8 +204,8 @@ class HypothesisLibrary(FilterLibrary):
         return (logs, left_out) if done == len(logs) else None
 
 
-def _at(array: NDArray[Any]) -> Any:
-    return array.ctypes.data_as(ctypes.c_void_p)
+def _at(array: NDArray[Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
 
 
 def _structure(kind: Any, given: Any) -> tuple[Any, list[Any]]:

@@ -59,6 +59,8 @@ _CAUSES = (
     "parameter or a state that the model lacks."
 )
 _DOUBT = "This is not certain: the innovations stay coloured with it."
+# Pairs that have a correlation, and the share of its mean square by which a signal varies.
+_PAIRS, _CONSTANT = 3, 1e-12
 # Samples at the start, at least, that are no evidence: a filter needs some to forget it.
 _START = 10
 
@@ -314,10 +316,9 @@ class Examination:
         both = np.hstack((signals, np.diff(signals, axis=0, prepend=signals[:1])))
         own, inputs = np.ones((lags + 1, p)), np.zeros((lags + 1, p, both.shape[1]))
         # A controller may use y(t) for u(t): only earlier inputs are evidence.
-        for lag, j in np.ndindex(lags, p):
-            later, until = bounded[lag + 1 :, j], total - lag - 1
-            own[lag + 1, j] = _correlation(later, bounded[:until, j])
-            inputs[lag + 1, j] = [_correlation(later, one[:until]) for one in both.T]
+        for lag in range(1, lags + 1):
+            found = _correlations_of(bounded[lag:], np.hstack((bounded, both))[:-lag])
+            own[lag], inputs[lag] = found[:, :p].diagonal(), found[:, p:]
         seen = int(np.isfinite(normalised).any(axis=1).sum())
         return Correlations(own, inputs, 1.96 / np.sqrt(max(seen, 1)))
 
@@ -609,13 +610,25 @@ def _held(inputs: Array) -> Array:
     return held
 
 
-def _correlation(one: Array, other: Array) -> float:
-    there = np.isfinite(one) & np.isfinite(other)
-    if there.sum() < 3:
-        return 0.0
-    one, other = one[there] - one[there].mean(), other[there] - other[there].mean()
-    size = float(np.sqrt(one.dot(one) * other.dot(other)))
-    return float(one.dot(other)) / size if size > 0.0 else 0.0
+def _correlations_of(one: Array, other: Array) -> Array:
+    """Correlations of columns (p, q) where both are there; 0 where they are fewer than three."""
+    products = []
+    for x in (one, other):
+        there = np.isfinite(x)
+        x = np.where(there, x - x.mean(axis=0, where=there), 0.0)
+        products.append((there.astype(np.float64), x, x**2))
+    (there, x, squares), (there2, z, squares2) = products
+    counts = there.T @ there2
+    fewest = np.maximum(counts, 1.0)
+    sums, sums2 = x.T @ there2, there.T @ z
+    sizes = []
+    for total, part in ((squares.T @ there2, sums), (there.T @ squares2, sums2)):
+        size = total - part**2 / fewest
+        sizes.append(np.where(size > _CONSTANT * total, size, 0.0))
+    size = np.sqrt(sizes[0] * sizes[1])
+    known = (counts >= _PAIRS) & (size > 0.0)
+    shared = x.T @ z - sums * sums2 / fewest
+    return np.asarray(np.divide(shared, size, out=np.zeros_like(size), where=known))
 
 
 def _direction(vector: Array, names: Sequence[str]) -> str:

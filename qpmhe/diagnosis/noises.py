@@ -9,14 +9,16 @@ from itertools import pairwise
 import numpy as np
 
 from .bank import Array, Hypothesis
-from .faults import Evidence, Fault, times
+from .faults import LEAST_GAIN, Evidence, Fault, times
 from .sensor_memory import coloured
 
 # Shares of a step by which times may be off.
 _JITTERS = (0.05, 0.1, 0.2, 0.4, 0.8)
 # Samples that both sides of a change have at least; beyond this, innovations count as this.
 _LEAST, _FAR = 20, 4.0
-# Factors beside the one that the innovations show.
+# What the innovations must show of a change in log likelihood, as a share of what it must gain, and
+# factors beside the one that they show.
+_SHOWN = 0.25
 _AROUND = (0.4, 1.0, 2.5)
 # A grid of numbers: how far multiples may be off, how many distinct ones it has at most as a share
 # of the samples, and the least step in deviations of the noise.
@@ -40,7 +42,10 @@ def changing(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _change(squares: Array) -> tuple[int, float]:
-    """The sample from which on squares have another mean, most likely, and the ratio of means."""
+    """The sample from which on squares have another mean, most likely, and the ratio of means.
+
+    The sample is 0 where they show none.
+    """
     there = np.isfinite(squares)
     counts = np.cumsum(there.sum(axis=1))
     sums = np.cumsum(np.where(there, squares, 0.0).sum(axis=1))
@@ -54,6 +59,9 @@ def _change(squares: Array) -> tuple[int, float]:
     with np.errstate(all="ignore"):
         logs = -(counts * np.log(before) + (counts[-1] - counts) * np.log(behind))
     k = int(np.argmax(np.where(fits, logs, -np.inf)))
+    whole = float(-counts[-1] * np.log(sums[-1] / counts[-1]))
+    if 0.5 * (logs[k] - whole) < _SHOWN * LEAST_GAIN:
+        return 0, 1.0
     return k + 1, float(behind[k] / before[k])
 
 

@@ -182,8 +182,8 @@ def offsets(evidence: Evidence) -> Iterator[Fault]:
         for part in parts:
             outputs = np.zeros((total, p))
             outputs[:, part] = 1.0
-            whole = Signature("bias", part, outputs, np.zeros((total, bank.system.n)))
-            one = replace(whole, outputs=outputs[:_FEW], states=whole.states[:_FEW])
+            whole = Signature("bias", part, outputs)
+            one = replace(whole, outputs=outputs[:_FEW])
             size = float(np.nanmedian(first[:, part]))
             if not abs(size) > UNIT_OFFSET * np.sqrt(base.usual_noise[part[0], part[0]]):
                 continue  # smaller ones need no such start

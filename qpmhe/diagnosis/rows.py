@@ -79,11 +79,13 @@ def _jumps(evidence: Evidence, moves: Array) -> tuple[Array, Array]:
     errors = np.where(np.isfinite(null.innovations), null.innovations, 0.0)
     against, own = np.zeros(total), np.zeros(total)
     slope, spread = np.zeros(n), np.zeros((n, n))
+    weighed = null.outputs.swapaxes(1, 2) @ null.weights
+    slopes, spreads = (weighed @ errors[:, :, None])[:, :, 0], weighed @ null.outputs
+    closed = null.transitions @ (np.eye(n) - null.gains @ null.outputs)
     for t in range(total - 1, -1, -1):
-        c = null.outputs[t]
-        closed = null.transitions[t] @ (np.eye(n) - null.gains[t] @ c)
-        slope = c.T @ (null.weights[t] @ errors[t]) + closed.T @ slope
-        spread = c.T @ null.weights[t] @ c + closed.T @ spread @ closed
+        turned = closed[t].T
+        slope = slopes[t] + turned @ slope
+        spread = spreads[t] + turned @ spread @ closed[t]
         if t:  # what the step before should have moved
             against[t], own[t] = moves[t] @ slope, moves[t] @ spread @ moves[t]
     sizes = np.divide(against, own, out=np.zeros(total), where=own > 0.0)

@@ -15,34 +15,35 @@ from .faults import LEAST_GAIN, MOST_PARTS, Evidence, Fault, with_factor
 _AROUND = (0.5, 1.0, 1.5, 2.5)
 # Places where a ramp may begin.
 _RAMPS = 12
+# Samples that are moved before products are taken.
+_TOGETHER = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """How a fault of size one moves the outputs (T, p) and the states (T, n) of its sample."""
+    """How a fault of size one moves the outputs (T, p) and, if at all, the states (T, n)."""
 
     kind: str
     subject: tuple[int, ...]
     outputs: Array
-    states: Array
+    states: Array | None = None
     span: tuple[int, int] | None = None
 
 
 def _signatures(evidence: Evidence) -> Iterator[Signature]:
     bank, base, null, total = evidence.bank, evidence.base, evidence.null, evidence.total
     p, m, inputs = base.measurements.shape[1], base.inputs.shape[1], evidence.inputs
-    none_x = np.zeros((total, bank.system.n))
     # At each sample from those before it alone: else noise would look like a fault.
     expected, moves = bank.moves(null.states, inputs)
     if m:
-        yield Signature("shift", (), -moves, none_x)
+        yield Signature("shift", (), -moves)
     if p > 1:
         for part in evidence.sensors:
-            yield Signature("shift", part, -moves * (np.arange(p) == part[0]), none_x)
+            yield Signature("shift", part, -moves * (np.arange(p) == part[0]))
     for part in evidence.sensors:
-        yield Signature("gain", part, expected * (np.arange(p) == part[0]), none_x)
+        yield Signature("gain", part, expected * (np.arange(p) == part[0]))
     if p > 1:
-        yield Signature("gain", (), expected, none_x)
+        yield Signature("gain", (), expected)
     reached = bank.following(null.corrected, inputs)
     for j in range(m):
         without = inputs.copy()
@@ -61,15 +62,13 @@ def _signatures(evidence: Evidence) -> Iterator[Signature]:
         for first in np.linspace(0, total, _RAMPS + 1).astype(int).tolist()[:-1]:
             outputs = np.zeros((total, p))
             outputs[first:, part[0]] = np.arange(total - first)
-            yield Signature("ramp", part, outputs, none_x, (first, total - 1))
+            yield Signature("ramp", part, outputs, None, (first, total - 1))
 
 
 def _bias(bank: FilterBank, total: int, sensor: int, first: int, last: int) -> Signature:
     outputs = np.zeros((total, bank.system.p))
     outputs[first : last + 1, sensor] = 1.0
-    return Signature(
-        "bias", (sensor,), outputs, np.zeros((total, bank.system.n)), (first, last)
-    )
+    return Signature("bias", (sensor,), outputs, None, (first, last))
 
 
 def additive(kind: str) -> Callable[[Evidence], list[Fault]]:
@@ -99,7 +98,8 @@ def _additive_faults(evidence: Evidence) -> Iterator[Fault]:
         return
     signatures = [
         one for one in _signatures(evidence)
-        if np.isfinite(one.outputs).all() and np.isfinite(one.states).all()
+        if np.isfinite(one.outputs).all()
+        and (one.states is None or np.isfinite(one.states).all())
     ]
     if not signatures:
         return
@@ -142,20 +142,35 @@ def _candidates(
 
 
 def moments(signatures: list[Signature], null: Filtered) -> tuple[Array, Array]:
-    """Products of the signatures in the innovations with these (K,), and with each other (K, K)."""
-    outputs = np.stack([one.outputs for one in signatures], axis=2)
-    states = np.stack([one.states for one in signatures], axis=2)
-    there = np.isfinite(null.innovations)
-    errors = np.where(there, null.innovations, 0.0)
-    moved = np.zeros(states.shape[1:])
-    shown = outputs * there[:, :, None]
-    for t in range(len(outputs)):
-        shown[t] += null.outputs[t] @ moved
-        moved = null.transitions[t] @ (moved - null.gains[t] @ shown[t]) + states[t]
-    # All samples at once: W shown, and shown' W shown.
-    weighted, k = null.weights @ shown, len(signatures)
-    own = shown.reshape(-1, k).T @ weighted.reshape(-1, k)
-    return np.asarray(errors.ravel() @ weighted.reshape(-1, k)), np.asarray(own)
+    """Products of the signatures in the innovations with these (K,), and with each other (K, K).
+
+    The latter for those of one kind and subject; they are 0 between others.
+    """
+    (total, n), k = null.states.shape, len(signatures)
+    moved, against, own = np.zeros((n, k)), np.zeros(k), np.zeros((k, k))
+    moving = [i for i, one in enumerate(signatures) if one.states is not None]
+    keys = [(one.kind, one.subject) for one in signatures]
+    alike = [np.flatnonzero([other == key for other in keys]) for key in dict.fromkeys(keys)]
+    for first in range(0, total, _TOGETHER):  # all of a long record would not fit in a cache
+        part = slice(first, first + _TOGETHER)
+        there, c, gains = np.isfinite(null.innovations[part]), null.outputs[part], null.gains[part]
+        errors, a = np.where(there, null.innovations[part], 0.0), null.transitions[part]
+        shown = np.stack([one.outputs[part] for one in signatures], axis=2) * there[:, :, None]
+        entering = -(a @ gains) @ shown
+        entering[:, :, moving] += np.stack(
+            [np.zeros((len(a), n)), *(one.states[part] for one in signatures
+                                      if one.states is not None)], axis=2)[:, :, 1:]
+        both = np.concatenate((c, a @ (np.eye(n) - gains @ c)), axis=1)
+        for t in range(len(both)):
+            found = both[t] @ moved
+            shown[t] += found[:-n]
+            moved = found[-n:] + entering[t]
+        # All samples at once: W shown, and shown' W shown.
+        weighted, shown = (one.reshape(-1, k) for one in (null.weights[part] @ shown, shown))
+        for some in alike:
+            own[np.ix_(some, some)] += shown[:, some].T @ weighted[:, some]
+        against += errors.ravel() @ weighted
+    return against, own
 
 
 def with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -> Fault:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..terms.information import prior_units, window_information
+from ..terms.information import prior_units
 
 Array = NDArray[np.float64]
 
@@ -55,14 +55,53 @@ def observability(
     horizon : int
         N <= T.
     """
-    windows = len(transitions) - horizon + 1
-    a, seen = (
-        [one[k : k + windows] for k in range(horizon)] for one in (transitions, information)
-    )
-    matrices = window_information(a, seen, disturbance)
+    matrices = _of_all_windows(transitions, information, disturbance, horizon)
     root, _ = prior_units(prior)
     values, directions = np.linalg.eigh(root.T @ matrices @ root)
     return Observability(matrices, np.maximum(values, 0.0), directions)
+
+
+def _of_all_windows(
+    transitions: Array, information: Array, disturbance: Array, horizon: int
+) -> Array:
+    r"""`window_information` of all windows of a record, (W, n, n).
+
+    Two stretches of a window become one: with :math:`E` and :math:`G` what one makes of its first
+    state and of its disturbances' covariance, and :math:`\Lambda` its information, those of both
+    are :math:`E_2 D E_1`, :math:`G_2 + E_2 D G_1 E_2^\top` and :math:`\Lambda_1 + E_1^\top
+    \Lambda_2 D E_1` with :math:`D = (I + G_1 \Lambda_2)^{-1}`. So the lengths double.
+
+    References
+    ----------
+    Anderson, Second-order convergent algorithms for the steady-state Riccati equation,
+    International Journal of Control 28 (1978).
+    """
+    windows, n = len(transitions) - horizon + 1, disturbance.shape[-1]
+    one: tuple[Array, ...] = (
+        transitions, np.broadcast_to(disturbance, transitions.shape), information)
+    eye, whole, length, begin = np.eye(n), None, 1, 0
+    while True:
+        if horizon & length:  # of these lengths the window consists, the shortest first
+            part = tuple(each[begin : begin + windows] for each in one)
+            whole = part if whole is None else _joined(whole, part, eye)
+            begin += length
+        if 2 * length > horizon:
+            break
+        one = _joined(tuple(each[:-length] for each in one), tuple(each[length:] for each in one),
+                      eye)
+        length *= 2
+    assert whole is not None
+    return whole[2]
+
+
+def _joined(first: tuple[Array, ...], second: tuple[Array, ...], eye: Array) -> tuple[Array, ...]:
+    """E, G and the information of two stretches, one behind the other."""
+    (e, g, seen), (e2, g2, seen2) = first, second
+    n = len(eye)
+    both = np.linalg.solve(eye + g @ seen2, np.concatenate((e, g), axis=2))
+    later, spread = e2 @ both[:, :, :n], e2 @ both[:, :, n:] @ e2.swapaxes(1, 2) + g2
+    found = seen + e.swapaxes(1, 2) @ seen2 @ both[:, :, :n]
+    return later, 0.5 * (spread + spread.swapaxes(1, 2)), 0.5 * (found + found.swapaxes(1, 2))
 
 
 def prior_shares(

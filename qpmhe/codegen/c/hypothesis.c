@@ -19,15 +19,49 @@ typedef struct {
     real *outputs, *gains;
 } mhe_filtered;
 
-/* out = A P A' + Q. */
-static void mhe_moved_covariance(const real *A, const real *P, const real *Q, real *out)
+/* out += (I + scale (A - I)) B, by the nonzeros of A. */
+static void mhe_add_moved(const real *A, real scale, const real *B, real *out)
 {
-    real half[NX * NX], turned[NX * NX];
+    for (int i = 0; scale != 1 && i < NX * NX; i++) out[i] += (1 - scale) * B[i];
+    for (int a = 0; a < MHE_A_NONZEROS; a++) {
+        const real factor = scale * A[a], *from = B + mhe_A_column[a] * NX;
+        real *to = out + mhe_A_row[a] * NX;
+        for (int j = 0; j < NX; j++) to[j] += factor * from[j];
+    }
+}
+
+/* P = A P A' + Q, with A as above; P is symmetric. */
+static void mhe_move_covariance(const real *A, real scale, const real *Q, real *P)
+{
+    real half[NX * NX] = {0}, turned[NX * NX];
+    mhe_add_moved(A, scale, P, half);
     for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) turned[j * NX + i] = A[i * NX + j];
-    mhe_multiply(NX, NX, NX, A, P, half);
-    mhe_multiply(NX, NX, NX, half, turned, out);
-    for (int i = 0; i < NX * NX; i++) out[i] += Q[i];
+        for (int j = 0; j < NX; j++) turned[j * NX + i] = half[i * NX + j];
+    memcpy(P, Q, sizeof half);
+    mhe_add_moved(A, scale, turned, P);
+}
+
+/* P = (I - K C) P (I - K C)' + K R K', with C P in `seen` and K by columns. */
+static void mhe_correct_covariance(const real *C, const real *seen, const real *K,
+                                   const real *noise, real *P)
+{
+    real weighed[NY * NX] = {0}; /* K R - (I - K C) P C', by columns */
+    for (int j = 0; j < NX; j++)
+        for (int i = 0; i < NY; i++)
+            for (int l = 0; l < NX; l++) P[j * NX + l] -= seen[i * NX + j] * K[i * NX + l];
+    for (int i = 0; i < NY; i++)
+        for (int l = 0; l < NY; l++)
+            for (int j = 0; j < NX; j++)
+                weighed[i * NX + j] += noise[i * NY + l] * K[l * NX + j];
+    for (int a = 0; a < MHE_C_NONZEROS; a++) {
+        const int i = mhe_C_row[a], l = mhe_C_column[a];
+        for (int j = 0; j < NX; j++)
+            weighed[i * NX + j] -= C[i * NX + l] * P[l * NX + j];
+    }
+    for (int j = 0; j < NX; j++)
+        for (int i = 0; i < NY; i++)
+            for (int l = 0; l < NX; l++) P[j * NX + l] += K[i * NX + j] * weighed[i * NX + l];
+    mhe_symmetrise(NX, P);
 }
 
 /* Correct x and P by a sample, and add to its log likelihood; 0 where that fails. */
@@ -38,7 +72,7 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
     const real *noise = r->noise + (r->changes ? (size_t)t * NY * NY : 0);
     const real *y = r->y + (size_t)t * NY;
     real expected[NY], nonzeros[SIZE(MHE_C_NONZEROS)], C[NY * NX] = {0}, seen[NY * NX] = {0};
-    real e[NY], S[NY * NY] = {0}, gain[NY * (NX + 1)], closed[NX * NX], weighed[NY * NX];
+    real e[NY], S[NY * NY] = {0}, gain[NY * (NX + 1)], K[NY * NX]; /* K by columns */
     unsigned char kept[NY];
     mhe_call_output(x, r->u + (size_t)t * (NU + 1), expected, nonzeros);
     for (int a = 0; a < MHE_C_NONZEROS; a++)
@@ -95,7 +129,7 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
     }
     if (!mhe_decompose(NY, S)) return 0;
     mhe_solve_for(NY, S, NX + 1, gain);
-    real cost = 0, *K = weighed; /* by columns */
+    real cost = 0;
     for (int i = 0; i < NY; i++) {
         cost += (real)0.5 * (e[i] * gain[i * (NX + 1) + NX] + log(S[i * NY + i]));
         for (int j = 0; j < NX; j++) {
@@ -106,20 +140,13 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
     *log_ = log_likelihood - cost;
     for (int j = 0; j < NX; j++)
         x[j] = x[j] < r->low[j] ? r->low[j] : x[j] > r->high[j] ? r->high[j] : x[j];
-    real used[NY * NX], KR[NY * NX], turned[NX * NY], none[NX * NX], later[NX * NX];
-    memcpy(used, K, sizeof used);
-    for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NY; j++) turned[i * NY + j] = used[j * NX + i];
-    mhe_multiply(NX, NY, NX, turned, C, closed);
-    for (int i = 0; i < NX * NX; i++) closed[i] = (real)(i % (NX + 1) == 0) - closed[i];
-    mhe_multiply(NY, NY, NX, noise, used, KR);
-    mhe_multiply(NX, NY, NX, turned, KR, none);
-    mhe_moved_covariance(closed, P, none, later);
-    memcpy(P, later, sizeof later);
+    mhe_correct_covariance(C, seen, K, noise, P);
     if (out) {
-        memcpy(out->gains + (size_t)t * NX * NY, turned, sizeof turned);
+        for (int i = 0; i < NX; i++)
+            for (int j = 0; j < NY; j++)
+                out->gains[((size_t)t * NX + i) * NY + j] = K[j * NX + i];
         memcpy(out->corrected + (size_t)t * NX, x, sizeof(real) * NX);
-        memcpy(out->covariances + (size_t)t * NX * NX, P, sizeof later);
+        memcpy(out->covariances + (size_t)t * NX * NX, P, sizeof(real) * NX * NX);
     }
     return 1;
 }
@@ -128,26 +155,18 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
 static void mhe_hypothesis_move(const mhe_hypothesis *r, int t, real *x, real *P,
                                 const mhe_filtered *out)
 {
-    real A[NX * NX], all[NX * NX], next[NX], nonzeros[SIZE(MHE_A_NONZEROS)], later[NX * NX];
+    real all[NX * NX], moved[NX * NX], next[NX], A[SIZE(MHE_A_NONZEROS)];
     for (int i = 0; i < NX * NX; i++) all[i] = (real)(i % (NX + 1) == 0);
     for (int64_t step = 0; step < r->repeats[t]; step++) {
-        mhe_call_step(x, r->u + (size_t)t * (NU + 1), next, nonzeros);
-        for (int i = 0; i < NX * NX; i++) A[i] = 0;
-        for (int a = 0; a < MHE_A_NONZEROS; a++)
-            A[mhe_A_row[a] * NX + mhe_A_column[a]] = nonzeros[a];
-        if (step == 0 && r->scale != 1) {
-            for (int j = 0; j < NX; j++) next[j] = x[j] + r->scale * (next[j] - x[j]);
-            for (int i = 0; i < NX * NX; i++) {
-                const real one = (real)(i % (NX + 1) == 0);
-                A[i] = one + r->scale * (A[i] - one);
-            }
-        }
+        const real scale = step == 0 ? r->scale : 1;
+        mhe_call_step(x, r->u + (size_t)t * (NU + 1), next, A);
+        for (int j = 0; scale != 1 && j < NX; j++) next[j] = x[j] + scale * (next[j] - x[j]);
         memcpy(x, next, sizeof next);
-        mhe_moved_covariance(A, P, r->disturbance, later);
-        memcpy(P, later, sizeof later);
+        mhe_move_covariance(A, scale, r->disturbance, P);
         if (out) {
-            mhe_multiply(NX, NX, NX, A, all, later);
-            memcpy(all, later, sizeof later);
+            for (int i = 0; i < NX * NX; i++) moved[i] = 0;
+            mhe_add_moved(A, scale, all, moved);
+            memcpy(all, moved, sizeof all);
         }
     }
     if (out) memcpy(out->transitions + (size_t)t * NX * NX, all, sizeof all);
