@@ -38,8 +38,13 @@ class Kind:
 
     @classmethod
     def named(cls, source: ModelSource, limit: float | None = None) -> Kind:
-        """The one that a name stands for."""
-        return cls(source.name, lambda problem: made(source, problem), limit)
+        """The one that a name stands for, made as from a file of weights: about the state 0."""
+        def make(problem: Problem) -> Observer:
+            about_zero = replace(problem, initial_state=np.zeros(problem.system.n))
+            observer: Observer = made(source, about_zero)
+            return observer
+
+        return cls(source.name, make, limit)
 
     def about(self, likely: Found) -> Kind:
         """A constant gain is made about the mean of the records, where nothing else is given."""
@@ -88,14 +93,15 @@ def kinds_of(observers: Any, problem: Problem, arrival: str) -> list[Kind]:
         if source.name == "steady":  # made once a typical state is known
             kinds.append(Kind.named(source))
             continue
-        observer = made(source, problem)
+        kind = Kind.named(source)
+        observer = kind.make(problem)
         if arrival == "observer" and observer.initial_covariance() is None:
             raise OptionError(
                 f"observer {source.name!r} returned {shown(observer)}, which has no covariance to "
                 "weigh the prior, so it cannot be tuned; give arrival='constant', or another "
                 "observer."
             )
-        kinds.append(Kind.named(source, observer.innovation_limit))
+        kinds.append(replace(kind, limit=observer.innovation_limit))
     return kinds
 
 

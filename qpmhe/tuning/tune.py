@@ -119,7 +119,8 @@ def tune(
     observers : sequence of str, optional
         Observers to compare, instead of ``observer``: ``ekf``, ``gated`` (an extended Kalman filter
         with `qpmhe.Gate`), ``ukf``, ``steady`` (a constant gain about the mean of the records), or
-        functions, named as for `qpmhe.Study`; ``"all"`` for these four. Each is tuned alone and
+        functions, named as for `qpmhe.Study`; ``"all"`` for these four. A function gets a problem
+        with the initial state 0, here and from the file of weights. Each is tuned alone and
         with 1 to ``max_qps`` QPs, and all are ranked on the blocks that judge. The result is the
         one of the simplest estimator whose score is within one standard error, or 1 %, of the
         least: the one with the fewest QPs, of those the first in the list.

@@ -151,6 +151,29 @@ def test_the_best_observer_goes_into_the_file_and_from_there_to_estimate(folder)
     assert 1 in found["qps"]
 
 
+def test_a_function_makes_the_observer_for_the_same_problem_in_tune_and_from_the_file(tmp_path):
+    seen, system = tmp_path / "seen.txt", qpmhe.models.van_der_pol()[0]
+    (tmp_path / "own.py").write_text(textwrap.dedent(f"""
+        import qpmhe
+
+        def own(problem):
+            with open({str(seen)!r}, "a") as file:
+                file.write(f"{{problem.initial_state.tolist()}}\\n")
+            return qpmhe.ExtendedKalman(**problem.covariances)
+    """), "utf-8")
+    record = qpmhe.models.van_der_pol().scenario.simulate(seed=0, steps=120)
+    tuning = qpmhe.tune(
+        system, [record.measurements], prior=np.eye(2), disturbance=0.01 * np.eye(2),
+        noise=[[0.04]], initial_state=[0.5, -0.5], objective="likelihood", structure="scalar",
+        observers=[f"{tmp_path / 'own.py'}:own"], max_qps=0, starts=1, progress=False)
+    tuning.save(tmp_path / "weights.toml")
+    made = len(seen.read_text("utf-8").splitlines())
+    load(tmp_path / "weights.toml").observer(system=system)
+    problems = seen.read_text("utf-8").splitlines()
+    assert 2 <= made < len(problems)
+    assert set(problems) == {"[0.0, 0.0]"}
+
+
 @pytest.mark.parametrize(("arguments", "error", "text"), [
     ([*TUNE, "--observers", "ukff"], ModelError, "observer 'ukff' is not known.*Did you mean ukf"),
     ([*TUNE, "--observers", ","], OptionError, "--observers is empty"),
