@@ -5,9 +5,9 @@
 For each certified model of the zoo, a record with disturbances and noises at their bounds is
 estimated with a backend that returns, of all steps that lower the QP's objective, one that leads
 farthest from the truth. Then the same with assumptions broken on purpose: disturbances and noises
-ten times as large as stated, and a start five times as far away. Last, truths with signals at
-their bounds beside estimates that are anything at all, for small systems, many runs each: an error
-above twice the bound stops the script.
+ten times as large as stated, and a start five times as far away. First, truths with signals at
+their bounds, many runs a system, and beside them estimates that are anything at all: an error of
+the observer above its bound, or a guarded one above twice that, stops the script.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from adversary import Array
-from certified_ratios import others, zoo
+from certified_ratios import ZOO, others, zoo
 
 import qpmhe
 from qpmhe.certificates import Evidence, Monitor, ObserverBound, synthesise_gain
 from qpmhe.certificates.guard import Guard
 from qpmhe.certificates.observer_bound import bound_observer
 from qpmhe.model.residuals import difference
+from qpmhe.observers.projection import NearestPoint
 from qpmhe_solvers import QP, Backend, RawSolution, Solver
 
 # Systems on which many runs are cheap.
@@ -179,42 +180,63 @@ def run(name: str, runs: int, steps: int, larger: float = 1.0, farther: float = 
     return counts
 
 
-def many(name: str, runs: int, steps: int = 25, checked: int = 2) -> str:
-    """Truths beside the observer, all at once; hostile estimates at the last samples, guarded."""
-    system, region, sizes = others()[name]
+def many(name: str, runs: int, hostile: int, steps: int = 25, checked: int = 2) -> str:
+    """Truths beside the observer, all at once; hostile estimates at the last samples, guarded.
+
+    In a system with an X, the observer is projected in P, and the truth stays in X.
+    """
+    system, region, sizes = zoo(name) if name in ZOO else others()[name]
     gain = synthesise_gain(system, region, sizes=sizes.typical, seconds=SECONDS).observer
     cost = qpmhe.QuadraticCost(
         prior=np.eye(system.n), disturbance=np.eye(system.n), noise=np.eye(system.p))
     bound = bound_observer(system, gain, cost, region, sizes=sizes, seconds=SECONDS)
-    rng, n, L = np.random.default_rng(1), system.n, gain.gain
-    half = 0.3 * bound.settled.box
+    rng, n, L, X = np.random.default_rng(1), system.n, gain.gain, system.states
+    half, nearest = 0.3 * bound.settled.box, None if X is None else NearestPoint(X)
+    covariance = np.linalg.inv(bound.metric)
     w, v = (np.broadcast_to(each, (size,)) / (1.0 if np.ndim(each) else np.sqrt(size))
             for each, size in zip(bound.sizes.extent, (n, system.p), strict=True))
-    x = rng.uniform(-0.8, 0.8, (runs, n))
-    z = x + rng.choice([-1.0, 1.0], (runs, n)) * half
-    nothing, point = np.zeros((runs, 0)), rng.uniform(-0.5, 0.5, n)
-    A, C = (np.asarray(each(point, nothing[0])) for each in (system.f_jacobian, system.h_jacobian))
-    rows = rng.standard_normal((runs, n))
+    low, high = bound.region.lower, bound.region.upper
+    points = low + (high - low) * rng.uniform(0.3, 0.7, (runs + 1, low.size))
+    if X is not None:  # half of them where the observer may be projected
+        points[::2, :n] = np.clip(
+            points[::2, :n] + (high - low)[:n], low[:n], np.minimum(high[:n], X.upper))
+    points[:, :n] = np.where(  # of a slanted region, only from its middle on
+        bound.region.contains(points[:, :n])[:, None], points[:, :n], points[-1, :n])
+    x, u = points[:runs, :n].copy(), points[:runs, n:]
+    z = np.clip(x + rng.choice([-1.0, 1.0], (runs, n)) * half, low[:n], high[:n])
+    A, C = (np.asarray(each(points[-1, :n], points[-1, n:]))
+            for each in (system.f_jacobian, system.h_jacobian))
+    rows = rng.standard_normal((runs, n)) / bound.settled.box
     backwards = [rows]
     for _ in range(steps - 1):
         backwards.append(backwards[-1] @ (A - L @ C))
     alive, tube = np.ones(runs, np.bool_), bound.begun(qpmhe.Box(-half, half))
     guard, entering, added = Guard(bound, system), bound.entering(), bound.added()
-    worst, moved, compared = 0.0, 0, 0
+    worst, moved, compared, projected = 0.0, 0, 0, 0
     for t in range(steps):
         push = backwards[steps - 1 - t]
         sign = np.where(push > 0.0, 1.0, -1.0)
         chance = rng.random(runs) < 0.3
         sign[chance] = rng.choice([-1.0, 1.0], (int(chance.sum()), n))
         noise = np.where(-push @ L > 0.0, 1.0, -1.0) * v
-        fit = system.h.batch(x, nothing) + noise - system.h.batch(z, nothing)
-        z = system.f.batch(z, nothing) + fit @ L.T
-        x = system.f.batch(x, nothing) + sign * w
-        alive &= bound.region.contains(x) & bound.region.contains(z)
-        tube = bound.followed(tube, entering, added, projected=False)
+        fit = difference(
+            system.output_residual, system.h.batch(x, u) + noise, system.h.batch(z, u))
+        z, x = system.f.batch(z, u) + fit @ L.T, system.f.batch(x, u)
+        x += np.where(bound.region.contains(x + sign * w)[:, None], sign, -sign) * w
+        if nearest is not None:
+            alive &= nearest.contains(x)
+            for k in np.flatnonzero(~nearest.contains(z) & alive):
+                z[k], projected = nearest(z[k], covariance).point, projected + 1
+        alive &= bound.region.contains(x)
+        tube = bound.followed(tube, entering, added, projected=X is not None)
+        share = (np.abs(x - z)[alive] / tube.box).max(initial=0.0)
+        if share > 1.0 + 1e-9:
+            raise SystemExit(f"{name}: an error is {share} times its bound")
+        alive &= bound.region.contains(z)
         if t < steps - checked:
             continue
-        for k in np.flatnonzero(alive):
+        left = np.flatnonzero(alive)
+        for k in left[:: max(len(left) * checked // hostile, 1)]:
             # Beyond z as seen from the truth, or anywhere, near and far.
             away = z[k] - x[k] if k % 2 else rng.standard_normal(n) * bound.settled.box
             found = guard(z[k] + 10.0 ** rng.uniform(-1.0, 4.0) * away, z[k], tube)
@@ -227,24 +249,27 @@ def many(name: str, runs: int, steps: int = 25, checked: int = 2) -> str:
                 raise SystemExit(f"{name}: a guarded error is {share} times twice its bound")
             worst, moved, compared = max(worst, share), moved + found.acted, compared + 1
     return (
-        f"{name}: {runs} runs, {int(alive.sum())} of them in the region to the end, {compared} "
-        f"hostile estimates, {moved} moved, largest error {worst:.3f} of twice the bound"
+        f"{name}: {runs} runs, {int(alive.sum())} of them in the region to the end, {projected} "
+        f"projections, {compared} hostile estimates, {moved} moved, largest error {worst:.3f} of "
+        "twice the bound"
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Estimates that are as wrong as may be, guarded.")
     parser.add_argument("--runs", type=int, default=10_000, help="of each small system")
+    parser.add_argument("--small", nargs="*", default=SMALL, help="systems, also of the zoo")
+    parser.add_argument("--hostile", type=int, default=20_000, help="estimates of each of these")
     parser.add_argument("--zoo-runs", type=int, default=8, help="of each model of the zoo")
     parser.add_argument("--steps", type=int, default=50, help="samples of a run in the zoo")
     parser.add_argument("--models", nargs="*", default=MODELS)
     given, began = parser.parse_args(), time.process_time()
-    for name in SMALL if given.runs else ():
-        print(many(name, given.runs), flush=True)
+    for name in given.small if given.runs else ():
+        print(many(name, given.runs, given.hostile), flush=True)
     qpmhe.solvers.register(Backend("hostile", Hostile, "adversary"))
     print("| model | runs | samples | moved | worst / 2 b | guarded | rms / 2 b | guarded | lost "
           "| of these noticed |\n|---|---|---|---|---|---|---|---|---|---|")
-    for name in given.models:
+    for name in given.models if given.zoo_runs else ():
         CERTIFIED[name] = certified(name)
         if CERTIFIED[name][2].evidence is not Evidence.PROVED:
             print(f"| {name} | not proved in {SECONDS:g} s |", flush=True)

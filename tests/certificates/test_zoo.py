@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import Evidence, Sizes, synthesise_gain
+from qpmhe.certificates import (
+    Evidence,
+    NotCertifiedError,
+    Sizes,
+    certify_detectability,
+    search,
+    synthesise_gain,
+)
 from qpmhe.certificates.observer_bound import bound_observer
 from qpmhe.certificates.report import region_of
 from qpmhe.errors import ModelError
@@ -61,3 +68,23 @@ def test_a_chain_with_a_spring_without_length_is_refused():
     chain = qpmhe.models.chain_of_masses(masses=2).system
     with pytest.raises(ModelError, match=r"f is not finite at x = .*within the region"):
         synthesise_gain(chain, box(-np.ones(chain.n), np.ones(chain.n)))
+
+
+@pytest.mark.slow
+def test_the_quadrotor_has_no_constant_gain():
+    """On the box around its record, at the states of which the programs are made."""
+    made = qpmhe.models.catalogue()["quadrotor"]()
+    with pytest.raises(NotCertifiedError, match=r"infeasible for every rate below 1"):
+        synthesise_gain(made.system, region_of(made.system, made.scenario), seconds=3000.0)
+
+
+@pytest.mark.slow
+def test_the_quadrotor_is_detectable_at_samples(monkeypatch):
+    """The proof takes more cells than these."""
+    monkeypatch.setattr(search, "_MOST_CELLS", 300)
+    made = qpmhe.models.catalogue()["quadrotor"]()
+    found = certify_detectability(
+        made.system, region_of(made.system, made.scenario), seconds=3000.0)
+    assert found.evidence is Evidence.SAMPLED
+    assert "the proof was given up after dividing the region into" in found.notes[0]
+    assert found.eta < 1.0
