@@ -394,7 +394,7 @@ def same_record(here):
     table["time"] = times = np.arange(50) * DT
     table.to_csv("record.csv", index=False)
     columns = {name: table[name].to_numpy() for name in "yu"}
-    mf4("record.mf4", [(times, columns)])
+    mf4("record.mf4", [(times, columns)], datetime(2026, 3, 2, 8, 0, tzinfo=UTC))
     from scipy.io import savemat
     savemat("record.mat", {"time": times, **columns})
     h5py = pytest.importorskip("h5py")
