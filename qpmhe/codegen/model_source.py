@@ -63,6 +63,8 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
         named = _named(ca, slopes, name, model.width, model.m)
         generator.add(named)
         calls.append(_call(f"mhe_call_{which}_jacobian", name, named))
+        if which == "f" and model.is_implicit and not model.guess:
+            continue  # its nonzeros are those of the flows
         listed = ", ".join(str(place) for place in places) or "0"
         calls.append(
             f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
@@ -233,7 +235,8 @@ def _step_parts(model: CasadiModel, single: bool) -> list[str]:
     coarser = 2.0**29 if single else 1.0  # rounding, in that of double precision
     values = {
         "iterations": MOST_ITERATIONS, "halvings": MOST_HALVINGS,
-        "rounding": repr(coarser * ROUNDING), "small": repr(math.sqrt(coarser) * SMALL), "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
+        "rounding": repr(coarser * ROUNDING), "small": repr(math.sqrt(coarser) * SMALL),
+        "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
         "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),
         "kept": MOST_KEPT, "contraction": repr(CONTRACTION), "few": repr(FEW_ROUNDINGS),
         "spread": repr(LARGEST_SPREAD / coarser), "parts": FOLLOWED, "whole": MOST_WHOLE,

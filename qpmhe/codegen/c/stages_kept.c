@@ -30,33 +30,33 @@ typedef struct {
 /* The same by elimination without exchanges; whether it may do without. */
 static int mhe_invert_blocks(real h, const real *J, const real *per, mhe_modes *modes)
 {
-    real one[NX * NX], pair[SIZE(4 * NX * NX * MHE_PAIR)], both[SIZE(2 * NX * NX * MHE_PAIR)];
-    real z[NX * NX];
+    real one[NX * NX], z[NX * NX];
     for (int i = 0; i < NX * NX; i++) one[i] = z[i] = 0;
-    for (int i = 0; i < 4 * NX * NX * MHE_PAIR; i++) pair[i] = 0;
-    for (int i = 0; i < 2 * NX * NX * MHE_PAIR; i++) both[i] = 0;
     for (int a = 0; a < NX; a++) {
         one[a * NX + a] = $real;
         z[a * NX + a] = 1;
-        if (!MHE_PAIR) continue;
-        real *block = pair + 4 * (a * NX + a);
-        block[0] = block[3] = $real + $shift;
-        block[1] = -$turning;
-        block[2] = $turning;
-        both[2 * a * NX + a] = 1;
     }
-    for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
-        const int at = mhe_flow_row[q] * NX + mhe_flow_column[q];
-        const real flow = h * J[q];
-        one[at] -= flow;
-        if (!MHE_PAIR) continue;
-        pair[4 * at] -= flow;
-        pair[4 * at + 3] -= flow;
-    }
+    for (int q = 0; q < MHE_FLOW_NONZEROS; q++)
+        one[mhe_flow_row[q] * NX + mhe_flow_column[q]] -= h * J[q];
     if (!mhe_factor_blocks(1, one, per)) return 0;
     mhe_solve_blocks(1, one, z);
     for (int i = 0; i < NX * NX; i++) modes->one[i % NX * NX + i / NX] = z[i];
     if (MHE_PAIR) {
+        real pair[4 * NX * NX], both[2 * NX * NX];
+        for (int i = 0; i < 4 * NX * NX; i++) pair[i] = 0;
+        for (int i = 0; i < 2 * NX * NX; i++) both[i] = 0;
+        for (int a = 0; a < NX; a++) {
+            real *block = pair + 4 * (a * NX + a);
+            block[0] = block[3] = $real + $shift;
+            block[1] = -$turning;
+            block[2] = $turning;
+            both[2 * a * NX + a] = 1;
+        }
+        for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
+            real *block = pair + 4 * (mhe_flow_row[q] * NX + mhe_flow_column[q]);
+            block[0] -= h * J[q];
+            block[3] -= h * J[q];
+        }
         if (!mhe_factor_blocks(2, pair, per)) return 0;
         mhe_solve_blocks(2, pair, both);
         for (int i = 0; i < NX; i++)
