@@ -72,7 +72,8 @@ def test_the_first_fault_and_what_equals_it_are_those_of_the_whole_search(fault,
         names = [(one.kind, one.subject, {k.kind for k in one.equals}) for one in faults]
         found.append((names, [one.value for one in faults]))
     assert found[0][0] == found[1][0]
-    np.testing.assert_allclose(found[0][1], found[1][1], rtol=0.05)
+    # Each is the top of a parabola, and those of a lag go through different values.
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=0.1)
     assert bool(faults) == (fault != "none")
     assert counts[0] < 0.6 * counts[1], counts
 
