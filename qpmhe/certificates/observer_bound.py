@@ -458,11 +458,12 @@ class ObserverBound:
 
         Beyond, they are those of the ball alone, and do not count.
         """
-        z, steps, n = run.observer_states, len(run), self.region.n
+        z, steps = run.observer_states, len(run)
         radius = self.radii(steps, initial_error, disturbances, noises)
         box = self.components(radius)
         entering = np.broadcast_to(self.entering(disturbances, noises), (steps, 2))
-        added = np.broadcast_to(self.added(disturbances, noises), (steps, n))
+        added = self.added(disturbances, noises)
+        added = np.broadcast_to(added, (steps, added.shape[-1]))
         within = np.append(self.region.contains(z[:-1]), False)
         projected = (run.flags & Status.OBSERVER_PROJECTED.value) != 0
         tube = self.begun(initial_error)

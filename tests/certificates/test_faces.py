@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.certificates import Evidence, Sizes
+from qpmhe.certificates import Evidence, Monitor, Sizes
 from qpmhe.certificates.faces import Faces
 from qpmhe.certificates.observer_bound import bound_observer
 from qpmhe.certificates.regions import Region
@@ -194,3 +194,32 @@ def test_the_box_counts_in_advance_where_projections_act(projected):
     assert "while x stays in the region" in bound.headline
     assert not bound.begins_within
     assert (tubes[-1].box <= bound.settled.box).all()
+
+
+@pytest.mark.slow
+def test_a_run_with_projections_has_the_bounds_of_its_monitor(projected):
+    """The true states are within them."""
+    bound, _ = projected
+    system, rng, steps = bound.stability.system, np.random.default_rng(5), 60
+    w_most, v_most = bound.sizes.disturbance.upper, bound.sizes.noise.upper
+    x, measurements = [np.array([0.3, 0.0, 0.0])], []
+    for _ in range(steps):
+        measurements.append(system.h(x[-1]) + rng.uniform(-1.0, 1.0, 1) * v_most)
+        x.append(np.minimum(system.f(x[-1]) + rng.uniform(-1.0, 1.0, 3) * w_most, 0.3))
+
+    def estimator():
+        return qpmhe.MovingHorizonEstimator(
+            system, qpmhe.Luenberger(bound.gain, metric=bound.metric), unit_cost(3), horizon=2,
+            initial_state=x[0])
+
+    mhe = estimator()
+    watch = Monitor(bound, mhe, initial_error=0.0)
+    readings = [watch.check(mhe.update(y)) for y in measurements]
+    run = estimator().run(np.array(measurements))
+    band = bound.along(run, initial_error=0.0)
+    assert (watch.lost, band.lost) == (None, None)
+    assert (run.flags & qpmhe.Status.OBSERVER_PROJECTED.value).any()
+    for name in ("radius", "lower", "upper", "error"):
+        found = [getattr(one, name) for one in readings]
+        np.testing.assert_allclose(getattr(band, name)[1:], found, rtol=1e-9)
+    assert ((band.lower <= x) & (np.array(x) <= band.upper)).all()

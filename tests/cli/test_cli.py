@@ -120,7 +120,7 @@ def test_our_warnings_are_one_line_and_those_of_others_have_their_place(
         main()
     assert warnings.showwarning is before
     printed = capsys.readouterr().err
-    own = [line for line in printed.splitlines() if "too long" in line]
+    own = [line for line in printed.splitlines() if "is too long" in line]
     assert len(own) == 1
     assert own[0].startswith("warning: one step of rk4 in dt = 0.1 is too long")
     assert "with u = [40.]" in own[0]
