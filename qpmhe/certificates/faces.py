@@ -76,7 +76,11 @@ class Faces:
     @property
     def reached(self) -> bool:
         """Whether any face may be active in the limit."""
-        return self.block.size > 0 or not self._least < self._most
+        return self.may_act(self._least)
+
+    def may_act(self, radius: float) -> bool:
+        """Whether any face may be active where |x - z|_P is at most a radius."""
+        return bool(self._active(radius).any()) or not radius < self._most
 
     def _active(self, radius: float) -> Array:
         """The components of which a bound may be active, where |x - z|_P is at most a radius."""

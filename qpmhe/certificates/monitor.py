@@ -452,7 +452,7 @@ class Monitor:
         return {
             "time": self._time, "observer": self._z.copy(), "radius": self._tube.radius,
             "box": self._tube.box.copy(), "oblique": self._tube.oblique.copy(),
-            "lost": self.lost, "reason": self.reason,
+            "directions": self.bound.directions.copy(), "lost": self.lost, "reason": self.reason,
             "metric": self.bound.metric.copy(), "moved": self.moved, "unguarded": self.unguarded,
         }
 
@@ -467,7 +467,6 @@ class Monitor:
             z = np.array(state["observer"], np.float64).reshape(self._z.shape)
             time, radius = int(state["time"]), float(state["radius"])
             box = np.array(state["box"], np.float64).reshape(self._z.shape)
-            oblique = np.array(state["oblique"], np.float64).reshape(self._tube.oblique.shape)
             lost = None if state["lost"] is None else int(state["lost"])
             reason, unguarded = str(state["reason"]), str(state["unguarded"])
             moved = int(state["moved"])
@@ -476,12 +475,17 @@ class Monitor:
                 raise ValueError(f"its bounds are {radius} and {box.tolist()}, not lost")
             if not np.array_equal(metric, mine):  # another search found another P
                 radius *= largest_ratio(mine, metric)
-                oblique = self.bound.tube(radius, box).oblique
+            tube = self.bound.tube(radius, box)
+            if np.array_equal(state.get("directions", ()), self.bound.directions):
+                oblique = np.array(state["oblique"], np.float64).reshape(tube.oblique.shape)
+                if lost is None and not (oblique >= 0.0).all():
+                    raise ValueError(f"its bounds along directions are {oblique.tolist()}")
+                tube = tube._replace(oblique=np.minimum(tube.oblique, oblique))
         except (KeyError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the state does not come from a monitor of this observer: {error}."
             ) from error
-        self._time, self._z, self._tube = time, z, Tube(radius, box, oblique)
+        self._time, self._z, self._tube = time, z, tube
         self.lost, self.reason, self.moved = lost, reason, moved
         if self._guard is not None and unguarded != _NO_GUARD:
             self.unguarded = unguarded

@@ -251,8 +251,17 @@ class ObserverBound:
     def tube(self, radius: float, box: Array | None = None) -> Tube:
         """Bounds on |x - z|_P and on its components, of the ball if left out."""
         box = self.components(radius) if box is None else box
-        faces = None if self.rowwise is None else self.rowwise.faces
+        faces = self._faces
         return Tube(radius, box) if faces is None else Tube(radius, box, faces.oblique(box))
+
+    @property
+    def directions(self) -> Array:
+        """Those (r, n) along which a `Tube` has bounds, too."""
+        return np.zeros((0, self.region.n)) if self._faces is None else self._faces.directions
+
+    @property
+    def _faces(self) -> Faces | None:
+        return None if self.rowwise is None else self.rowwise.faces
 
     def followed(
         self, tube: Tube, entering: ArrayLike, added: Array, *, projected: bool,
@@ -299,8 +308,7 @@ class ObserverBound:
         system = self.stability.system
         if system is None or system.states is None:
             return system is None
-        faces = None if self.rowwise is None else self.rowwise.faces
-        return faces is None or faces.reached
+        return self._faces is None or self._faces.reached
 
     @property
     def begins_within(self) -> bool:
@@ -515,9 +523,13 @@ class ObserverBound:
             return None
         rows = self.rowwise is not None
         entering, samples, room = self.entering(), 0, 0.5 * _SETTLED if rows else _SETTLED
+        # Faces out of the limit's reach may be within that of a larger radius.
+        faces = self._faces if self.unprojected else None
         if self.begins_within:
-            radius = limit
-        while radius > (1.0 + room) * limit and samples < _MOST_SAMPLES:
+            radius, faces = limit, None
+        while samples < _MOST_SAMPLES and (
+            radius > (1.0 + room) * limit or (faces is not None and faces.may_act(radius))
+        ):
             radius, samples = self.advanced(radius, entering), samples + 1
         if not rows:
             return samples

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -66,13 +65,12 @@ class Hypothesis:
         """R, or its mean where it changes."""
         return self.noise if self.noise.ndim == 2 else np.asarray(self.noise.mean(axis=0))
 
-    def part(self, begin: int, count: int) -> Hypothesis:
-        """The same of these samples alone."""
-        part = slice(begin, begin + count)
+    def first(self, count: int) -> Hypothesis:
+        """The same of the first samples alone."""
         return replace(
-            self, measurements=self.measurements[part], inputs=self.inputs[part],
-            noise=self.noise if self.noise.ndim == 2 else self.noise[part],
-            repeats=None if self.repeats is None else self.repeats[part],
+            self, measurements=self.measurements[:count], inputs=self.inputs[:count],
+            noise=self.noise if self.noise.ndim == 2 else self.noise[:count],
+            repeats=None if self.repeats is None else self.repeats[:count],
         )
 
 
@@ -134,18 +132,6 @@ class FilterBank:
         if self._is_timed and steps is None:
             self.steps = np.array([float(system.dt or 1.0)])
         self._tried = False
-
-    def part(self, begin: int, count: int, total: int) -> FilterBank:
-        """The same filters of some of the samples of a record, and of its other parts, too."""
-        found, filters = copy(self), self._filters * (total // count)
-        steps = self.steps if self.steps is None or len(self.steps) == 1 else (
-            self.steps[begin : begin + count])
-        found.steps, found.before, found._filters = steps, self.before + begin, filters
-        return found
-
-    def started(self, one: Hypothesis, state: Array) -> Array:
-        """Where a filter of this hypothesis begins if the system is in this state."""
-        return state
 
     def _try_batched(self, start: Array, prior: Array, inputs: Array) -> None:
         """Let functions that no trace has proved to take many states do so if it looks like it."""
@@ -417,7 +403,7 @@ class FilterBank:
         saved = self._filters * len(one.measurements) * (_RUNNING + _ENTRY * self.n**2)
         if saved < _PAYS * (_LIBRARY + operations * _COMPILING):
             return None
-        part = one.part(0, _COMPARED)
+        part = one.first(_COMPARED)
 
         def fault(library: HypothesisLibrary) -> str:
             found = self._run_in_c(library, [part], part)

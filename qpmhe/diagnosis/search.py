@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -10,9 +10,7 @@ import numpy as np
 
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
 from .causes import CAUSES, matters
-from .families import refined
 from .faults import LEAST_GAIN, SCALED, Evidence, Fault, with_factor
-from .screen import screened
 from .sensor_memory import colours
 from .signatures import with_ends
 
@@ -28,10 +26,6 @@ _ALIKE, _SHARE, _MOST_ALIKE = 6.0, 0.03, 15.0
 # Nothing else is looked for where means, squares and correlations over so few samples of the
 # innovations are within so many standard errors; larger innovations count as the last.
 _CALM, _SOON, _FAR = 2.5, 5, 4.0
-# No chance takes them that far off: a long record is then searched in full where its stretches show
-# nothing. On those, a fault must gain this share of what it must on the record.
-_WILD, _HOPE = 0.15, 0.1
-_LOCAL = frozenset(kind for kind, cause in CAUSES.items() if cause.local)
 # Families of values that are searched twice.
 _CLOSELY = 6
 # A sensor with a memory looks like a wrong Q and R, and these like it: they are searched together
@@ -76,20 +70,16 @@ def _given(evidence: Evidence, base: Hypothesis) -> Evidence:
     return replace(evidence, bank=bank, base=base, null=bank.run([base]), shared={})
 
 
-def _is_explained(evidence: Evidence, least: float = 0.0) -> bool:
-    """Whether the innovations are as they should be: then nothing else is looked for.
-
-    That is, up to chance, or to ``least`` in their deviations.
-    """
+def _is_explained(evidence: Evidence) -> bool:
+    """Whether the innovations are as they should be: then nothing else is looked for."""
     squares = evidence.null.normalised**2
     counts = np.maximum(np.isfinite(squares).sum(axis=0), 1)
-    limit = np.maximum(_CALM, least * np.sqrt(counts))
     means = np.nanmean(np.minimum(squares, _FAR**2), axis=0) - 1.0
     return bool(
         np.isfinite(evidence.null.logs).all()
-        and (np.abs(means) < limit * np.sqrt(2.0 / counts)).all()
-        and (colours(evidence, _SOON) < limit).all()
-        and (np.abs(np.nanmean(evidence.null.normalised, axis=0)) < limit / np.sqrt(counts)).all()
+        and (np.abs(means) < _CALM * np.sqrt(2.0 / counts)).all()
+        and (colours(evidence, _SOON) < _CALM).all()
+        and (np.abs(np.nanmean(evidence.null.normalised, axis=0)) < _CALM / np.sqrt(counts)).all()
     )
 
 
@@ -186,24 +176,14 @@ def _disjoint(found: list[Fault], base: Hypothesis) -> list[Fault]:
 
 def _best(evidence: Evidence, kinds: Collection[str]) -> tuple[Fault | None, bool]:
     """The best fault, and whether factors of R or Q alone explain much of what it does."""
-    every = [one for kind in kinds for make in CAUSES[kind].makers for one in make(evidence)]
-    some = screened(evidence, every, _LOCAL, _HOPE * _GAIN_EACH)
-    found = _best_of(evidence, some)
-    # What the stretches do not show may be elsewhere.
-    if found[0] is None and some is not every and not _is_explained(evidence, _WILD):
-        found = _best_of(evidence, every)
-    return found
-
-
-def _best_of(evidence: Evidence, tried: list[Fault]) -> tuple[Fault | None, bool]:
-    """The best of these, and whether factors of R or Q explain much of what it does."""
     bank, base, null = evidence.bank, evidence.base, evidence.null
+    tried = [one for kind in kinds for make in CAUSES[kind].makers for one in make(evidence)]
     logs = bank.run([base, *(one.hypothesis for one in tried)]).logs
     for most in (None, _CLOSELY):
-        better = list(refined(tried, logs.sum(axis=0), most))
-        if better:
-            further = bank.run([base, *(one.hypothesis for one in better)]).logs[:, 1:]
-            tried, logs = [*tried, *better], np.hstack((logs, further))
+        refined = list(_refined(tried, logs.sum(axis=0), most))
+        if refined:
+            further = bank.run([base, *(one.hypothesis for one in refined)]).logs[:, 1:]
+            tried, logs = [*tried, *refined], np.hstack((logs, further))
     gains, enough, least = _judged(base, logs)
     scores = gains - np.array([_price(one, evidence.total) for one in tried])
     order = np.argsort(-scores, kind="stable").tolist()
@@ -293,3 +273,35 @@ def _rival(evidence: Evidence) -> tuple[list[Fault], Hypothesis, float]:
         evidence.shared["rival"] = factors, base, gain if np.isfinite(gain) else -np.inf
     found: tuple[list[Fault], Hypothesis, float] = evidence.shared["rival"]
     return found
+
+
+def _refined(tried: list[Fault], values: Array, most: int | None) -> Iterator[Fault]:
+    """For each family of values, or the best ones, the top of a parabola through its best ones."""
+    families: dict[tuple[object, ...], list[tuple[float, float, Fault]]] = {}
+    for one, value in zip(tried, values[1:].tolist(), strict=True):
+        if one.again is not None and np.isfinite(one.value):
+            at = float(np.log(one.value)) if _is_factor(one) else one.value
+            key = one.kind, one.subject, one.family
+            families.setdefault(key, []).append((at, value, one))
+    best = sorted(families.values(), key=lambda some: -max(value for _, value, _ in some))
+    for some in best[:most]:
+        pairs = {at: value for at, value, _ in some}
+        if some[0][2].kind not in ("lag", "coloured", "jitter"):
+            pairs.setdefault(0.0, float(values[0]))
+        places, heights = np.array(sorted(pairs.items())).T
+        k = int(np.argmax(heights))
+        if not 0 < k < len(places) - 1 or not np.isfinite(heights[k - 1 : k + 2]).all():
+            continue
+        near = slice(k - 1, k + 2)
+        scale = float(np.ptp(places[near]))
+        curve = np.polyfit((places[near] - places[k]) / scale, heights[near], 2)
+        again = some[0][2].again
+        if curve[0] < 0.0 and again is not None:
+            top = float(places[k]) - 0.5 * scale * float(curve[1] / curve[0])
+            yield again(float(np.exp(top)) if _is_factor(some[0][2]) else top)
+
+
+def _is_factor(one: Fault) -> bool:
+    """Whether its values count by their logarithms."""
+    cause = CAUSES[one.kind]
+    return one.value > 0.0 and not (cause.adds or cause.size == "deviations")

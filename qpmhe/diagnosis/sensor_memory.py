@@ -48,20 +48,6 @@ class MemoryBank(FilterBank):
         m = self.system.m
         return np.hstack((self._bank.full_inputs(inputs[:, :m], step), inputs[:, m:]))
 
-    def part(self, begin: int, count: int, total: int) -> FilterBank:
-        """The same filters of some of the samples of a record."""
-        found = super().part(begin, count, total)
-        assert isinstance(found, MemoryBank)
-        found._bank = self._bank.part(begin, count, total)
-        return found
-
-    def started(self, one: Hypothesis, state: Array) -> Array:
-        """The state, and what a memory has of the outputs there: a lag has followed them."""
-        inputs = self._bank.full_inputs(one.inputs[:1, : self.system.m], one.step)
-        own = self._bank.expected(state[None], inputs)[0][self._sensors]
-        lags = one.inputs[0, self.system.m :].reshape(4, -1)[1] > 0.0
-        return np.append(state, lags * own)
-
     def _bounded(self, x: Array) -> Array:
         n = self.system.n
         return np.hstack((super()._bounded(x[:, :n]), x[:, n:]))

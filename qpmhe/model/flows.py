@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from .expressions import CasadiModel
 
@@ -19,6 +17,9 @@ def flow_pattern(model: CasadiModel) -> Pattern:
     own, k = full[:n, :n], model.width - n
     if not k:
         return own
+    from scipy.sparse import csr_matrix  # late: `import qpmhe` does without
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
     # With the equation that each z has by itself, z follows those of all z that it reaches.
     rows = maximum_bipartite_matching(csr_matrix(full[n:, n:]), perm_type="row")
     equations = full[n:][rows]

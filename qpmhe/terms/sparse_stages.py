@@ -64,10 +64,10 @@ class SparseStages:
         weighted_residual, weighted = weights @ residual, (weights @ slopes).tocoo()
         square = (slopes.T @ weighted.tocsr()).tocoo()
         panel.fill(0.0)
-        row, column = square.coords
+        row, column = square.row, square.col
         lower = row >= column
         panel[column[lower], (row - column)[lower]] = square.data[lower]
-        row, column = weighted.coords
+        row, column = weighted.row, weighted.col
         own = row < n
         panel[column[own], (n + row - column)[own]] = weighted.data[own]
         gradient[...] = slopes.T @ weighted_residual

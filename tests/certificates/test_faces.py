@@ -8,9 +8,10 @@ from qpmhe.certificates import Evidence, Monitor, Sizes
 from qpmhe.certificates.faces import Faces
 from qpmhe.certificates.observer_bound import bound_observer
 from qpmhe.certificates.regions import Region
+from qpmhe.errors import InvalidInputError
 from qpmhe.observers.projection import NearestPoint
 
-from .helpers import box, unit_cost
+from .helpers import box, linear, unit_cost
 
 FREE = np.inf
 
@@ -223,3 +224,48 @@ def test_a_run_with_projections_has_the_bounds_of_its_monitor(projected):
         found = [getattr(one, name) for one in readings]
         np.testing.assert_allclose(getattr(band, name)[1:], found, rtol=1e-9)
     assert ((band.lower <= x) & (np.array(x) <= band.upper)).all()
+
+
+def test_a_monitor_continues_beside_other_directions():
+    """Of another search, or of before there were any: what they bound follows from the box."""
+    def bound(side):
+        return bound_observer(
+            linear(np.diag([0.9, 0.5]), [[1.0, 0.0]], states=box([-1.0, -1.0], [1.0, 1.0])),
+            qpmhe.Luenberger([[0.3], [0.0]]), unit_cost(2), box([-1.0, -side], [1.0, side]),
+            sizes=Sizes(0.01, 0.02), seconds=3000.0)
+
+    one, other = bound(0.5), bound(1.0)
+    assert one.directions.shape != other.directions.shape
+    mhe = qpmhe.MovingHorizonEstimator(
+        one.stability.system, qpmhe.Luenberger(one.gain), unit_cost(2), horizon=2,
+        initial_state=np.zeros(2))
+    made, state = (Monitor(each, mhe, initial_error=0.1) for each in (other, one))
+    state = state.state_dict()
+    former = {name: each for name, each in state.items() if name not in ("oblique", "directions")}
+    for given in (state, former):
+        made.load_state_dict(given)
+        found = made.state_dict()
+        np.testing.assert_array_equal(found["oblique"], other.tube(1.0, found["box"]).oblique)
+    same = Monitor(one, mhe, initial_error=0.1)
+    with pytest.raises(InvalidInputError, match="along directions"):
+        same.load_state_dict(state | {"oblique": -state["oblique"] - 1.0})
+
+
+@pytest.mark.slow
+def test_a_bound_that_a_larger_ball_reaches_counts_until_the_bounds_have_settled():
+    """X begins a little beyond the limit's reach, and within that of 1.05 limits."""
+    def bound(X):
+        return bound_observer(
+            linear(np.diag([0.9, 0.5]), [[1.0, 0.0]], states=X), qpmhe.Luenberger([[0.3], [0.0]]),
+            unit_cost(2), box([-1.0, -0.5], [1.0, 0.5]), sizes=Sizes(0.01, 0.02), seconds=3000.0)
+
+    near = bound(box([-1.0, -0.5], [1.0, 0.5]))
+    top = 0.5 + 1.02 * float(near.slopes[1]) * near.limit()
+    beside = bound(box([-FREE, -top], [FREE, top]))
+    assert beside.unprojected
+    samples = beside.settling_samples
+    tube = beside.begun(box(-beside.widths, beside.widths))
+    entering, added = beside.entering(), beside.added()
+    for _ in range(samples):
+        tube = beside.followed(tube, entering, added, projected=True)
+    assert (tube.box <= 1.1 * beside.settled.box).all()

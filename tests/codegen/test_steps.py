@@ -9,7 +9,7 @@ import pytest
 import qpmhe
 from qpmhe import Status
 from qpmhe.codegen import write
-from qpmhe.codegen.compiler import find_compiler
+from qpmhe.codegen.compiler import find_compiler, optimisation
 from qpmhe.errors import InvalidInputError
 from qpmhe.memory.snapshot import read, written
 from tests.oracles.test_kalman import Plant, distance, kalman
@@ -192,3 +192,28 @@ def test_every_horizon_gives_the_kalman_predictor_and_filter(make, n, p, horizon
     assert distance(run.filtered, np.array([x for x, _ in filtered])) < 1e-9
     P = predicted[-1][1]
     np.testing.assert_allclose(mhe.covariances()[-1], P, rtol=0.0, atol=1e-8 * np.abs(P).max())
+
+
+def chain(method):
+    """Five states that decay into each other, from rates; a map, or a DAE, if asked for."""
+    def rate(x):
+        return -x + 0.3 * np.roll(x, 1, axis=-1)
+
+    if method == "map":
+        return qpmhe.System(lambda x: x + 0.1 * rate(x), lambda x: x[..., :1], n=5, p=1)
+    if method == "dae":
+        return qpmhe.System.from_dae(
+            lambda x, z: rate(x) + z, lambda x, z: z + z**3 - 0.1 * x[..., :1],
+            lambda x, z: x[..., :1], dt=0.1, n=5, k=1, p=1, algebraic_guess=[0.0])
+    return qpmhe.System.from_ode(rate, lambda x: x[..., :1], dt=0.1, n=5, p=1, method=method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["map", "rk4", "radau", "midpoint", "dae"])
+def test_the_step_is_compiled_with_all_optimisation(method):
+    """A part that does not compile beside another is left without a word: the next level does."""
+    made = qpmhe.compile(
+        chain(method), qpmhe.Luenberger(0.1 * np.ones((5, 1))),
+        qpmhe.QuadraticCost(prior=np.eye(5), disturbance=np.eye(5), noise=np.eye(1)), horizon=3,
+        initial_state=np.zeros(5))
+    assert optimisation(made.path).startswith("-O3")

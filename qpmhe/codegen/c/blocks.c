@@ -12,6 +12,7 @@ static void mhe_invert_block(int size, real *D, real *squares)
 {
     for (int k = size - 1; k >= 0; k--) {
         const real pivot = 1 / D[k * size + k];
+        *squares += 0 * pivot; /* no number if it is none */
         D[k * size + k] = 1;
         for (int j = 0; j < size; j++) D[k * size + j] *= pivot;
         for (int i = 0; i < size; i++) {

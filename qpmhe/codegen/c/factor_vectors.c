@@ -12,8 +12,8 @@ typedef real mhe_lanes
 INLINE const mhe_lanes *mhe_lanes_of(const real *a) { return (const mhe_lanes *)a; }
 
 /* sums -= F' A, for the first rows of F', and A of `count` rows. */
-INLINE void mhe_reduce(int rows, int tile, int count, const real *factors, const real *above,
-                       mhe_lanes sums[LANES][TILE])
+INLINE void mhe_reduce_tile(int rows, int tile, int count, const real *factors, const real *above,
+                            mhe_lanes sums[LANES][TILE])
 {
     for (int j = 0; j < count; j++, factors += LANES, above += WIDTH) {
         mhe_lanes x[TILE];
@@ -31,7 +31,7 @@ INLINE int mhe_eliminate_tile(int rows, int tile, int first, int r, int b, const
     real *to = panel + r * WIDTH + b;
     for (int q = 0; q < rows; q++)
         for (int c = 0; c < tile; c++) sums[q][c] = mhe_lanes_of(to + q * WIDTH)[c];
-    mhe_reduce(rows, tile, r, factors, panel + b, sums);
+    mhe_reduce_tile(rows, tile, r, factors, panel + b, sums);
     for (int p = 0; p < rows; p++) {
         if (first) {
             const mhe_lanes row = sums[p][0];
@@ -84,7 +84,7 @@ INLINE void mhe_subtract_tile(int rows, int tile, int whole, const real *factors
     mhe_lanes sums[LANES][TILE];
     for (int q = 0; q < rows; q++)
         for (int c = 0; c < tile; c++) sums[q][c] = (mhe_lanes){0};
-    mhe_reduce(rows, tile, NX, factors, above, sums);
+    mhe_reduce_tile(rows, tile, NX, factors, above, sums);
     for (int q = 0; q < rows; q++)
         for (int c = 0; c < tile; c++) {
             real *at = to + q * WIDTH + c * LANES;
