@@ -42,7 +42,7 @@ _NANOSECONDS = re.compile(r":\d\d[.,]\d{6}(\d{1,3})(?!\d)")
 _DAY_FIRST = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})(?=\s|T|$)")
 # What pandas writes of a duration, and what Python does: 1 days 00:00:00.25, 1 day, 0:00:00
 _DURATION = re.compile(
-    r"(?=.)(?:([+-]?\d+) days?,?)?(?:(?:^| )\+?(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d{1,9}))?)?"
+    r"(?=.)(?:([+-]?\d+) days?,?)?(?:(?:^| )\+?(\d+):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9}))?)?"
 )
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

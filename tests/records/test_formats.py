@@ -341,12 +341,14 @@ def test_durations_that_pandas_writes_come_back(here, step):
 
 
 def test_durations_of_python_and_spreadsheets(here):
-    forms = ["-1 day, 23:59:58.5", "0:00:00", "00:00:02,25", "1 day, 1:02:03", "2 days"]
+    forms = ["-1 day, 23:59:58.5", "0:00:00", "00:00:02,25", "1 day, 1:02:03", "2 days", "100:00:00"]
     put("record.csv", ["time;y", *(f"{one};1" for one in forms)])
     assert read("record.csv").index.total_seconds().tolist() == [
-        -1.5, 0.0, 2.25, 86_400 + 3723, 172_800]
+        -1.5, 0.0, 2.25, 86_400 + 3723, 172_800, 360_000]
     put("record.csv", ["time,y", "0:00:01,1", "0.5,1"])
     refused("record.csv", "its time is a number, and in line 2 a duration")
+    put("record.csv", ["time,y", "0:00:01,1", "0:99:00,1"])
+    refused("record.csv", "line 3")
 
 
 @pytest.mark.parametrize("seed", range(4))
