@@ -94,7 +94,7 @@ def test_sensors_with_memory_are_filtered_as_in_numpy(name, monkeypatch):
             expected = memories._run_in_numpy(some, usual)
             expected_of_vague = memories._run_in_numpy(of_vague, usual)
         monkeypatch.delenv("QPMHE_ENGINE", raising=False)
-        memories._run([some[0].part(0, 40)], usual.part(0, 40))  # compiles, and compares with NumPy
+        memories._run([some[0].first(40)], usual.first(40))  # compiles, and compares with NumPy
         with monkeypatch.context() as patched:
             patched.setattr(memories, "_run_in_numpy", lambda *_: pytest.fail("not compiled"))
             check_same(memories._run(some, usual), expected)
@@ -157,7 +157,7 @@ def test_few_samples_are_filtered_as_in_numpy(count, monkeypatch):
     memories, some = _with_memory(system, tried[:1], [0])
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)
     for filters, one in ((FilterBank(system, None, filters=10**9), tried[0]), (memories, some[0])):
-        library, part = filters._compiled(one), one.part(0, count)
+        library, part = filters._compiled(one), one.first(count)
         found, expected = filters._run_in_c(library, [part], part), filters._run([part], part)
         assert found.logs.shape == (count, 1)
         np.testing.assert_allclose(
