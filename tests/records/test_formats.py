@@ -341,7 +341,8 @@ def test_durations_that_pandas_writes_come_back(here, step):
 
 
 def test_durations_of_python_and_spreadsheets(here):
-    forms = ["-1 day, 23:59:58.5", "0:00:00", "00:00:02,25", "1 day, 1:02:03", "2 days", "100:00:00"]
+    forms = [
+        "-1 day, 23:59:58.5", "0:00:00", "00:00:02,25", "1 day, 1:02:03", "2 days", "100:00:00"]
     put("record.csv", ["time;y", *(f"{one};1" for one in forms)])
     assert read("record.csv").index.total_seconds().tolist() == [
         -1.5, 0.0, 2.25, 86_400 + 3723, 172_800, 360_000]
