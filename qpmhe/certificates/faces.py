@@ -109,7 +109,8 @@ class Faces:
             box[self.block] = np.minimum(box[self.block], reached[self.block])
         moved = (oblique + self._others @ box) * OUTWARD
         if one:
-            # Between the prediction's error and where that of the block is 0.
+            # The error lies on the segment that begins before the projection; at its other end the
+            # component of the block is 0.
             most[self.block] = 0.0
             ends = np.maximum(reached[self.rest], (oblique + self._others @ most) * OUTWARD)
             moved = np.minimum(moved, ends)

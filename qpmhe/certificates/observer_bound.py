@@ -523,7 +523,7 @@ class ObserverBound:
             return None
         rows = self.rowwise is not None
         entering, samples, room = self.entering(), 0, 0.5 * _SETTLED if rows else _SETTLED
-        # Faces out of the limit's reach may be within that of a larger radius.
+        # While the ball is larger than its limit, it may reach faces that the limit does not reach.
         faces = self._faces if self.unprojected else None
         if self.begins_within:
             radius, faces = limit, None
@@ -531,6 +531,8 @@ class ObserverBound:
             radius > (1.0 + room) * limit or (faces is not None and faces.may_act(radius))
         ):
             radius, samples = self.advanced(radius, entering), samples + 1
+        if faces is not None and faces.may_act(radius):
+            return None
         if not rows:
             return samples
         # Then the components, which follow the radius.

@@ -240,27 +240,23 @@ class TriedInputs:
 
     def __init__(self) -> None:
         self._range: tuple[Array, Array] | None = None
-        self._known: tuple[Array, Array] | None = None  # the range, and half of it beyond
 
     def new(self, inputs: Array) -> Array:
         """Of the finite inputs (T, m), the outermost ones if they lie beyond the range, by half.
 
         An input that creeps or jitters is new a few times, not at each sample.
         """
-        if self._known is not None:
-            low, high = self._known
-            if (inputs >= low).all() and (inputs <= high).all():
-                return inputs[:0]
         inputs = inputs[np.isfinite(inputs).all(axis=1)]
         if not len(inputs):
             return inputs
         least, most = inputs.min(axis=0), inputs.max(axis=0)
-        if self._range is not None and self._known is not None:
-            if (least >= self._known[0]).all() and (most <= self._known[1]).all():
+        if self._range is not None:
+            low, high = self._range
+            margin = 0.5 * (high - low)
+            if (least >= low - margin).all() and (most <= high + margin).all():
                 return inputs[:0]
-            least, most = np.minimum(least, self._range[0]), np.maximum(most, self._range[1])
-        margin = 0.5 * (most - least)
-        self._range, self._known = (least, most), (least - margin, most + margin)
+            least, most = np.minimum(least, low), np.maximum(most, high)
+        self._range = least, most
         rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
         return inputs[sorted(rows)]
 

@@ -345,6 +345,6 @@ def check_default(name: str, parameter: inspect.Parameter) -> None:
         return
     raise ModelError(
         f"{name} has the parameter {parameter.name}={shown(default)} in the place of the input u. "
-        f"If it is a constant, bind it: functools.partial({name}, {parameter.name}="
-        f"{shown(default)}); if it is the input, name it u, or leave out its default."
+        f"If it is a constant, bind it: functools.partial({name}, {parameter.name}=...); if it is "
+        "the input, name it u, or leave out its default."
     )

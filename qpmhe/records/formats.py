@@ -21,7 +21,7 @@ from .tables import TIMES, RecordError, first_line
 _LONGEST = 64
 # What is read at once: bytes of an MDF file, and messages of a bag.
 _FRAGMENT, _MESSAGES = 2**22, 2**14
-# The year of MDF: an earlier date is that of a clock that nobody had set.
+# MDF was made in this year; a file with an earlier date comes from a device without a set clock.
 _FIRST_MDF = 1991
 _Path = tuple[str | int, ...]
 

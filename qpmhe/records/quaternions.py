@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from .._checks import Array
 
-# How far a length may be from 1, and the cosine that is nearly that of the opposite.
+# A length is taken for 1 up to the first; two directions are taken for opposite where their cosine
+# is below the second.
 _LENGTH, _OPPOSITE = 0.1, -0.9
 
 
@@ -19,20 +20,23 @@ class SignChanges:
     """Counts, sample by sample, the changes of sign of every four outputs in a row."""
 
     def __init__(self, outputs: int) -> None:
-        self._last = np.full((max(0, outputs - 3), 4), np.nan)
+        self._four = np.arange(max(0, outputs - 3))[:, None] + np.arange(4)
+        self._last = np.full(self._four.shape, np.nan)
         self._counts: NDArray[np.intp] = np.zeros(len(self._last), np.intp)
         self._first: dict[int, str] = {}
 
     def look(self, y: Array, time: str) -> None:
         """Take the outputs of a sample."""
-        for k, last in enumerate(self._last):
-            q = y[k:k + 4]
-            length = float(q @ q) ** 0.5
-            if abs(length - 1.0) <= _LENGTH:  # and not missing
-                if float(q @ last) < _OPPOSITE:
-                    self._counts[k] += 1
-                    self._first.setdefault(k, time)
-                self._last[k] = q / length
+        q = y[self._four]
+        lengths = np.sqrt((q * q).sum(axis=1))
+        seen = np.abs(lengths - 1.0) <= _LENGTH  # and not missing
+        if not seen.any():
+            return
+        turned = seen & ((q * self._last).sum(axis=1) < _OPPOSITE)
+        self._counts += turned
+        for k in np.flatnonzero(turned).tolist():
+            self._first.setdefault(k, time)
+        self._last[seen] = q[seen] / lengths[seen, None]
 
     def notes(self, file: str, names: list[str]) -> list[str]:
         """What the user should know of outputs with these names."""

@@ -17,16 +17,17 @@ _MOST_FILLED = 0.05
 class _Sparse:
     """Sparse copies of matrices of one shape, with the pattern of the one before."""
 
-    __slots__ = ("_places", "_source")
+    __slots__ = ("_made", "_places", "_source")
 
     def __init__(self) -> None:
+        from scipy.sparse import csr_array  # late: few models need it
+
+        self._made = csr_array
         self._source: NDArray[np.intp] | None = None
         self._places: Any = None
 
     def of(self, matrix: Array) -> Any:
         """The matrix in compressed rows; None if too many of its entries are not 0."""
-        from scipy.sparse import csr_array  # late: few models need it
-
         flat = matrix.reshape(-1)
         count = np.count_nonzero(flat)
         if count > _MOST_FILLED * flat.size:
@@ -35,7 +36,7 @@ class _Sparse:
             self._source = np.flatnonzero(flat)
             rows, columns = np.divmod(self._source, matrix.shape[1])
             self._places = columns, np.searchsorted(rows, np.arange(matrix.shape[0] + 1))
-        return csr_array((flat[self._source], *self._places), shape=matrix.shape)
+        return self._made((flat[self._source], *self._places), shape=matrix.shape)
 
 
 class SparseStages:

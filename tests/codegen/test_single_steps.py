@@ -12,27 +12,13 @@ from qpmhe.codegen.model_source import model_files, model_source
 from qpmhe.codegen.single import in_single_precision
 from qpmhe.codegen.templates import prologue, template
 from qpmhe.model.implicit_steps import COLLOCATIONS
+from tests.model.test_implicit_steps import arrhenius, kinetics
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 
 
 def pendulum(x):
     return [x[1], -ca.sin(x[0]) - 0.1 * x[1]]
-
-
-def reactor(x):
-    """A reaction that heats its reactor, and a jacket."""
-    reacted = 7.2e10 * ca.exp(-8750.0 / x[1]) * x[0]
-    return [
-        1.0 - x[0] - reacted, 350.0 - x[1] + 209.2 * reacted + 2.09 * (x[2] - x[1]),
-        20.0 * (300.0 - x[2]) + 10.0 * (x[1] - x[2]),
-    ]
-
-
-def kinetics(x):
-    """Robertson's."""
-    slow, fast, back = 0.04 * x[0], 3e7 * x[1] ** 2, 1e4 * x[1] * x[2]
-    return [back - slow, slow - back - fast, fast]
 
 
 def linearized(model, x, real):
@@ -61,7 +47,7 @@ def linearized(model, x, real):
 @pytest.mark.parametrize("method", list(COLLOCATIONS))
 @pytest.mark.parametrize(("rate", "low", "high", "dt", "within"), [
     (pendulum, [-1.0, -1.0], [1.0, 1.0], 0.1, 1e-6),
-    (reactor, [0.4, 340.0, 300.0], [0.6, 355.0, 320.0], 0.05, 1e-5),
+    (arrhenius, [0.4, 340.0, 300.0], [0.6, 355.0, 320.0], 0.05, 1e-5),
     (kinetics, [0.6, 1e-6, 0.01], [1.0, 5e-5, 0.2], 1.0, 1e-4),
 ], ids=["pendulum", "reactor", "robertson"])
 def test_single_precision_has_the_step_of_double_precision(rate, low, high, dt, within, method):

@@ -331,7 +331,7 @@ def test_durations_that_pandas_writes_come_back(here, step):
         for out in ("out.csv", "out.parquet"):
             estimate(DISCRETE, name, out, overwrite=True, **dt)
             assert (read(out).index == index).all()
-    assert pd.read_parquet("out.parquet")["time"].dtype == index.dtype  # that of its record
+    assert pd.read_parquet("out.parquet")["time"].dtype == index.dtype  # as the record has it
     put("seconds.csv", ["time,y1,y2", *(f"{t},{a},{b}" for t, a, b in zip(
         index.total_seconds(), SLOW, FAST, strict=False))])
     estimate(DISCRETE, "seconds.csv", **dt, overwrite=True)
