@@ -27,6 +27,8 @@ class SignChanges:
 
     def look(self, y: Array, time: str) -> None:
         """Take the outputs of a sample."""
+        if not len(self._four):
+            return
         q = y[self._four]
         lengths = np.sqrt((q * q).sum(axis=1))
         seen = np.abs(lengths - 1.0) <= _LENGTH  # and not missing
