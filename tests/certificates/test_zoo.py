@@ -6,6 +6,7 @@ import pytest
 import qpmhe
 from qpmhe.certificates import (
     Evidence,
+    NotCertifiedError,
     Sizes,
     certify_detectability,
     search,
@@ -67,6 +68,35 @@ def test_a_chain_with_a_spring_without_length_is_refused():
     chain = qpmhe.models.chain_of_masses(masses=2).system
     with pytest.raises(ModelError, match=r"f is not finite at x = .*within the region"):
         synthesise_gain(chain, box(-np.ones(chain.n), np.ones(chain.n)))
+
+
+@pytest.mark.slow
+def test_one_mass_is_proved_near_its_rest():
+    """For a tenth of the scenario's disturbances and noises."""
+    chain = qpmhe.models.chain_of_masses(masses=1)
+    system, rest = chain.system, chain.scenario.initial_state
+    for _ in range(5000):
+        rest = system.f(rest, np.zeros(system.m))
+    half = np.repeat([0.05, 0.5], 3)
+    region = qpmhe.Box(rest - half, rest + half)
+    whole = stated(chain.scenario)
+    sizes = Sizes(*(
+        qpmhe.Box(0.1 * each.lower, 0.1 * each.upper) for each in (whole.disturbance, whole.noise)))
+    found = synthesise_gain(system, region, sizes=sizes.typical, seconds=600.0)
+    bound = bound_observer(
+        system, found.observer, unit_cost(system.r, system.p), region, sizes=sizes, seconds=600.0)
+    assert bound.evidence is Evidence.PROVED
+    assert (bound.settled.box < np.repeat([0.025, 0.23], 3)).all()
+
+
+@pytest.mark.slow
+def test_no_constant_gain_contracts_on_the_quadrotors_record():
+    """A rate next to 1 is infeasible at some states; so is every smaller one on the region."""
+    made = qpmhe.models.catalogue()["quadrotor"]()
+    with pytest.raises(NotCertifiedError, match="infeasible for every rate below 1"):
+        synthesise_gain(
+            made.system, region_of(made.system, made.scenario), rho=0.9999,
+            sizes=stated(made.scenario).typical, seconds=3000.0)
 
 
 @pytest.mark.slow
