@@ -15,7 +15,7 @@ from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
-from .._checks import count, flag, numbers, positive, vector
+from .._checks import count, flag, numbers, positive
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import ConvexSet
@@ -23,13 +23,14 @@ from ..model.system import System
 from ..model.traces import warn_of
 from ..observers import Observer
 from .branches import check_branches
-from .conditions import ConditionReader, Conditions
+from .conditions import Conditions
 from .contracts import check_correction, check_observer, check_prior
 from .engines import EngineChangeError, engine_for, engine_for_record
 from .estimate import Estimate
 from .estimator_memory import EstimatorMemory
 from .reach import compared
 from .run import FixedLag, Run, RunSource
+from .sample_arguments import SampleArguments, with_parameters
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require, with_scaled_constraints
 from .step_length import TriedInputs, check_step, explosion
@@ -204,35 +205,21 @@ class MovingHorizonEstimator(EstimatorMemory):
         own = system.evaluated_by(system.model(
             cost.prior_deviations(observer.initial_covariance(), system.disturbance_matrix)
         ))
-        nominal = self.settings.parameters
-        if len(nominal) > system.m:
-            raise ShapeError(
-                f"parameters has {len(nominal)} numbers; expected at most {system.m}, the system's "
-                "known inputs: parameters are the last of these. Make the system with a larger m."
-            )
-        self._inputs = system.m - len(nominal)  # numbers in the u of `update`
-        self._usual_input = np.append(np.zeros(self._inputs), nominal)
-        self._full_input = self._usual_input.copy()  # each sample's, overwritten
-        self._reader, self._partial = ConditionReader(system, cost), np.empty(system.p)
-        self._sensors = (system.p,)
+        self._arguments = SampleArguments(system, cost, self.settings.parameters)
         self._takes_steps = False  # whether a step of another length has been tried
-        self._tried = None if is_copy or not self._inputs else TriedInputs()
+        self._tried = None if is_copy or not self._arguments.inputs else TriedInputs()
         self._step_error = 0.0  # of which the user has been warned
         # The system as this estimator evaluates it.
         self._initial_state: Array
         self._initial_state, self._own_system = self._checked_start(initial_state, own)
         self._first_state = self._initial_state  # which `reset` does not change
         if not is_copy:
-            check_correction(
-                self._own_system, observer, cost, self._initial_state, self._usual_input
-            )
-            place = cost, observer.initial_covariance(), self._initial_state, self._usual_input
+            usual = self._arguments.usual_input
+            check_correction(self._own_system, observer, cost, self._initial_state, usual)
+            place = cost, observer.initial_covariance(), self._initial_state, usual
             self._step_error = check_step(self._own_system, *place, 3)
             check_branches(self._own_system, *place, 3)
-            self._own_system = compared(
-                self._own_system, cost, observer.initial_covariance(), self._initial_state,
-                self._usual_input, horizon,
-            )
+            self._own_system = compared(self._own_system, *place, horizon)
         self._own_system = with_scaled_constraints(
             self._own_system, observer, cost, self._initial_state
         )
@@ -316,20 +303,22 @@ class MovingHorizonEstimator(EstimatorMemory):
                     "observer, cost or solver. Take another estimator there."
                 )
             caller = caller.f_back
+        arguments = self._arguments
         own: Conditions | None = None
         if sensors is not None:
-            y_array, own = self._sampled(y, sensors)
-        elif type(y) is np.ndarray and y.shape == self._sensors and y.dtype == np.float64:
+            y_array, own = arguments.sampled(y, sensors)
+        elif type(y) is np.ndarray and y.shape == arguments.outputs and y.dtype == np.float64:
             y_array = y
         else:
-            y_array = self._measurement(y)
-        needed = u is not None or parameters is not None or self._full_input.size
-        u_array = self._input(u, parameters) if needed else self._full_input
+            y_array = arguments.measurement(y)
+        u_array = arguments.input
+        if u is not None or parameters is not None or u_array.size:
+            u_array = arguments.read_input(u, parameters, self._engine.usual)
         if dt is not None:
             dt = positive("dt", dt)
             self._check_step_length(dt)
         if not (noise_weight is None and disturbance_weight is None and bounds is None):
-            found = self._reader.read(
+            found = arguments.conditions.read(
                 self._engine.usual, noise_weight=noise_weight,
                 disturbance_weight=disturbance_weight, bounds=bounds,
             )
@@ -356,7 +345,7 @@ class MovingHorizonEstimator(EstimatorMemory):
             estimator evaluates the functions as they are written from now on.
         """
         try:
-            return self._engine.verify(self._usual_input)
+            return self._engine.verify(self._arguments.usual_input)
         except EngineChangeError as change:
             self._change_engine(change)
             return False
@@ -395,66 +384,13 @@ class MovingHorizonEstimator(EstimatorMemory):
             If an argument is invalid; the estimator stays unchanged.
         """
         usual = self._engine.usual
-        changes = self._reader.read(
+        reader = self._arguments.conditions
+        changes = reader.read(
             usual, noise_weight=noise_weight, disturbance_weight=disturbance_weight,
             bounds=bounds, drop_usual=False,
         )
-        values = None if parameters is None else self._reader.parameters(parameters, usual)
+        values = None if parameters is None else reader.parameters(parameters, usual)
         return self._engine.set(changes, values)
-
-    def _measurement(self, y: ArrayLike | None) -> Array:
-        p = self.system.p
-        return np.full(p, np.nan) if y is None else vector("y", y, p, finite=False)
-
-    def _sampled(self, y: ArrayLike | None, sensors: ArrayLike) -> tuple[Array, Conditions | None]:
-        """y(t) with NaN where it was not sampled, and the conditions that say so."""
-        index, own = self._reader.sensors(sensors)
-        self._partial.fill(np.nan)
-        if y is not None:
-            if type(y) is np.ndarray and y.ndim == 1 and y.dtype == np.float64:
-                given = y
-            else:
-                given = np.atleast_1d(numbers("y", y, finite=False))
-            if given.shape != index.shape:
-                raise ShapeError(
-                    f"y has shape {given.shape}; expected {index.shape}, a component for each of "
-                    f"sensors={index.tolist()}."
-                )
-            self._partial[index] = given
-        return self._partial, own
-
-    def _input(
-        self, u: ArrayLike | None, parameters: ArrayLike | None = None, call: str = "update(y, u)"
-    ) -> Array:
-        """u(t), the parameters behind the rest."""
-        count, full = self._inputs, self._full_input
-        if u is None:
-            if count:
-                raise InvalidInputError(
-                    f"{call[-2]} is missing; the system has {count} "
-                    f"input{'s' * (count != 1)}: {call}."
-                )
-        elif count == 0:
-            beside = " beside its parameters" if self.system.m else ""
-            raise InvalidInputError(
-                f"u was given, but the system has no inputs{beside}; leave it out."
-            )
-        else:
-            full[:count] = vector("u", u, count, finite=False)
-        usual = self._engine.usual
-        if parameters is not None:
-            full[count:] = self._reader.parameters(parameters, usual)
-        elif usual.parameters is not None:
-            full[count:] = usual.parameters
-        return full
-
-    def _with_parameters(self, inputs: Array | None, samples: int) -> Array | None:
-        """The inputs of a record, with the usual parameters behind them."""
-        parameters = self._engine.usual.parameters
-        if parameters is None:
-            return inputs
-        behind = np.tile(parameters, (samples, 1))
-        return behind if inputs is None else np.hstack((inputs, behind))
 
     def check_inputs(self, inputs: ArrayLike) -> None:
         """Warn where inputs make the step of a discretised ODE too long.
@@ -475,10 +411,10 @@ class MovingHorizonEstimator(EstimatorMemory):
         ShapeError, InvalidInputError
             If they have another shape, or are no numbers.
         """
-        us = numbers("inputs", inputs, finite=False)
-        if us.ndim != 2 or us.shape[1] != self._inputs:
+        us, m = numbers("inputs", inputs, finite=False), self._arguments.inputs
+        if us.ndim != 2 or us.shape[1] != m:
             raise ShapeError(
-                f"inputs has shape {us.shape}; expected (T, {self._inputs}), a row for each time."
+                f"inputs has shape {us.shape}; expected (T, {m}), a row for each time."
             )
         self._check_inputs(us, 3)
 
@@ -486,7 +422,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         if self._tried is None:
             return
         tried = self._tried.new(us)
-        whole = self._with_parameters(tried, len(tried))
+        whole = with_parameters(tried, len(tried), self._engine.usual)
         if whole is not None and len(tried):
             self._step_error = check_step(
                 self._own_system, self.cost, self.observer.initial_covariance(),
@@ -510,13 +446,14 @@ class MovingHorizonEstimator(EstimatorMemory):
         finite = np.isfinite(estimate.candidate).all(axis=1)
         return explosion(
             self._own_system, self.cost, self.observer.initial_covariance(),
-            (self._initial_state, *estimate.candidate[finite]), self._full_input,
+            (self._initial_state, *estimate.candidate[finite]), self._arguments.input,
         )
 
     def _check_step_length(self, dt: float) -> None:
         """Check once, before a sample is taken, that the model takes step lengths."""
         if not self._takes_steps:
-            self._engine.system.timed.at(self._initial_state, np.append(self._usual_input, dt))
+            inputs = np.append(self._arguments.usual_input, dt)
+            self._engine.system.timed.at(self._initial_state, inputs)
             self._takes_steps = True
 
     def amend(self, time: int, y: ArrayLike) -> Estimate:
@@ -550,7 +487,7 @@ class MovingHorizonEstimator(EstimatorMemory):
                 f"time is {shown(time)}; expected an integer from {oldest} to {newest}, the "
                 "samples in the window. Take a longer horizon for later measurements."
             )
-        return self._engine.amend(index, self._measurement(y))
+        return self._engine.amend(index, self._arguments.measurement(y))
 
     def run(
         self,
@@ -610,13 +547,13 @@ class MovingHorizonEstimator(EstimatorMemory):
                 remedy=" A window of N samples has lags of up to N - 1.",
             )
         ys, us, lengths, index, _ = paired_record(
-            self.system, measurements, inputs, self._inputs, time_unit
+            self.system, measurements, inputs, self._arguments.inputs, time_unit
         )
-        if us is None and self._inputs:
-            self._input(None, call="run(Y, U)")
+        if us is None and self._arguments.inputs:
+            self._arguments.read_input(None, None, self._engine.usual, "run(Y, U)")
         if us is not None:
             self._check_inputs(us, 3)
-        whole = self._with_parameters(us, len(ys))
+        whole = with_parameters(us, len(ys), self._engine.usual)
         at_once, reason = None, ""
         if may_compile:
             self._engine, reason = engine_for_record(

@@ -22,6 +22,7 @@ from ..terms.hold import WindowHold
 from .conditions import Conditions
 from .engines import Engine, engine_of_snapshot
 from .problem import Solved
+from .sample_arguments import SampleArguments
 from .settings import Settings
 from .start import check_start, inside
 
@@ -42,10 +43,9 @@ class EstimatorMemory:
     cost: Cost
     settings: Settings
     _engine: Engine
-    _inputs: int
     _initial_state: Array
     _first_state: Array
-    _usual_input: Array
+    _arguments: SampleArguments
     _own_system: System
 
     def _checked_start(
@@ -53,7 +53,7 @@ class EstimatorMemory:
     ) -> tuple[Array, System]:
         state = vector("initial_state", initial_state, system.n)
         return check_start(
-            system, self.observer, self.cost, state, u=self._usual_input,
+            system, self.observer, self.cost, state, u=self._arguments.usual_input,
             metric=self.settings.projection_metric,
         )
 
@@ -117,7 +117,7 @@ class EstimatorMemory:
     @property
     def inputs(self) -> int:
         """Number of inputs in the ``u`` of `update`: the system's inputs without the parameters."""
-        return self._inputs
+        return self._arguments.inputs
 
     @property
     def scaled_constraints(self) -> ConstraintFunctions | None:
