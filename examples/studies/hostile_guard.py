@@ -233,6 +233,7 @@ def many(name: str, runs: int, hostile: int, steps: int = 25, checked: int = 2) 
         if share > 1.0 + 1e-9:
             raise SystemExit(f"{name}: an error is {share} times its bound")
         alive &= bound.region.contains(z)
+        x[~alive] = z[~alive] = points[-1, :n]  # these count no more, and may not overflow
         if t < steps - checked:
             continue
         left = np.flatnonzero(alive)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
+from timeit import repeat
 from typing import Annotated
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -22,11 +24,15 @@ from ..costs import QuadraticCost
 from ..errors import QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.step_length import step_errors
+from ..model.system import System
 from ..models import catalogue
 from ..observers import Luenberger
 from ..records.record_model import load_record_model
 from ..studies.environment import environment
 
+Array = NDArray[np.float64]
+# Steps that are timed; the least time counts.
+_TRIALS = 20
 _GOOD, _BAD = "[green]ok[/]", "[yellow]--[/]"
 
 
@@ -48,7 +54,7 @@ def doctor(
         table.add_column(name, no_wrap=name != "model", overflow="fold")
     table.add_column("because")
     steps = _plain("Steps of models in continuous time, and their errors in sigma of w")
-    for name in ("model", "method", "substeps", "error", "expected"):
+    for name in ("model", "method", "substeps", "error", "expected", "time in Python"):
         steps.add_column(name, no_wrap=name != "model", overflow="fold")
     for model in models or catalogue():
         with console.status(f"trying {escape(model)}"):
@@ -91,11 +97,26 @@ def _steps(estimator: MovingHorizonEstimator) -> list[tuple[str, ...]]:
         np.zeros(system.m),
     ):
         color = "default" if error.is_harmless else "yellow"
+        own = how == system.origin.how
         rows.append((
             how.method, str(how.steps), f"[{color}]{error.deviations:.2g}[/]",
             f"at most {error.most:g}",
+            _time(system if own else system.discretized(*how), estimator.initial_state),
         ))
-    return rows or [(f"{system.method}", f"{system.steps}", "unknown", "")]
+    return rows or [(
+        f"{system.method}", f"{system.steps}", "unknown", "",
+        _time(system, estimator.initial_state),
+    )]
+
+
+def _time(system: System | None, x: Array) -> str:
+    """How long one step takes, as an estimator evaluates it."""
+    if system is None:
+        return ""
+    made, u = system.evaluated_by(system.model()), np.zeros(system.m)
+    with np.errstate(all="ignore"):
+        best = min(repeat(lambda: made.f(x, u), number=1, repeat=_TRIALS))
+    return f"{1e6 * best:.3g} us"
 
 
 def _machine() -> Table:

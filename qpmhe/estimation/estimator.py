@@ -336,7 +336,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         both when it is made; later where values that the functions read have changed, at which it
         looks before the samples; and, without ``time_budget``, at each 1000th sample. This method
         compares them at the present state and at points of several magnitudes, whatever has
-        changed, in some hundred microseconds.
+        changed, in some hundred microseconds. It also warns where the step of a discretised ODE is
+        too long from the present state, with the newest inputs.
 
         Returns
         -------
@@ -344,6 +345,10 @@ class MovingHorizonEstimator(EstimatorMemory):
             Whether they agree. If not, an `EngineWarning` names the function and the point, and the
             estimator evaluates the functions as they are written from now on.
         """
+        self._step_error = check_step(
+            self._own_system, self.cost, self.observer.initial_covariance(), self.state,
+            self._arguments.input, 2, self._step_error,
+        )
         try:
             return self._engine.verify(self._arguments.usual_input)
         except EngineChangeError as change:

@@ -34,6 +34,7 @@ from .system_arguments import (
     tried_functions,
 )
 from .traces import ModelTrace
+from .unsolved_step import unsolved_step
 
 Array = NDArray[np.float64]
 Function = Callable[..., Any]
@@ -305,7 +306,13 @@ class System(ContinuousTime):
         """
         if self.origin.equations is not None:
             self.origin.equations.check(x, u[: self.m - self.origin.is_timed])
-        model = self.evaluation.at(x, u)
+        try:
+            model = self.evaluation.at(x, u)
+        except ModelError as error:
+            reason = unsolved_step(self.origin, x, u)
+            if not reason:
+                raise
+            raise ModelError(reason) from error
         found = self if model is self.evaluation else self.evaluated_by(model)
         if self.constraints is not None:
             constraints = self.constraints.copy()

@@ -153,6 +153,8 @@ def test_doctor_says_what_there_is_and_what_each_model_runs(here, monkeypatch):
     (row,) = [one.split() for one in answer.output.splitlines() if "at most" in one]
     assert row[:3] == ["cstr", "rk4", "1"]
     assert 0.0 <= float(row[3]) < 0.1
+    assert row[-1] == "us"
+    assert float(row[-2]) > 0.0
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell script")

@@ -284,3 +284,17 @@ def test_the_error_at_inputs_is_that_of_a_system_whose_inputs_they_are():
     assert found.inputs.tolist() == [40.0]
     assert found.deviations == pytest.approx(expected.deviations, rel=1e-9)
     assert np.array_equal(found.point, expected.point)
+
+
+def test_verify_looks_at_the_step_from_the_present_state():
+    """x' = -x^3 is slow near 0, where the estimator is made, and fast at 1.9."""
+    system = qpmhe.System.from_ode(lambda x: -x**3, lambda x: x, dt=0.5, n=1, p=1)
+    cost = qpmhe.QuadraticCost(prior=[[100.0]], disturbance=[[100.0]], noise=[[1.0]])
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([[0.9]]), cost, horizon=5, initial_state=[0.1])
+    assert mhe.verify()
+    mhe.reset([1.9])
+    with pytest.warns(qpmhe.ModelWarning, match="one step of rk4 in dt = 0.5 is too long") as seen:
+        assert mhe.verify()
+    assert seen[0].filename == __file__
+    assert mhe.verify()  # no news

@@ -734,11 +734,19 @@ def test_batches():
     np.testing.assert_allclose(found.states[1], expected, rtol=0, atol=1e-12)
 
 
-def test_certificates_refuse_algebraic_states():
+def test_certificates_of_algebraic_states_rest_on_samples():
+    from qpmhe.certificates import Evidence, certify_observer
     from qpmhe.certificates.reading import expression_of
 
     for name in ("f", "h"):
         assert "algebraic states" in expression_of(cubic_system(), name).reason
+    system = System.from_dae(
+        lambda x, z: -z, lambda x, z: z + 0.1 * z**3 - x, lambda x, z: x, dt=0.1, n=1, k=1, p=1,
+        algebraic_guess=[0.0],
+    )
+    found = certify_observer(system, qpmhe.Luenberger([[0.1]]), qpmhe.Box([-1.0], [1.0]))
+    assert found.evidence is Evidence.SAMPLED
+    assert any("algebraic states" in note for note in found.notes)
 
 
 # Bad input.
@@ -829,6 +837,25 @@ def test_an_estimator_says_where_the_guess_leads_to_another_branch(guess, deviat
     assert not found or "at x = [-10.], a point of the prior" in texts[0]
 
 
+@pytest.mark.parametrize(("deviation", "found"), [(0.5, False), (2.0, True)])
+def test_an_estimator_says_where_the_prior_reaches_beyond_a_fold(deviation, found):
+    """z^2 = x has no solution at x = -1, which is within the prior of 1 by 2 alone."""
+    system = System.from_dae(
+        lambda x, z: -0.1 * x, lambda x, z: z**2 - x, lambda x, z: z, dt=0.1, n=1, k=1, p=1,
+        algebraic_guess=[1.0],
+    )
+    cost = QuadraticCost(
+        prior=[[deviation**-2]], disturbance=[[1.0]], noise=[[1.0]])
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        MovingHorizonEstimator(
+            system, qpmhe.Luenberger([[0.1]]), cost, horizon=3, initial_state=[1.0])
+    texts = [str(one.message) for one in seen if "the prior" in str(one.message)]
+    assert len(texts) == found
+    assert not found or (
+        "no solution at x = [-1.0]" in texts[0] and "equation 0" in texts[0])
+
+
 @pytest.mark.parametrize("make", [
     lambda **o: qpmhe.System.from_ode(lambda x: -x, lambda x: x, dt=0.1, n=1, p=1, **o),
     lambda **o: qpmhe.System.from_implicit(lambda d, x: d + x, lambda x: x, dt=0.1, n=1, p=1, **o),
@@ -841,6 +868,38 @@ def test_an_option_that_does_not_exist_is_refused(make):
     make(states=qpmhe.Box([0.0], [1.0]))
     with pytest.raises(qpmhe.errors.OptionError, match=r"no option 'statess'.*Did you mean states"):
         make(statess=qpmhe.Box([0.0], [1.0]))
+
+
+GROWING = "Newton's method finds no stages of {} with 1 substep in dt = 1 at .*{} is the farthest"
+
+
+def of_ode(rate, n, method):
+    return System.from_ode(rate, lambda x: x[..., :1], dt=1.0, n=n, p=1, method=method)
+
+
+@pytest.mark.parametrize(("make", "words", "start"), [
+    (lambda: of_ode(lambda x: np.stack([1e3 * x[..., 0]**2 + 1e6, -x[..., 1]], -1), 2, "radau"),
+     GROWING.format("radau", r"the rate of x\[0\]"), [0.5, 0.2]),
+    (lambda: of_ode(lambda x: np.stack([-x[..., 0], 1e3 * x[..., 1]**2 + 1e6], -1), 2, "midpoint"),
+     GROWING.format("midpoint", r"the rate of x\[1\]"), [0.5, 0.2]),
+    (lambda: of_ode(lambda x: np.sqrt(x - 1.0), 1, "radau"),
+     r"the rate is \[nan\] at the initial state \[0.5\]", [0.5]),
+    (lambda: System.from_dae(
+        lambda x, z: -1.0 + 0.0 * x, lambda x, z: z**2 - x, lambda x, z: x, dt=0.1, n=1, k=1, p=1,
+        algebraic_guess=[1.0]), "algebraic equation 0 is the farthest.*a fold", [0.05]),
+    (lambda: System.from_implicit(
+        lambda d, x: d - 1e3 * x**2 - 1e6, lambda x: x, dt=1.0, n=1, p=1),
+     "finds no stages of radau", [0.5]),
+], ids=["first", "second", "rate", "fold", "implicit"])
+def test_steps_without_stages_are_named_at_construction(make, words, start):
+    system = make()
+    cost = QuadraticCost(prior=np.eye(system.n), disturbance=np.eye(system.n), noise=[[1.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", qpmhe.ModelWarning)
+        with pytest.raises(ModelError, match=words):
+            MovingHorizonEstimator(
+                system, qpmhe.Luenberger(np.zeros((system.n, 1))), cost, horizon=3,
+                initial_state=start)
 
 
 def test_equations_that_raise_are_named_at_construction():
