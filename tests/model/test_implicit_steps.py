@@ -78,6 +78,28 @@ def test_the_error_falls_with_the_order(method):
     assert slopes.min() > ORDERS[method] - 0.4, slopes
 
 
+@pytest.mark.parametrize(("kind", "options", "within"), [
+    ("cvodes", {"reltol": 1e-11, "abstol": 1e-13}, 1e-8),
+    # The same stages, of one element; then elements of which each is a substep.
+    ("collocation", {"collocation_scheme": "radau", "interpolation_order": 3,
+                     "number_of_finite_elements": 1}, 1e-13),
+    ("collocation", {"collocation_scheme": "radau", "interpolation_order": 3,
+                     "number_of_finite_elements": 4}, 1e-13),
+], ids=["cvodes", "one element", "four elements"])
+def test_the_step_against_casadis_integrators(kind, options, within):
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    ode = ca.vertcat(x[1], u - ca.sin(x[0]) - 0.1 * x[1])
+    if kind == "collocation":
+        options = options | {
+            "rootfinder": "newton", "rootfinder_options": {"abstol": 1e-14, "abstolStep": 1e-14}}
+    step = ca.integrator("step", kind, {"x": x, "p": u, "ode": ode}, 0.0, 0.5, options)
+    expected = step(x0=[1.0, 0.3], p=0.2)["xf"].full().ravel()
+    steps = options.get("number_of_finite_elements", 16)
+    found = system(pendulum, 2, 1, dt=0.5, method="radau", steps=steps).f(
+        np.array([1.0, 0.3]), np.array([0.2]))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=within)
+
+
 @pytest.mark.parametrize("kind", ["traced", "called"])
 @pytest.mark.parametrize(("rate", "x", "dt", "steps", "within"), [
     (robertson, [1.0, 0.0, 0.0], 1.0, 4, 1e-7),  # the first millisecond is not resolved
