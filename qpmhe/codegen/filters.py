@@ -71,24 +71,33 @@ class FilterLibrary:
         self._library = library
 
     def _files(self, model: CasadiModel) -> dict[str, str]:
-        """Functions of (z, u with the step's length) to f or h and the nonzeros of its Jacobian."""
-        ca, m = import_casadi(), model.m
-        z, u = ca.SX.sym("z", model.n), ca.SX.sym("u", m + 1)
-        values = {"step": model.step()(z, u[:m], u[m]), "output": model.h(z, u[:m])}
+        """Functions of (z, u with the step's length) to f or h and the nonzeros of its Jacobian.
+
+        An implicit step is C: then of (w, u) to the rate or h, for the adjoint alone.
+        """
+        ca, m, implicit = import_casadi(), model.m, model.is_implicit
+        z, u = ca.SX.sym("z", model.width), ca.SX.sym("u", m if implicit else m + 1)
+        values = (
+            {"rate": model.f(z, u), "shown": model.h(z, u)} if implicit
+            else {"step": model.step()(z, u[:m], u[m]), "output": model.h(z, u[:m])}
+        )
         functions, slopes = {}, {}
-        for (name, value), letter in zip(values.items(), "AC", strict=True):
+        letters = values if implicit else "AC"
+        for (name, value), letter in zip(values.items(), letters, strict=True):
             slope = slopes[letter] = ca.jacobian(value, z)
             entries = ca.sparsity_cast(slope, ca.Sparsity.dense(slope.nnz(), 1))
             results = [ca.densify(value), ca.densify(entries)]
             functions[name] = ca.Function(f"mhe_casadi_{name}", [z, u], results)
-        functions.update(self._further(functions))
-        operations = sum(one.n_instructions() for one in functions.values())
+        further = self._further(functions)
+        operations = sum(one.n_instructions() for one in (*functions.values(), *further.values()))
         if operations > MOST_OPERATIONS:
             raise CompilationError(
                 f"the filter's model has {operations} operations, more than {MOST_OPERATIONS}, "
                 "which would keep a compiler busy for longer than they save."
             )
-        return filter_files(model, self.part, functions, slopes)
+        if implicit:
+            functions = {}
+        return filter_files(model, self.part, functions | further, slopes)
 
     def _further(self, functions: dict[str, Any]) -> dict[str, Any]:
         """Further functions of the model."""
@@ -108,12 +117,14 @@ class LikelihoodLibrary(FilterLibrary):
     def _further(self, functions: dict[str, Any]) -> dict[str, Any]:
         """The derivative by z and u of all values and nonzeros, times what follows z."""
         ca = import_casadi()
-        z, u = (ca.SX.sym(name, functions["step"].numel_in(k)) for k, name in enumerate("zu"))
+        first = next(iter(functions.values()))
+        z, u = (ca.SX.sym(name, first.numel_in(k)) for k, name in enumerate("zu"))
         results = [one for each in functions.values() for one in each(z, u)]
         seeds = [ca.SX.sym("by", one.numel()) for one in results]
         total = sum((ca.dot(*pair) for pair in zip(seeds, results, strict=True)), ca.SX(0))
         back = [ca.densify(ca.gradient(total, one)) for one in (z, u)]
-        return {"back": ca.Function("mhe_casadi_back", [ca.vertcat(z, *seeds), u], back)}
+        name = "back" if "step" in functions else "pull"
+        return {name: ca.Function(f"mhe_casadi_{name}", [ca.vertcat(z, *seeds), u], back)}
 
     def costs(self, given: LikelihoodInput) -> Array:
         """The cost of each sample (T,)."""
@@ -221,8 +232,11 @@ def _structure(kind: Any, given: Any) -> tuple[Any, list[Any]]:
 
 
 def scalar_model(model: CasadiModel | None) -> CasadiModel | None:
-    """The model with f and h as scalar expressions; None where a step is no such expression."""
-    if model is None or model.is_implicit:
+    """The model with f and h as scalar expressions; None where they are none.
+
+    With implicit steps, f is the rate.
+    """
+    if model is None:
         return None
     model = replace(model, f=in_scalars(model.f), h=in_scalars(model.h))
     return model if model.f.is_a("SXFunction") and model.h.is_a("SXFunction") else None

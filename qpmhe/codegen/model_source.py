@@ -51,25 +51,7 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
     _check_solvers(model)
     ca = import_casadi()
     generator = _generator("mhe_model.c")
-    calls = []
-    for which in ("f", "h"):
-        function = getattr(model, which)
-        name = f"mhe_casadi_{which}"
-        named = _named(ca, function, name, model.width, model.m)
-        generator.add(named)
-        calls.append(_call(f"mhe_call_{which}", name, named))
-        slopes, places = model.with_jacobian(which)
-        name = f"mhe_casadi_{which}_jacobian"
-        named = _named(ca, slopes, name, model.width, model.m)
-        generator.add(named)
-        calls.append(_call(f"mhe_call_{which}_jacobian", name, named))
-        if which == "f" and model.is_implicit and not model.guess:
-            continue  # its nonzeros are those of the flows
-        listed = ", ".join(str(place) for place in places) or "0"
-        calls.append(
-            f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
-            f"static const int mhe_{which}_place[] = {{{listed}}};\n"
-        )
+    calls = _function_calls(ca, generator, model)
     for which, *sizes in (
         ("output_residual", model.p, model.p), ("state_residual", model.n, model.n),
         ("correction", model.n, model.p),
@@ -106,6 +88,30 @@ def model_source(model: CasadiModel, single: bool = False) -> str:
     return "\n".join((
         *_quieted(code, single), *calls, *_model_parts(model, single), *_algebraic_set(model),
     ))
+
+
+def _function_calls(ca: Any, generator: Any, model: CasadiModel) -> list[str]:
+    """C functions of (x, u) to f and h, and to their Jacobians."""
+    calls = []
+    for which in ("f", "h"):
+        function = getattr(model, which)
+        name = f"mhe_casadi_{which}"
+        named = _named(ca, function, name, model.width, model.m)
+        generator.add(named)
+        calls.append(_call(f"mhe_call_{which}", name, named))
+        slopes, places = model.with_jacobian(which)
+        name = f"mhe_casadi_{which}_jacobian"
+        named = _named(ca, slopes, name, model.width, model.m)
+        generator.add(named)
+        calls.append(_call(f"mhe_call_{which}_jacobian", name, named))
+        if which == "f" and model.is_implicit and not model.guess:
+            continue  # its nonzeros are those of the flows
+        listed = ", ".join(str(place) for place in places) or "0"
+        calls.append(
+            f"#define MHE_{which.upper()}_NONZEROS {len(places)}\n"
+            f"static const int mhe_{which}_place[] = {{{listed}}};\n"
+        )
+    return calls
 
 
 def _quieted(code: str, single: bool) -> tuple[str, ...]:
@@ -392,19 +398,40 @@ def filter_files(
     """Source of a library that filters records, in double precision.
 
     Of the functions and the Jacobians whose nonzeros they have, by name; `FilterLibrary` makes
-    them, and names the part.
+    them, and names the part. Those of a model with implicit steps are the derivatives alone, if
+    any: the rest is C.
     """
-    generator = _generator("mhe_filter.c")
-    calls = []
+    ca, generator = import_casadi(), _generator("mhe_filter.c")
+    calls, parts = [], []
+    if model.is_implicit:
+        calls, parts = _function_calls(ca, generator, model), _implicit_filter_parts(model)
     for name, function in functions.items():
         generator.add(function)
         calls.append(_call(f"mhe_call_{name}", function.name(), function))
     for name, slope in slopes.items():
         calls += _tables(name, *slope.sparsity().get_triplet())
+    if model.is_implicit and functions:
+        assert model.how is not None
+        name = "mhe_f_jacobian" if model.how.steps == 1 else "mhe_substep_jacobian"
+        parts += [
+            template("back_functions.c"),
+            template("back_algebraic.c" if model.guess else "back_rate.c"),
+            filled("back_implicit", {"steps": model.how.steps, "slope": name}),
+        ]
     return {f"{part}.c": "\n".join((
         _sizes(model), *_quieted(_bare(generator.dump()), False), *calls, template("algebra.c"),
-        template(f"{part}.c"),
+        *parts, template(f"{part}.c"),
     ))}
+
+
+def _implicit_filter_parts(model: CasadiModel) -> list[str]:
+    """The steps and outputs of a model with implicit steps, as filters call them."""
+    n, p = model.n, model.p
+    tables = [
+        line for name, rows in (("A", n), ("C", p))
+        for line in _tables(name, np.repeat(np.arange(rows), n).tolist(), [*range(n)] * rows)
+    ]
+    return [*tables, *_model_parts(model, False), template("filter_implicit.c")]
 
 
 def _generator(name: str) -> Any:
