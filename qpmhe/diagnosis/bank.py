@@ -36,6 +36,8 @@ _GAP = 10
 # compiler for a library and for each of the model's operations, roughly; a library is compiled
 # where it saves so many times as much.
 _RUNNING, _ENTRY, _LIBRARY, _COMPILING, _PAYS = 8e-6, 1e-7, 0.5, 4e-3, 3.0
+# The first and the third where steps are implicit.
+_IMPLICIT_RUNNING, _IMPLICIT_LIBRARY = 2e-4, 3.0
 # Samples on which both filters are compared, and the difference that is no rounding.
 _COMPARED, _ROUNDING = 40, 1e-6
 # Of systems that were asked for one, by the filters' kind; None where it was not to be had.
@@ -379,8 +381,8 @@ class FilterBank:
         lengths = [] if self._is_timed else [np.full(len(inputs), self.system.dt or 0.0)]
         return np.column_stack((inputs, *lengths))
 
-    def _model_in_c(self, model: CasadiModel) -> CasadiModel:
-        """What is compiled of the system's model."""
+    def _model_in_c(self, model: CasadiModel) -> CasadiModel | None:
+        """What is compiled of the system's model; None if nothing."""
         return model
 
     def _compiled(self, one: Hypothesis) -> HypothesisLibrary | None:
@@ -398,19 +400,25 @@ class FilterBank:
         model = scalar_model(system.evaluated_by(system.model()).symbolic)
         if model is None:
             return None
-        model = self._model_in_c(model)
-        operations = model.step().n_instructions() + model.h.n_instructions()
-        saved = self._filters * len(one.measurements) * (_RUNNING + _ENTRY * self.n**2)
-        if saved < _PAYS * (_LIBRARY + operations * _COMPILING):
+        implicit = model.is_implicit
+        found = self._model_in_c(model)
+        if found is None:
+            return None
+        model = found
+        step = model.f if implicit else model.step()
+        operations = step.n_instructions() + model.h.n_instructions()
+        running = (_IMPLICIT_RUNNING if implicit else _RUNNING) + _ENTRY * self.n**2
+        library = (_IMPLICIT_LIBRARY if implicit else _LIBRARY) + operations * _COMPILING
+        if self._filters * len(one.measurements) * running < _PAYS * library:
             return None
         part = one.first(_COMPARED)
 
         def fault(library: HypothesisLibrary) -> str:
-            found = self._run_in_c(library, [part], part)
-            if found is None:
+            filtered = self._run_in_c(library, [part], part)
+            if filtered is None:
                 return "the filter fails"
             for got, true in zip(
-                vars(found).values(), vars(self._run_in_numpy([part], part)).values(), strict=True
+                vars(filtered).values(), vars(self._run_in_numpy([part], part)).values(), strict=True
             ):
                 size = np.abs(np.nan_to_num(true)).max(axis=0)
                 if not (np.abs(np.nan_to_num(got - true)) <= _ROUNDING * size).all():

@@ -91,11 +91,13 @@ class MemoryBank(FilterBank):
 
         return following, outputs, following_jacobian, outputs_jacobian
 
-    def _model_in_c(self, model: CasadiModel) -> CasadiModel:
+    def _model_in_c(self, model: CasadiModel) -> CasadiModel | None:
         """A map of (x, s), with the length of the step behind the inputs, and then a, b, c and d.
 
-        b and c are matrices, and d has a number for each sensor.
+        b and c are matrices, and d has a number for each sensor. None where a step is implicit.
         """
+        if model.is_implicit:
+            return None
         ca, n, m, memories = import_casadi(), model.n, model.m, len(self._sensors)
         which = self._pattern
         z, u, a = ca.SX.sym("z", n + memories), ca.SX.sym("u", m + 1), ca.SX.sym("a", memories)

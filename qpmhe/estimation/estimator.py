@@ -612,3 +612,18 @@ class MovingHorizonEstimator(EstimatorMemory):
 
 
 _UPDATE = MovingHorizonEstimator.update.__code__
+
+
+def reweighted(
+    known: MovingHorizonEstimator, observer: Observer, cost: Cost
+) -> MovingHorizonEstimator:
+    """An estimator as a known one was at first, with another observer and cost.
+
+    Neither the model nor the length of its steps is tried again, and no warning is given twice.
+    """
+    made = MovingHorizonEstimator.__new__(MovingHorizonEstimator)
+    made.settings = known.settings
+    made.__init__(  # type: ignore[misc]  # as `__setstate__` does
+        known.system, observer, cost, initial_state=known.initial_state, **vars(known.settings)
+    )
+    return made

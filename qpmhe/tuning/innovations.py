@@ -21,6 +21,8 @@ _LAGS, _SURE, _MATTERS = 10, 1e-4, 0.1
 # Deviations beyond which an innovation is outlying, the share of them that matters (of normal ones
 # 1 in 16,000 is that far off), and how many there are at least.
 _OUTLYING, _SHARE, _FEW = 4.0, 2e-3, 3
+# One filter alone takes NumPy as long as so many of those that run together.
+_ALONE = 10
 # Of deviations of a filter that outliers have made too large, the threshold that is proposed.
 _THRESHOLD = 1.5
 
@@ -107,7 +109,7 @@ def innovations_of(
             weights.prior,
         )
         with np.errstate(all="ignore"):
-            found = FilterBank(system, one.dt).run([hypothesis])
+            found = FilterBank(system, one.dt, filters=_ALONE * len(data)).run([hypothesis])
         if not np.isfinite(found.logs).all():
             return None
         there = np.isfinite(found.innovations)

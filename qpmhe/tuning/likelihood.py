@@ -28,10 +28,14 @@ _GRADIENTS = 20
 # Seconds that a value and its gradient take CasADi's machine for a sample, and for each of the
 # step's operations; and a compiler for a library, and for each of the model's operations, roughly.
 _SAMPLE, _RUNNING, _LIBRARY, _COMPILING = 5e-6, 1.2e-8, 0.5, 1e-2
+# The same of NumPy where steps are implicit, for a value and its differences.
+_IMPLICIT_SAMPLE, _IMPLICIT_LIBRARY = 5e-3, 3.0
 # A library is compiled where it saves so many times the seconds that it takes.
 _PAYS = 3.0
-# Samples on which both filters are compared, and the difference that is no rounding.
+# Samples on which both filters are compared, the difference that is no rounding, and of differences
+# over such shares of a covariance.
 _COMPARED, _ROUNDING = 40, 1e-6
+_SHARE, _OF_DIFFERENCES = 1e-4, 1e-4
 
 
 class Likelihood:
@@ -53,7 +57,7 @@ class Likelihood:
     For a traced system, the gradient is exact, from one backward sweep through the filter. For
     others, it consists of central differences; the filter runs for all of them at once.
 
-    `compile` has both sweeps done in C from then on.
+    `compile` has both sweeps done in C from then on, also where steps are implicit.
     """
 
     def __init__(
@@ -82,7 +86,7 @@ class Likelihood:
         if self._remade:  # another system at each point would be another library
             return
         one = self._filter(self.structure.first)
-        if one is None or not one.traced or (python_only() and not always):
+        if one is None or one.model is None or (python_only() and not always):
             return
         samples = sum(map(len, self.data))
         if always or one.saves(samples * _GRADIENTS * self.structure.seen):
@@ -126,7 +130,7 @@ class Likelihood:
         chosen = chosen or self.tuned
         weights = structure.weights(theta)
         made = self._filter(weights)
-        if made is not None and made.traced:
+        if made is not None and made.has_adjoint:
             value, slopes, behind = made.adjoint(weights, self.data, chosen)
             begin = structure.covariances if self._remade else structure.seen
             by = np.zeros(len(structure.parameters)) if self._remade else behind
@@ -179,7 +183,7 @@ class Likelihood:
 
 
 class _Filter:
-    """The filter of one system, in CasADi where it is traced and in NumPy where it is not."""
+    """The filter of one system, in CasADi where a step is an expression, else in NumPy; or in C."""
 
     def __init__(self, system: System, weights: Weights, threshold: float | None) -> None:
         self._system = system.evaluated_by(
@@ -191,17 +195,22 @@ class _Filter:
         self._back: dict[int, Any] = {}
         self._step: Any = None
         self._library: LikelihoodLibrary | None = None
-        self._model = scalar_model(self._system.symbolic)
+        #: f and h as scalar expressions, of which C can be made; None where there are none.
+        self.model = scalar_model(self._system.symbolic)
         residual = system.output_residual
         self._periods = np.zeros(system.p)
         if residual is not None and residual.periods is not None:
             self._periods[list(residual.components)] = residual.periods
-        self.traced = self._model is not None and (
-            residual is None or residual.periods is not None
-        )
-        if self.traced:
+        if residual is not None and residual.periods is None:
+            self.model = None
+        if self.model is not None and not self.model.is_implicit:
             self._step = _symbolic_step(
-                self._model, self._periods, self._clip, self._threshold)
+                self.model, self._periods, self._clip, self._threshold)
+
+    @property
+    def has_adjoint(self) -> bool:
+        """Whether `adjoint` is there."""
+        return self._step is not None or self._library is not None
 
     def _covariances(self, weights: Weights) -> tuple[Array, Array, Array]:
         entering = self._system.state_covariance(weights.disturbance)
@@ -209,47 +218,87 @@ class _Filter:
 
     def costs(self, settings: list[Weights], one: Data) -> Array:
         """Costs (T, B) of a record at B settings."""
-        if not self.traced:
-            return self._run_together(settings, one)
         if self._library is not None:
             given = [self._record(weights, one) for weights in settings]
             return np.stack([self._library.costs(each) for each in given], axis=1)
+        if self._step is None:
+            return self._run_together(settings, one)
         return np.stack([self._forward(weights, one)[2] for weights in settings], axis=1)
 
     # In C
 
     def saves(self, passes: int) -> bool:
         """Whether C saves time where so many samples pass, forwards and back."""
-        model = self._model
+        model = self.model
         assert model is not None
+        if self._step is None:
+            return passes * _IMPLICIT_SAMPLE > _PAYS * _IMPLICIT_LIBRARY
         within = model.step().n_instructions() + model.h.n_instructions()
         running = passes * (_SAMPLE + self._step.n_instructions() * _RUNNING)
         return bool(running > _PAYS * (_LIBRARY + within * _COMPILING))
 
     def compile(self, weights: Weights, one: Data) -> None:
-        """Compile the filter, compared with CasADi's on the first samples of a record."""
+        """Compile the filter, compared with the one that there is on a record's first samples."""
         first = one.first(_COMPARED)
         chosen = np.ones(len(first), np.bool_)
+        compared = self._compared_with_numpy if self._step is None else self._compared_with_casadi
 
         def fault(library: LikelihoodLibrary) -> str:
-            expected = self._adjoint_in_casadi(weights, first, chosen)
-            if not np.isfinite(expected[0]):
-                return "the likelihood of the first samples is not finite, and cannot be compared"
-            self._library = library
-            found = self._adjoint_in_c(weights, first, chosen)
-            self._library = None
-            scales = [_scales(one) for one in self._covariances(weights)]
-            for got, true in zip(map(np.asarray, found), map(np.asarray, expected), strict=True):
-                if true.ndim == 2:  # of symmetric matrices, in their own units
-                    scale = scales.pop(0)
-                    got, true = scale * (got + got.T), scale * (true + true.T)
-                if not (abs(got - true) <= _ROUNDING * abs(true).max(initial=0.0)).all():
-                    return "the likelihood, or its slope, is not the one of CasADi's interpreter"
-            return ""
+            try:
+                return compared(library, weights, first, chosen)
+            finally:
+                self._library = None
 
-        model = self._model
-        assert model is not None
-        self._library = LikelihoodLibrary(model, fault)
+        assert self.model is not None
+        self._library = LikelihoodLibrary(self.model, fault)
+
+    def _compared_with_casadi(
+        self, library: LikelihoodLibrary, weights: Weights, first: Data, chosen: Mask
+    ) -> str:
+        """What is wrong with a library; blank if nothing."""
+        expected = self._adjoint_in_casadi(weights, first, chosen)
+        if not np.isfinite(expected[0]):
+            return "the likelihood of the first samples is not finite, and cannot be compared"
+        self._library = library
+        found = self._adjoint_in_c(weights, first, chosen)
+        scales = [_scales(one) for one in self._covariances(weights)]
+        for got, true in zip(map(np.asarray, found), map(np.asarray, expected), strict=True):
+            if true.ndim == 2:  # of symmetric matrices, in their own units
+                scale = scales.pop(0)
+                got, true = scale * (got + got.T), scale * (true + true.T)
+            if not (abs(got - true) <= _ROUNDING * abs(true).max(initial=0.0)).all():
+                return "the likelihood, or its slope, is not the one of CasADi's interpreter"
+        return ""
+
+    def _compared_with_numpy(
+        self, library: LikelihoodLibrary, weights: Weights, first: Data, chosen: Mask
+    ) -> str:
+        """The same where steps are implicit: values with NumPy's, the slope with differences."""
+        expected = self._run_together([weights], first)[:, 0]
+        if not np.isfinite(expected).all():
+            return "the likelihood of the first samples is not finite, and cannot be compared"
+        self._library, given = library, self._record(weights, first)
+        costs = library.costs(given)
+        if not (abs(costs - expected) <= _ROUNDING * abs(expected).max(initial=0.0)).all():
+            return "the likelihood is not the one of NumPy"
+        _, *slopes = self._adjoint_in_c(weights, first, chosen)
+        moves = [given.prior, given.disturbance, given.noise]
+        moves += [np.eye(len(slopes[3]) + 1)[k] * np.abs(given.inputs[:, k]).mean()
+                  for k in range(len(slopes[3]))]
+        names = "prior", "disturbance", "noise", *("inputs",) * len(slopes[3])
+        found, differences = [], []
+        for k, (name, move) in enumerate(zip(names, moves, strict=True)):
+            by = slopes[k] if k < 3 else np.append(slopes[3], 0.0)
+            found.append(float((by * move).sum()))
+            ends = [
+                library.costs(given._replace(**{name: getattr(given, name) + part * move})).sum()
+                for part in (_SHARE, -_SHARE)
+            ]
+            differences.append((ends[0] - ends[1]) / (2.0 * _SHARE))
+        apart = np.abs(np.subtract(found, differences))
+        if not (apart <= _OF_DIFFERENCES * (np.abs(differences) + len(first))).all():
+            return "the likelihood's slope is not the one of differences"
+        return ""
 
     def _record(self, weights: Weights, one: Data) -> LikelihoodInput:
         y, u, dt, _ = self._given(weights, one)

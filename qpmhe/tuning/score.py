@@ -17,7 +17,7 @@ from ..baselines.base import deviations
 from ..codegen import compile as compile_ahead
 from ..errors import EngineWarning, ObserverWarning, QpmheError
 from ..estimation.engines import python_only
-from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.estimator import MovingHorizonEstimator, reweighted
 from ..model.system import System
 from ..observers import Observer
 from .data import Data
@@ -44,6 +44,8 @@ class Score:
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
         self._compiled = False
+        # The first estimator of each record: what it was checked for holds for those of other weights.
+        self._checked: dict[int, MovingHorizonEstimator] = {}
         #: Seconds that a step took, the median of the last run.
         self.seconds = np.nan
         #: Steps ahead, whether the truth is compared with, and the names of what is compared.
@@ -61,6 +63,7 @@ class Score:
         """The score of another estimator, in the same units: those of this one."""
         _, other = self.scale, copy(self)
         other.kind, other._options = kind, {**self._options, "max_qps": qps}
+        other._checked = {}
         if self._compiled:
             other.compile()
         return other
@@ -160,10 +163,15 @@ class Score:
         options, problem = dict(self._options), self.problem(system, weights, one)
         if problem.parameters.size:
             options["parameters"] = problem.parameters
-        return MovingHorizonEstimator(
-            system, self.kind(problem), weights.cost(), horizon=weights.horizon,
-            initial_state=one.start, **options,
+        observer, cost = self.kind(problem), weights.cost()
+        known = self._checked.get(id(one))
+        if known is not None and known.system is system and "parameters" not in options:
+            return reweighted(known, observer, cost)
+        made = MovingHorizonEstimator(
+            system, observer, cost, horizon=weights.horizon, initial_state=one.start, **options,
         )
+        self._checked[id(one)] = made
+        return made
 
     def problem(
         self, system: System, weights: Weights, one: Data | None = None

@@ -34,8 +34,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _OBJECTIVES = ("auto", "likelihood", "prediction", "truth")
-# Samples times parameters beyond which compiling the step takes less time than it saves.
-_WORTH_COMPILING = 2000
+# Samples times parameters beyond which compiling the step takes less time than it saves; an implicit
+# step takes Python ten times as long.
+_WORTH_COMPILING, _IMPLICIT = 2000, 10
 # Spread of the logarithms of further starts.
 _SPREAD = 1.0
 
@@ -206,7 +207,10 @@ def tune(
         begins=any(name.startswith("prior ") for name in plan.names),
         labels=labels["prior" if truth else "noise"], options=options,
     )
-    if objective != "likelihood" and sum(map(len, data)) * len(plan.names) > _WORTH_COMPILING:
+    how = first.origin.how
+    factor = _IMPLICIT if how is not None and how.is_implicit else 1
+    work = sum(map(len, data)) * len(plan.names) * factor
+    if objective != "likelihood" and work > _WORTH_COMPILING:
         score.compile()
     if objective != "likelihood" or observers:
         _ = score.scale  # what is wrong with the options shows before the search

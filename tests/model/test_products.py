@@ -132,7 +132,7 @@ def test_a_step_of_a_rate_has_the_slopes_and_the_curvature_of_its_scalar_form(na
 
 def test_weights_are_tuned_in_scalar_form():
     weights = Weights(np.eye(3), 0.1 * np.eye(3), 0.1 * np.eye(2))
-    assert _Filter(case("layered").system, weights, None).traced
+    assert _Filter(case("layered").system, weights, None).has_adjoint
 
 
 def test_a_dense_map_of_a_hundred_states_is_traced():
