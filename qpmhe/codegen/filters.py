@@ -134,6 +134,13 @@ class LikelihoodLibrary(FilterLibrary):
             ctypes.byref(record), len(costs), len(costs), None, _at(kept), _at(costs))
         return costs
 
+    def follow(self, x: Array, inputs: Array) -> Array:
+        """States (K, n) after a step from x (K, n), with inputs (K, m + 1) and the step's length."""
+        x, inputs = (np.ascontiguousarray(one, np.float64) for one in (x, inputs))
+        reached = np.empty_like(x)
+        self._library.mhe_steps(ctypes.c_int64(len(x)), *map(_at, (x, inputs, reached)))
+        return reached
+
     def adjoint(
         self, given: LikelihoodInput, weights: Array
     ) -> tuple[float, Array, Array, Array, Array]:

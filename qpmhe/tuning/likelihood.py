@@ -95,6 +95,12 @@ class Likelihood:
             except CompilationError as error:
                 self.not_compiled = str(error)
 
+    @property
+    def follow(self) -> Callable[[Array, Array], Array] | None:
+        """The compiled model's step, as `LikelihoodLibrary.follow` has it; None without one."""
+        one = None if self._remade else self._filter(self.structure.first)
+        return None if one is None else one.follow
+
     def expected_seconds(self) -> float:
         """How long a search from one start will take, roughly, by the time of one gradient."""
         began = perf_counter()
@@ -211,6 +217,11 @@ class _Filter:
     def has_adjoint(self) -> bool:
         """Whether `adjoint` is there."""
         return self._step is not None or self._library is not None
+
+    @property
+    def follow(self) -> Callable[[Array, Array], Array] | None:
+        """See `Likelihood.follow`."""
+        return None if self._library is None else self._library.follow
 
     def _covariances(self, weights: Weights) -> tuple[Array, Array, Array]:
         entering = self._system.state_covariance(weights.disturbance)

@@ -46,6 +46,8 @@ class Score:
         self._compiled = False
         # The first estimator of each record: what it was checked for holds for those of other weights.
         self._checked: dict[int, MovingHorizonEstimator] = {}
+        #: A compiled step of the model: of states and of inputs with the step's length behind them.
+        self.follow: Callable[[Array, Array], Array] | None = None
         #: Seconds that a step took, the median of the last run.
         self.seconds = np.nan
         #: Steps ahead, whether the truth is compared with, and the names of what is compared.
@@ -148,11 +150,16 @@ class Score:
             return errors
         reached, model = states[:count], system.model()
         u = one.inputs(system, weights.parameters)
+        lengths = np.full(len(one), system.dt or 0.0) if one.dt is None else one.dt
+        timed = np.column_stack((u, lengths))
         if one.dt is not None:
-            model, u = model.timed, np.hstack((u, one.dt[:, None]))
+            model, u = model.timed, timed
         with np.errstate(all="ignore"):
             for j in range(1, k):
-                reached = model.step(reached, u[j : count + j])
+                reached = (
+                    model.step(reached, u[j : count + j]) if self.follow is None
+                    else self.follow(reached, timed[j : count + j])
+                )
             measured = one.y[k:]
             errors[:count] = measured - model.output(reached, u[k:])
         if system.output_residual is not None:

@@ -207,6 +207,7 @@ def tune(
         begins=any(name.startswith("prior ") for name in plan.names),
         labels=labels["prior" if truth else "noise"], options=options,
     )
+    score.follow = likelihoods[kinds[0].limit].follow
     how = first.origin.how
     factor = _IMPLICIT if how is not None and how.is_implicit else 1
     work = sum(map(len, data)) * len(plan.names) * factor
