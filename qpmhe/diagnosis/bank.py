@@ -417,9 +417,8 @@ class FilterBank:
             filtered = self._run_in_c(library, [part], part)
             if filtered is None:
                 return "the filter fails"
-            for got, true in zip(
-                vars(filtered).values(), vars(self._run_in_numpy([part], part)).values(), strict=True
-            ):
+            expected = self._run_in_numpy([part], part)
+            for got, true in zip(vars(filtered).values(), vars(expected).values(), strict=True):
                 size = np.abs(np.nan_to_num(true)).max(axis=0)
                 if not (np.abs(np.nan_to_num(got - true)) <= _ROUNDING * size).all():
                     return "the filter is not the one of NumPy"

@@ -44,7 +44,7 @@ class Score:
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
         self._compiled = False
-        # The first estimator of each record: what it was checked for holds for those of other weights.
+        # The first estimator of each record: those of other weights are not checked again.
         self._checked: dict[int, MovingHorizonEstimator] = {}
         #: A compiled step of the model: of states and of inputs with the step's length behind them.
         self.follow: Callable[[Array, Array], Array] | None = None

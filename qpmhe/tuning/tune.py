@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _OBJECTIVES = ("auto", "likelihood", "prediction", "truth")
-# Samples times parameters beyond which compiling the step takes less time than it saves; an implicit
-# step takes Python ten times as long.
+# Samples times parameters beyond which compiling the step takes less time than it saves; where it
+# is implicit, Python takes ten times as long.
 _WORTH_COMPILING, _IMPLICIT = 2000, 10
 # Spread of the logarithms of further starts.
 _SPREAD = 1.0
