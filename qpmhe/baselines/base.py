@@ -21,7 +21,6 @@ from .._checks import (
     positive,
     positive_definite,
     positive_semidefinite,
-    record,
     vector,
 )
 from .._linalg import inverse
@@ -30,6 +29,7 @@ from ..errors import InvalidInputError, ModelError, ShapeError, WeightError
 from ..estimation.estimate import Estimate
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.run import Run
+from ..estimation.time_index import PairedRecord, has_times, index_of, paired_record
 from ..model.residuals import difference
 from ..model.system import System, checked_system
 from ..observers import Observer
@@ -213,20 +213,32 @@ class Baseline(ABC):
             self._predict(system, full)
         return self.state
 
-    def run(self, measurements: ArrayLike, inputs: ArrayLike | None = None) -> Run:
-        """Take a record, Y (T, p) and U (T, m), from the present state on.
+    def run(
+        self, measurements: ArrayLike, inputs: ArrayLike | None = None, *, time_unit: Any = "s"
+    ) -> Run:
+        """Take a record from the present state on.
+
+        Parameters
+        ----------
+        measurements, inputs, time_unit
+            As for `qpmhe.MovingHorizonEstimator.run`: an index of times is the time axis.
 
         Returns
         -------
         Run
             With covariances; its costs are NaN, as a filter has none.
+
+        Raises
+        ------
+        ShapeError, InvalidInputError
+            If a shape is wrong, or the times of measurements and inputs do not match or are no
+            steps of the model.
         """
         system = self.problem.system
-        y = record("Y", measurements, system.p)
-        u = None if inputs is None else record(
-            "U", inputs, system.m - self.problem.parameters.size
+        paired = paired_record(
+            system, measurements, inputs, system.m - self.problem.parameters.size, time_unit
         )
-        return follow(self, self.state, y, u, covariances=True)
+        return _followed_in_time(self, self.state, paired, time_unit, covariances=True)
 
     def _begin(self) -> None:
         """Set up further memory from the state and the covariance, where a filter has any."""
@@ -256,7 +268,7 @@ def deviations(system: System, states: Array, weights: Array) -> tuple[Array, Ar
 def follow(
     estimator: Any, start: ArrayLike, measurements: ArrayLike, inputs: ArrayLike | None = None,
     steps: ArrayLike | None = None, *, covariances: bool = False,
-    each: Callable[[int], object] = lambda _done: None,
+    each: Callable[[int], object] = lambda _done: None, time_unit: Any = "s",
 ) -> Run:
     """Run an estimator on a record.
 
@@ -269,14 +281,17 @@ def follow(
         error, and ``filtered`` (n,), the estimate of x(t) that has used y(t).
     start : (n,) array_like
         The estimate of x(0).
-    measurements, inputs : (T, p) and (T, m) array_like
-        The record.
+    measurements, inputs : (T, p) and (T, m) array_like, DataFrame or Series
+        The record. An index of times is read as by `qpmhe.MovingHorizonEstimator.run`, for such
+        an estimator, a `Baseline`, or one whose ``problem`` is the `Problem`.
     steps : (T,) array_like, optional
         Lengths of the steps.
     covariances : bool
         Whether to collect covariances.
     each : callable
         each(t) is called after t steps.
+    time_unit : str or pandas.Timedelta
+        The model's unit of time, for an index of times.
 
     Returns
     -------
@@ -295,6 +310,25 @@ def follow(
             f"the estimator is {shown(estimator)}; expected an object with update(y, u)."
         )
     first = vector("start", start, np.size(start))
+    index = index_of(measurements)
+    if index is not None and (system := _system_of(estimator)) is not None:
+        if steps is not None and has_times(index):
+            raise InvalidInputError(
+                "steps are given, and the index of the measurements has their lengths; leave out "
+                "steps."
+            )
+        width = 0 if inputs is None else int(np.prod(np.asarray(inputs).shape[1:]))
+        paired = paired_record(system, measurements, inputs, width, time_unit)
+        if paired.times is not None:
+            return _followed_in_time(
+                estimator, first, paired, time_unit, covariances=covariances, each=each
+            )
+    elif has_times(index):
+        raise InvalidInputError(
+            f"the measurements have an index of times, and {name} does not say the steps of its "
+            "model; give it an attribute problem, its qpmhe.baselines.Problem, or give arrays "
+            "(.to_numpy()), which are paired by position."
+        )
     y = _rows("measurements", measurements)
     u = None if inputs is None else _rows("inputs", inputs, len(y))
     lengths = None if steps is None else _rows("steps", steps, len(y))
@@ -337,6 +371,26 @@ def follow(
         qps=none, solver_iterations=none - 1, flags=none.copy(), observer_states=array,
         covariances=matrices, engine=name,
     )
+
+
+def _system_of(estimator: Any) -> System | None:
+    """The system whose steps an index of times is made of, if the estimator says it."""
+    if isinstance(estimator, MovingHorizonEstimator):
+        return estimator.system
+    problem = getattr(estimator, "problem", None)
+    return problem.system if isinstance(problem, Problem) else None
+
+
+def _followed_in_time(
+    estimator: Any, start: Array, paired: PairedRecord, time_unit: Any, **options: Any
+) -> Run:
+    """Follow a record whose rows are paired, and keep its times."""
+    run = follow(
+        estimator, start, paired.measurements, paired.inputs, paired.lengths, **options
+    )
+    if paired.times is not None:
+        run.keep_times(paired.times, time_unit)
+    return run
 
 
 def _takes(update: Callable[..., Any], *arguments: Any, **options: Any) -> bool:

@@ -276,6 +276,11 @@ class Run:
             return None
         return [f"{one.name} ({one.unit})" if one.unit else one.name for one in signals.states]
 
+    def keep_times(self, index: pandas.Index, time_unit: Any) -> None:
+        """Take the times of x(0), ..., x(T), where there is no source that knows the unit."""
+        self.index, self._time_unit = index, unit_name(time_unit)
+        self._elapsed = elapsed_times(index, time_unit)
+
     def _clock(self) -> dict[str, Any]:
         """What its source knows of times and names, to be kept without it."""
         return {"elapsed": self.elapsed, "time_unit": self.time_unit, "labels": self.labels}

@@ -57,8 +57,8 @@ class PairedRecord(NamedTuple):
         given = numbers(name, values, finite=False)
         if given.ndim != 2:
             return given  # refused where its shape is checked
-        index = _index(values)
-        if _has_times(index):
+        index = index_of(values)
+        if has_times(index):
             _check_order(name, index, increasing=False)
             found = _positions(index, self.times, name)
         elif len(given) in (count := int((self.rows >= 0).sum()), count + 1):
@@ -97,8 +97,8 @@ def paired_record(
         raise _no_unit(time_unit)
     ys = record(names[0], measurements, system.p)
     us = None if inputs is None else record(names[1], inputs, width)
-    times, others = _index(measurements), _index(inputs)
-    if not _has_times(times):
+    times, others = index_of(measurements), index_of(inputs)
+    if not has_times(times):
         if us is not None and len(us) != len(ys):
             raise ShapeError(
                 f"{names[1]} has {len(us)} samples; expected {len(ys)}, one for each measurement."
@@ -110,7 +110,7 @@ def paired_record(
             )
         return PairedRecord(ys, us, None, None, np.arange(len(ys)))
     _check_order(names[0], times)
-    if us is not None and not _has_times(others):
+    if us is not None and not has_times(others):
         if len(us) != len(ys):
             raise ShapeError(
                 f"{names[1]} has {len(us)} rows without times; expected {len(ys)}, one for each "
@@ -241,7 +241,7 @@ def _positions(index: Any, times: Any, name: str) -> NDArray[np.intp]:
     return np.where(at >= 0, order[at], -1)
 
 
-def _index(values: Any) -> Any:
+def index_of(values: Any) -> Any:
     """The index of a Series or DataFrame, None for anything else."""
     pandas: Any = sys.modules.get("pandas")
     kinds = (getattr(pandas, "Series", ()), getattr(pandas, "DataFrame", ()))
@@ -249,7 +249,8 @@ def _index(values: Any) -> Any:
     return values.index if is_of_pandas else None
 
 
-def _has_times(index: Any) -> bool:
+def has_times(index: Any) -> bool:
+    """Whether an index is one of times."""
     pandas: Any = sys.modules.get("pandas")
     return index is not None and isinstance(
         index, (pandas.DatetimeIndex, pandas.TimedeltaIndex)

@@ -1,15 +1,18 @@
 """Records from pandas: an index of times is the time axis; all else is paired by position."""
 
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.baselines import ExtendedKalmanFilter, Problem, follow
 from qpmhe.errors import InvalidInputError, ShapeError
 from qpmhe.model.signals import Signal, Signals
 from qpmhe.tuning import TuningRecord
 from qpmhe.tuning.data import checked_data
+from tests.covering import covering
 
 pd = pytest.importorskip("pandas")
 
@@ -38,6 +41,26 @@ def estimator(system):
     )
 
 
+def kalman(system):
+    return ExtendedKalmanFilter(
+        Problem(system, initial_state=np.zeros(2), prior=np.eye(2), **COVARIANCES))
+
+
+def followed(make):
+    """As `run`, by `follow`."""
+    def run(measurements, inputs=None, **options):
+        one = make()
+        return follow(one, one.state, measurements, inputs, **options)
+    return SimpleNamespace(run=run)
+
+
+MAKERS = {
+    "mhe": estimator, "kalman": kalman,
+    "followed mhe": lambda system: followed(lambda: estimator(system)),
+    "followed kalman": lambda system: followed(lambda: kalman(system)),
+}
+
+
 def record(index):
     rng = np.random.default_rng(3)
     y, u = rng.normal(size=(len(index), 1)), rng.normal(size=(len(index), 1))
@@ -52,27 +75,29 @@ INDEXES = {
 }
 
 
-@pytest.mark.parametrize("name", INDEXES)
-def test_rows_are_paired_by_time_in_any_order_and_of_any_resolution(name):
-    index = INDEXES[name]
+@covering(name=INDEXES, maker=MAKERS, strength=1)
+def test_inputs_are_paired_by_time_in_any_order_and_of_any_resolution(name, maker):
+    index, make = INDEXES[name], MAKERS[maker]
     y, u = record(index)
-    plain = estimator(discrete()).run(y.to_numpy(), u.to_numpy())
+    plain = make(discrete()).run(y.to_numpy(), u.to_numpy())
     assert plain.index is None
     others = u.set_axis(u.index.as_unit("ns"))
     wider = pd.concat([u, u.set_axis(u.index + (u.index[-1] - u.index[0]) + pd.Timedelta("1D"))])
     shuffled = u["u"].sample(frac=1.0, random_state=1)
     for inputs in (u, u[::-1], shuffled, others, wider, u.to_numpy()):
-        run = estimator(discrete()).run(y, inputs)
+        run = make(discrete()).run(y, inputs)
         np.testing.assert_array_equal(run.states, plain.states)
         assert run.index[:-1].equals(index)
         assert run.index[-1] - run.index[-2] == index[1] - index[0]
     # And in single updates, to the last bit.
     mhe = estimator(discrete())
-    assert mhe.update(y.iloc[0], u.iloc[0]).cost == plain.costs[0]
+    cost = mhe.update(y.iloc[0], u.iloc[0]).cost
+    assert cost == plain.costs[0] or not plain.has_costs
 
 
-@pytest.mark.parametrize("name", ["dates", "zone"])
-def test_gaps_are_samples_without_measurement(name):
+@covering(name=["dates", "zone"], maker=MAKERS, strength=1)
+def test_gaps_are_samples_without_measurement(name, maker):
+    make = MAKERS[maker]
     y, u = record(INDEXES[name])
     gone = [7, 8, 9, 10, 11, 12, 20]
     holes = y.copy()
@@ -82,10 +107,12 @@ def test_gaps_are_samples_without_measurement(name):
     held = held.ffill()
     dropped = np.delete(np.arange(T), gone)
     for inputs, expected in ((u, u), (u.iloc[dropped], held)):
-        plain = estimator(discrete()).run(holes.to_numpy(), expected.to_numpy())
-        run = estimator(discrete()).run(y.iloc[dropped], inputs)
+        plain = make(discrete()).run(holes.to_numpy(), expected.to_numpy())
+        run = make(discrete()).run(y.iloc[dropped], inputs)
         np.testing.assert_array_equal(run.states, plain.states)
         assert run.index[:-1].equals(y.index)
+        if run.source is None:
+            continue
         np.testing.assert_array_equal(run.source.measurements, holes)
         np.testing.assert_array_equal(run.source.inputs, expected)
 
@@ -102,6 +129,13 @@ def test_steps_of_any_length_in_the_models_unit():
         run = estimator(of_ode(1.0)).run(y, u[::-1], time_unit=unit)
         np.testing.assert_allclose(run.states[1:], states, rtol=1e-12)
         assert run.index[-1] == index[-1] + pd.Timedelta("1min")
+    filtered = follow(kalman(of_ode(1.0)), np.zeros(2), y.to_numpy(), u.to_numpy(), lengths)
+    for name in set(MAKERS) - {"mhe"}:
+        other = MAKERS[name](of_ode(1.0)).run(y, u[::-1], time_unit="min")
+        expected = filtered if "kalman" in name else run
+        np.testing.assert_allclose(other.states, expected.states, rtol=1e-12)
+        np.testing.assert_array_equal(other.elapsed, run.elapsed)
+        assert (other.time_unit, other.index[-1]) == ("min", run.index[-1])
     # The record is the tuning's, too, with true states of some times.
     truth = pd.DataFrame(rng.normal(size=(T, 2)), index)
     (data,) = checked_data(
@@ -258,8 +292,9 @@ def test_what_does_not_match_is_refused_by_name():
         (y.set_axis(range(T)), u.set_axis(range(1, T + 1)), "different indexes.*by position"),
     ):
         mhe = estimator(discrete())
-        with pytest.raises((InvalidInputError, ShapeError), match=words):
-            mhe.run(measurements, inputs)
+        for one in (mhe, kalman(discrete()), followed(lambda: kalman(discrete()))):
+            with pytest.raises((InvalidInputError, ShapeError), match=words):
+                one.run(measurements, inputs)
         assert mhe.time == 0
     for unit in ("fortnight", 0, pd.Timedelta(0), pd.NaT, None):
         with pytest.raises(InvalidInputError, match="time_unit is"):
@@ -268,3 +303,19 @@ def test_what_does_not_match_is_refused_by_name():
         run = estimator(discrete()).run(y.iloc[:few], u.iloc[:few])
         assert len(run.index) == few + 1
         assert len(run) == few
+
+
+def test_an_estimator_that_does_not_say_its_model_gets_no_index_of_times():
+    y, u = record(INDEXES["dates"])
+    holder = SimpleNamespace(update=lambda y, u=None: np.zeros(2))
+    with pytest.raises(InvalidInputError, match=r"SimpleNamespace does not say the steps.*problem"):
+        follow(holder, np.zeros(2), y, u)
+    assert len(follow(holder, np.zeros(2), y.reset_index(drop=True))) == T
+    with pytest.raises(InvalidInputError, match="leave out steps"):
+        follow(kalman(discrete()), np.zeros(2), y, u, np.ones(T))
+    # A record whose steps have several lengths, for an update without dt.
+    holder.problem = kalman(of_ode(600.0)).problem
+    assert len(follow(holder, np.zeros(2), y.drop(y.index[4]))) == T
+    with pytest.raises(InvalidInputError, match=r"SimpleNamespace.update cannot .* dt=\.\.\."):
+        follow(holder, np.zeros(2), y.drop(y.index[4]).set_axis(y.index[1:].map(
+            lambda one: one + pd.Timedelta(minutes=one.hour))))
