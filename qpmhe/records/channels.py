@@ -156,29 +156,33 @@ class ChannelTable(Table):
         return [f"{text}{zone}" for text in np.datetime_as_string(times.astype("M8[ns]")).tolist()]
 
     def _in_order(self, signals: list[Signal]) -> tuple[list[Signal], RecordError | None]:
-        """The signals up to the first time that goes backwards, and the error that says so."""
-        fault, last = None, None
-        for k, (times, _) in enumerate(signals):
-            if times.dtype.kind == "f" and not np.isfinite(times).all():
-                at = int(np.argmin(np.isfinite(times)))
-                raise RecordError(
-                    f"the time of value {at + 1} is {times[at]}; correct the file.", self.name,
-                    column=self.header[k + 1],
+        """The signals up to the first time that is none or goes backwards, and the error of it."""
+        fault: RecordError | None = None
+        last: Any = np.inf
+        wrongs = [
+            ~np.isfinite(times) | (times < np.append(times[:1], times[:-1])) for times, _ in signals
+        ]
+        for k, ((times, _), wrong) in enumerate(zip(signals, wrongs, strict=True)):
+            at = int(np.argmax(wrong)) if wrong.any() else 0
+            before = times[at - 1] if at else -np.inf
+            if not wrong.any() or before >= last:
+                continue
+            last = before
+            if np.isfinite(times[at]):
+                earlier, later = self._times(times[at - 1:at + 1])
+                what = (
+                    f"time goes backwards from {earlier} to {later} at value {at + 1}; sort the "
+                    "file by time, or split it there."
                 )
-            back = np.flatnonzero(np.diff(times) < 0)
-            if back.size and (last is None or times[back[0]] < last):
-                at, last = int(back[0]), times[back[0]]
-                before, after = self._times(times[at:at + 2])
-                fault = RecordError(
-                    f"time goes backwards from {before} to {after} at value {at + 2}; sort the "
-                    "file by time, or split it there.", self.name, column=self.header[k + 1],
-                )
-        if last is None:
+            else:
+                what = f"the time of value {at + 1} is {times[at]}; correct the file."
+            fault = RecordError(what, self.name, column=self.header[k + 1])
+        if fault is None:
             return signals, None
         kept = []
-        for times, values in signals:
-            wrong = np.flatnonzero((times > last) | (np.diff(times, prepend=times[:1]) < 0))
-            end = wrong[0] if wrong.size else len(times)
+        for (times, values), wrong in zip(signals, wrongs, strict=True):
+            ends = np.flatnonzero(wrong | (times > last))
+            end = ends[0] if ends.size else len(times)
             kept.append(Signal(times[:end], values[:end]))
         return kept, fault
 

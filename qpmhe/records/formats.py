@@ -15,14 +15,22 @@ from numpy.typing import NDArray
 
 from .._checks import need
 from .channels import Channels, Signal
-from .tables import TIMES, RecordError, first_line
+from .tables import TIMES, RecordError, first_line, nearest_first
 
 # Longer arrays, such as images, are no signals.
 _LONGEST = 64
+# An error shows so many names.
+_NEAREST = 5
 # What is read at once: bytes of an MDF file, and messages of a bag.
 _FRAGMENT, _MESSAGES = 2**22, 2**14
 # MDF was made in this year; a file with an earlier date comes from a device without a set clock.
 _FIRST_MDF = 1991
+# What keeps the whole part of a file that is cut off, by the end of its name.
+_MENDS = {
+    ".mcap": "'mcap recover {0} -o whole.mcap' keeps what is whole.",
+    ".db3": "'sqlite3 {0} .recover | sqlite3 whole.db3' keeps what is whole.",
+    ".bag": "'rosbag reindex {0}' keeps what is whole.",
+}
 _Path = tuple[str | int, ...]
 
 
@@ -82,7 +90,7 @@ def read_mat(file: str, time: str | None = None) -> Channels:
     major, _ = _attempt(file, "MAT", Exception, lambda: matfile_version(file))
     if major != 2:
         content = _attempt(file, "MAT", Exception, lambda: loadmat(file, simplify_cells=True))
-        return _of_tree(file, _variables(content), {}, time, hint)
+        return _of_tree(file, _variables(content), {}, time, hint=hint)
     kind = "a MAT file of version 7.3"  # which is HDF5
     load, h5py = need("pymatreader", kind, "mat").read_mat, need("h5py", kind, "mat")
     root = _attempt(file, "MAT", OSError, lambda: h5py.File(file, "r"))
@@ -93,9 +101,7 @@ def read_mat(file: str, time: str | None = None) -> Channels:
         return found | _variables(load(file, variable_names=others) if others else {})
 
     tree = _attempt(file, "MAT", Exception, listed, root.close)
-    channels = _of_tree(file, tree, {}, time, hint)
-    channels.close = root.close
-    return channels
+    return _of_tree(file, tree, {}, time, root.close, hint)
 
 
 def _variables(content: dict[str, Any]) -> dict[str, Any]:
@@ -149,9 +155,7 @@ def read_hdf5(file: str, time: str | None = None) -> Channels:
         return found
 
     tree = _attempt(file, "HDF5", errors, lambda: grown(root, ()), root.close)
-    channels = _of_tree(file, tree, units, time, "")
-    channels.close = root.close
-    return channels
+    return _of_tree(file, tree, units, time, root.close)
 
 
 class _Field:
@@ -180,7 +184,8 @@ def _grown(value: Any) -> Any:
 
 
 def _of_tree(
-    file: str, tree: dict[str, Any], units: dict[_Path, str], time: str | None, hint: str
+    file: str, tree: dict[str, Any], units: dict[_Path, str], time: str | None,
+    close: Callable[[], None] = lambda: None, hint: str = "",
 ) -> Channels:
     """The channels of groups in groups, each with the nearest time that has its length."""
     names: list[str] = []
@@ -221,6 +226,13 @@ def _of_tree(
             found.append((path, item, (slice(None), k) if axis == 0 else (k, slice(None)), clock))
 
     walk(tree, (), [])
+    if time is not None and not used:
+        close()
+        several = nearest_first({str(path[-1]) for path, *_ in found}, time)[:_NEAREST]
+        raise RecordError(
+            f"there is no variable {time!r} for the time; the nearest are "
+            f"{', '.join(map(repr, several))}. Name it with --time NAME.{hint}", file,
+        )
 
     def load(chosen: Sequence[int]) -> list[Signal]:
         loaded = []
@@ -238,7 +250,7 @@ def _of_tree(
         return loaded
 
     return Channels(
-        names, [units.get(path, "") for path, *_ in found], load,
+        names, [units.get(path, "") for path, *_ in found], load, close,
         time=min(used, default=time or "time"), notes=notes, hint=hint,
     )
 
@@ -406,6 +418,8 @@ def _attempt(
     gc.collect()  # half-made objects of asammdf complain when they go
     sys.unraisablehook = shown
     close()
+    mend = _MENDS.get(Path(file).suffix.lower(), "").format(file)
     raise RecordError(
-        f"it cannot be read as {kind} ({text}); it may be cut off, or of another kind.", file
+        f"it cannot be read as {kind} ({text}); it may be cut off, or of another kind."
+        f"{' If it is cut off, ' * bool(mend)}{mend}", file,
     )

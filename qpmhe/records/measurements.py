@@ -9,7 +9,6 @@ from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from difflib import SequenceMatcher
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
@@ -19,7 +18,7 @@ from .._checks import Array
 from ..errors import InvalidInputError, OptionError
 from .quaternions import SignChanges
 from .readers import ReadingOptions, open_table
-from .tables import TIMES, RecordError, Table, TableRow
+from .tables import TIMES, RecordError, Table, TableRow, nearest_first
 
 # Units with which a column called "t" is the time, and no temperature.
 _TIME_UNITS = frozenset((
@@ -367,8 +366,7 @@ class Header:
         more = len(names) - _NAMES_SHOWN
         nearest = ""
         if more > 0:
-            names = sorted(names, key=lambda name: -SequenceMatcher(
-                None, name.lower(), wanted[0].lower()).ratio())
+            names = nearest_first(names, wanted[0])
             nearest = ", the nearest first,"
         shown = ", ".join(
             repr(name if len(name) <= _LETTERS_SHOWN else f"{name[:_LETTERS_SHOWN]}...")

@@ -163,6 +163,11 @@ def open_table(record: str, time: str | None, reading: ReadingOptions) -> Table:
     name = "standard input" if piped else record
     if piped and sys.stdin is None:
         raise RecordError("it is closed; pipe a record into it, or name a file.", name)
+    if os.path.isdir(record) and not is_bag(record):
+        raise RecordError(
+            "it is a folder and has no metadata.yaml; name a file. Of a ROS 2 bag, name the .mcap "
+            f"or .db3 file in it, or run 'ros2 bag reindex {record}'.", name,
+        )
     ending = "folder" if is_bag(record) else Path(record).suffix.lower()
     reader, option = READERS.get(ending, (None, None))
     options = {option: time if option == "time" else reading.log_time} if option else {}

@@ -6,8 +6,9 @@ import csv
 import json
 import re
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import datetime
+from difflib import SequenceMatcher
 from itertools import chain, islice
 from time import perf_counter
 from typing import Any, BinaryIO, NamedTuple
@@ -338,3 +339,9 @@ def _is_number(field: str) -> bool:
 def first_line(error: BaseException) -> str:
     """What an exception says, on one line."""
     return str(error).partition("\n")[0].rstrip(".")
+
+
+def nearest_first(names: Iterable[str], wanted: str) -> list[str]:
+    """The names, those most like the wanted one first."""
+    return sorted(names, key=lambda name: (
+        -SequenceMatcher(None, name.lower(), wanted.lower()).ratio(), name))

@@ -461,7 +461,8 @@ def test_bad_files_are_one_line_each(here):
         for content in (whole[: len(whole) // 2], whole[:20], b"no such thing", b""):
             cut = Path(f"cut{Path(name).suffix}")
             cut.write_bytes(content)
-            refused(str(cut), f"{cut}: it cannot be read as", "cut off")
+            mend = "'mcap recover cut.mcap -o whole.mcap'" if cut.suffix == ".mcap" else ""
+            refused(str(cut), f"{cut}: it cannot be read as", "cut off", mend)
         Path("renamed.csv").write_bytes(whole)
         refused("renamed.csv", "renamed.csv: it is", "name the file, in .")
         refused(f"nowhere{Path(name).suffix}", "No such file")
@@ -471,15 +472,16 @@ def test_bad_files_are_one_line_each(here):
     refused("many.mf4", "the nearest first, 'Speed_kmh'", "and 21 more", columns=["speed_km"])
 
 
-@pytest.mark.parametrize("backwards", [1, 7])
-def test_output_is_kept_up_to_a_time_that_goes_backwards(here, backwards):
+@pytest.mark.parametrize(("backwards", "moved"), [(1, -0.25), (7, -0.25), (7, np.nan), (7, np.inf)])
+def test_output_is_kept_up_to_a_time_that_goes_backwards_or_is_none(here, backwards, moved):
     times = T2.copy()
-    times[backwards] -= 0.25
+    times[backwards:backwards + 2] += moved
+    what = "time goes backwards" if np.isfinite(moved) else f"is {moved + 0.0}; correct the file"
     h5py = pytest.importorskip("h5py")
     with h5py.File("record.h5", "w") as file:
         file["time"], file["y1"] = times, SLOW
         file["b/time"], file["b/y2"] = T2, SLOW
-    message = refused("record.h5", "time goes backwards", f"at value {backwards + 1}",
+    message = refused("record.h5", what, f"value {backwards + 1}",
                       "column 'y1'", read=lambda name: estimate(DISCRETE, name))
     put("rows.csv", ["time,y1,y2", *(f"{t},{y},{y}" for t, y in zip(
         T2[:backwards], SLOW, strict=False))])
@@ -489,6 +491,38 @@ def test_output_is_kept_up_to_a_time_that_goes_backwards(here, backwards):
     refused("record.mf4", "is in sample 20 already",
             read=lambda name: estimate(DISCRETE, name, overwrite=True))
     assert estimate(DISCRETE, "record.mf4", overwrite=True, skip_repeated=True).samples == 20
+    with h5py.File("first.h5", "w") as file:
+        file["time"], file["y1"], file["y2"] = np.r_[np.nan, T2[1:]], SLOW, SLOW
+    refused("first.h5", "the time of value 1 is nan")
+
+
+@pytest.mark.parametrize("kind", ["h5", "mat", "7.3"])
+def test_a_time_that_is_not_there_is_refused_before_anything_is_written(here, kind):
+    from scipy.io import savemat
+
+    name = "record.h5" if kind == "h5" else "record.mat"
+    variables = {"stamp": T2, "y1": SLOW, "y2": SLOW}
+    if kind == "h5":
+        with pytest.importorskip("h5py").File(name, "w") as file:
+            for one, values in variables.items():
+                file[f"log/{one}"] = values
+    elif kind == "mat":
+        savemat(name, {"log": variables})
+    else:
+        pytest.importorskip("pymatreader")
+        mat73(name, {"log": variables})
+    refused(name, "no variable 'stmp' for the time; the nearest are 'stamp', '", "--time NAME",
+            read=lambda name: estimate(DISCRETE, name, time="stmp"))
+    assert os.listdir() == [name]
+    assert estimate(DISCRETE, name, time="Stamp").samples == 20
+
+
+def test_a_folder_without_metadata_is_no_bag_yet(here):
+    bag("run", "MCAP", [("/y", EPOCH + np.arange(20), None, SLOW)])
+    Path("run/metadata.yaml").unlink()
+    refused("run", "has no metadata.yaml; name a file", "the .mcap or .db3 file in it",
+            "'ros2 bag reindex run'")
+    assert len(read("run/run.mcap")) == 20
 
 
 @pytest.mark.parametrize(("name", "module", "extra"), [
