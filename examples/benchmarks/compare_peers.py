@@ -29,7 +29,7 @@ from rich.console import Console
 
 from qpmhe.codegen.compiler import find_compiler
 
-WIDTH = 110
+WIDTH = 130
 NOTES = [
     "Read the ratios; microseconds are those of this machine and its load.",
     "Estimators take turns, --turn steps at a time. With --turn 1 each step begins with the "
@@ -45,10 +45,12 @@ NOTES = [
     "CasADi's programs: (x), the states are the variables; (x, w), the disturbances as well; C, "
     "functions (sqpmethod: all of it) compiled, else in CasADi's virtual machine. Compare like "
     "with like. They start at their own previous solution, shifted, unless --start candidate.",
+    "Largest difference: of any state in any trajectory from that of our converged estimate, in "
+    "standard deviations of the prior.",
     "Setup: seconds to import and build, once. Compiled libraries are kept on disk for the next "
     "run.",
-    "All problems here are without constraints. acados and ModelPredictiveControl.jl do not "
-    "come from PyPI and are not run.",
+    "All problems here are without constraints. acados does not come from PyPI: it runs where "
+    "ACADOS_SOURCE_DIR is set. ModelPredictiveControl.jl is not run.",
 ]
 
 
@@ -105,7 +107,7 @@ def main() -> None:
             )
             show(console, results[-1])
             picture(results[-1], chosen.out / f"peers_{name}.png")
-    packages = {one.peer.package for result in results for one in result.series}
+    packages = {one.peer.package for result in results for one in result.series} - {""}
     surroundings["versions"] = environment(packages)["versions"]
     notes = [*NOTES, *_limitations(results)]
     path = chosen.json or chosen.out / "peers.json"

@@ -40,6 +40,8 @@ class Series:
         Seconds, without those in which another process had the processor.
     costs : dict of (seed, t) to float
         True J of its trajectory; infinite where it gave none.
+    trajectories : dict of (seed, t) to array
+        Its trajectories (K + 1, n).
     squares : list of float
         Squared errors of the state x(t+1).
     waited : float
@@ -50,6 +52,7 @@ class Series:
     setup_seconds: float
     times: dict[tuple[int, int], float] = field(default_factory=dict)
     costs: dict[tuple[int, int], float] = field(default_factory=dict)
+    trajectories: dict[tuple[int, int], Array] = field(default_factory=dict)
     squares: list[float] = field(default_factory=list)
     waited: float = 0.0
 
@@ -103,6 +106,23 @@ class Measurement:
             for step, cost in one.costs.items():
                 lowest[step] = min(cost, lowest.get(step, math.inf))
         return lowest
+
+    def difference(self, one: Series) -> float | None:
+        """Its trajectories' largest difference from our converged ones, in deviations of the prior.
+
+        None without either, and for what solves another problem.
+        """
+        ours = next((
+            other for other in self.series
+            if other.peer.kind == "qpmhe" and other.peer.converges
+        ), None)
+        if ours is None or one.peer.kind == "other":
+            return None
+        deviations = np.sqrt(np.diag(np.linalg.inv(self.problem.cost.prior)))
+        return max((
+            float(np.abs((found - ours.trajectories[step]) / deviations).max())
+            for step, found in one.trajectories.items() if step in ours.trajectories
+        ), default=None)
 
     @property
     def waited(self) -> float:
@@ -184,11 +204,13 @@ def _samples(problem: Problem, seed: int, steps: int) -> list[_Sample]:
     )
     formulation = Formulation(problem.system, problem.observer, problem.cost)
     samples = []
-    for y, truth in zip(record.measurements, record.states[1:], strict=True):
-        window.push(y, np.zeros(0))
+    inputs = np.zeros((steps, 0)) if record.inputs is None else record.inputs
+    for y, u, truth in zip(record.measurements, inputs, record.states[1:], strict=True):
+        window.push(y, u)
         data = WindowData(
-            y.copy(), window.candidate[0].copy(), window.measurements.copy(),
-            window.candidate.copy(), window.residuals[:, : problem.n].copy(),
+            y.copy(), u.copy(), window.candidate[0].copy(), window.measurements.copy(),
+            window.inputs.copy(), window.candidate.copy(),
+            window.residuals[:, : problem.n].copy(),
         )
         judge = formulation.problem(window)
         # The window goes on: what the judge reads is copied.
@@ -238,6 +260,7 @@ def _steps(
         one.squares.append(float(np.sum((state - samples[t].truth) ** 2)))
         if answer.ndim == 2:
             one.costs[seed, t] = samples[t].judge.evaluate(answer).cost
+            one.trajectories[seed, t] = answer
 
 
 def _guarded(result: Measurement, one: Series, call: Callable[[], None]) -> None:

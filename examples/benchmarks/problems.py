@@ -16,6 +16,7 @@ from qpmhe.models.batch_reactor import casadi_rate as reactor_rate
 from qpmhe.models.chain import casadi_output as chain_output
 from qpmhe.models.chain import casadi_rate as chain_rate
 from qpmhe.models.chain import chain_of_masses
+from qpmhe.models.quadrotor import quadrotor
 from qpmhe.models.scenario import Scenario
 
 __all__ = ["NAMES", "Problem", "chain_problem", "named", "reactor_problem"]
@@ -23,7 +24,7 @@ __all__ = ["NAMES", "Problem", "chain_problem", "named", "reactor_problem"]
 
 @dataclass(frozen=True)
 class Problem:
-    """One estimation problem, without sets and inputs: (eq:optiMHE) with quadratic cost.
+    """One estimation problem, without sets: (eq:optiMHE) with quadratic cost.
 
     Parameters
     ----------
@@ -40,7 +41,8 @@ class Problem:
     horizon : int
         N.
     rate, output : callable
-        The same continuous-time model for CasADi: column (n) to (n) and to (p).
+        The same continuous-time model for CasADi: x, and u where there are inputs, to (n);
+        x to (p).
     method : {"euler", "rk4"}
         Its discretisation.
     """
@@ -51,7 +53,7 @@ class Problem:
     cost: qpmhe.QuadraticCost
     scenario: Scenario
     horizon: int
-    rate: Callable[[Any], Any]
+    rate: Callable[..., Any]
     output: Callable[[Any], Any]
     method: str
 
@@ -66,19 +68,25 @@ class Problem:
         return self.system.p
 
     @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.system.m
+
+    @property
     def title(self) -> str:
         """Name and sizes."""
         return f"{self.name}: n = {self.n}, p = {self.p}, N = {self.horizon}"
 
-    def step(self, x: Any) -> Any:
-        """One step of the discretised model for a CasADi column (n)."""
+    def step(self, x: Any, u: Any) -> Any:
+        """One step of the discretised model for CasADi columns (n) and (m)."""
         step, _ = discretize(self.rate, None, Discretization(self.method))
-        return step(self.scenario.dt, x)
+        return step(self.scenario.dt, x, *([u] if self.m else []))
 
     def casadi_system(self) -> qpmhe.System:
         """The same system made from the CasADi model."""
         return qpmhe.from_casadi(
-            self.rate, self.output, n=self.n, p=self.p, dt=self.scenario.dt, method=self.method
+            self.rate, self.output, n=self.n, p=self.p, m=self.m, dt=self.scenario.dt,
+            method=self.method,
         )
 
 
@@ -100,10 +108,21 @@ def chain_problem(masses: int, dimension: int, horizon: int | None = None) -> Pr
     )
 
 
+def quadrotor_problem() -> Problem:
+    """A quadrotor in flight, n = 12 with four inputs; its CasADi model is the trace of NumPy's."""
+    system, observer, cost, scenario = quadrotor("rk4")
+    traced, nothing = system.symbolic, np.zeros(system.m)
+    return Problem(
+        "quadrotor", system, observer, cost, scenario, scenario.horizon,
+        lambda x, u: traced.f(x, u), lambda x: traced.h(x, nothing), "rk4",
+    )
+
+
 _MAKERS: dict[str, Callable[[], Problem]] = {
     "reactor": reactor_problem,
     "chain-12": lambda: chain_problem(2, 3),
     "chain-18": lambda: chain_problem(3, 3),
+    "quadrotor": quadrotor_problem,
 }
 NAMES = tuple(_MAKERS)
 
@@ -118,10 +137,10 @@ def named(name: str) -> Problem:
 def _agree(problem: Problem) -> None:
     import casadi as ca
 
-    x = ca.SX.sym("x", problem.n)
-    both = ca.Function("model", [x], [problem.step(x), problem.output(x)])
-    at, nothing = problem.scenario.initial_state, np.zeros(0)
-    ours = (problem.system.f(at, nothing), problem.system.h(at, nothing))
-    for theirs, value in zip(both(at), ours, strict=True):
+    x, u = ca.SX.sym("x", problem.n), ca.SX.sym("u", problem.m)
+    both = ca.Function("model", [x, u], [problem.step(x, u), problem.output(x)])
+    at, held = problem.scenario.initial_state, np.linspace(1.0, 0.0, problem.m)
+    ours = (problem.system.f(at, held), problem.system.h(at, held))
+    for theirs, value in zip(both(at, held), ours, strict=True):
         if not np.allclose(theirs.full().ravel(), value, rtol=1e-12, atol=1e-12):
             raise RuntimeError(f"{problem.name}: its NumPy and CasADi models are not the same.")

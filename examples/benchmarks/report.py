@@ -35,6 +35,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "qpmhe": {"label": "qpmhe, converged", "color": "#0072B2"},
     "capped": {"label": "qpmhe, capped", "color": "#8CC8EE"},
     "peer": {"label": "other tools, converged", "color": "#B8B8B8"},
+    "one": {"label": "other tools, one QP", "color": "#E2E2E2"},
     "other": {"label": "another problem", "color": "#F0C987", "hatch": "///"},
 }
 LIGHT: dict[str, Any] = {
@@ -133,6 +134,7 @@ def _row(result: Measurement, one: Series, base: float | None) -> dict[str, Any]
         "excess": float(np.median(excess)) if excess.size else None,
         "excess_worst": float(excess.max()) if excess.size else None,
         "same_cost": same,
+        "difference": result.difference(one),
         "rmse": None if one.peer.most_calls else math.sqrt(float(np.mean(one.squares))),
         "steps": len(one.times),
         "waited_s": one.waited,
@@ -161,7 +163,7 @@ def show(console: Console, result: Measurement) -> None:
     )
     for name in (
         "estimator", "median\nus", "mean\nus", "quartiles\nus", "x faster\nthan Ipopt",
-        "J above\nconverged", "RMSE", "setup\ns",
+        "J above\nconverged", "largest\ndifference", "RMSE", "setup\ns",
     ):
         table.add_column(name, justify="left" if name == "estimator" else "right", no_wrap=True)
     for row in sorted(table_rows, key=lambda row: row["median_us"]):
@@ -169,7 +171,8 @@ def show(console: Console, result: Measurement) -> None:
             row["estimator"], _short(row["median_us"]), _short(row["mean_us"]),
             " ".join(_short(q) for q in row["quartiles_us"]),
             "reference" if row["is_reference"] else _or_dash(row["ratio"], "{:.3g}"),
-            _excess(row["excess"]), _or_dash(row["rmse"], "{:.4f}"),
+            _excess(row["excess"]), _or_dash(row["difference"], "{:.0e}"),
+            _or_dash(row["rmse"], "{:.4f}"),
             f"{row['setup_s']:.2f}",
         )
     console.print(table)
@@ -268,8 +271,9 @@ def picture(result: Measurement, path: Path) -> None:
 
 
 def _style(row: dict[str, Any]) -> dict[str, Any]:
-    capped = row["kind"] == "qpmhe" and row["same_cost"] is None
-    return KINDS["capped" if capped else row["kind"]]
+    capped = row["same_cost"] is None
+    kind = {"qpmhe": "capped", "peer": "one"}.get(row["kind"]) if capped else None
+    return KINDS[kind or row["kind"]]
 
 
 def _label(row: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from problems import Problem
 
+from .acados_window import Acados
 from .base import Array, Peer, UnavailableError, WindowData
 from .casadi_fatrop import CasadiFatrop
 from .casadi_gauss_newton import CasadiGaussNewton
@@ -17,7 +18,10 @@ from .qpmhe_variants import Qpmhe
 __all__ = ["GROUPS", "Array", "Peer", "UnavailableError", "WindowData", "make"]
 
 #: What ``--peers`` takes.
-GROUPS = ("ipopt", "sqpmethod", "gauss-newton", "fatrop", "do-mpc", "gekko", "filterpy", "qpmhe")
+GROUPS = (
+    "ipopt", "sqpmethod", "gauss-newton", "fatrop", "acados", "do-mpc", "gekko", "filterpy",
+    "qpmhe",
+)
 
 # With few states w is better eliminated; with many, derivatives stage by stage are cheaper.
 _FEW_STATES = 4
@@ -48,6 +52,7 @@ def make(groups: tuple[str, ...], problem: Problem, compiled: bool, start: str) 
         "sqpmethod": [CasadiSqp("states", start=start), CasadiSqp("shooting", start=start)],
         "gauss-newton": [CasadiGaussNewton(start=start)],
         "fatrop": [CasadiFatrop(start=start)],
+        "acados": [Acados(1, start), Acados(None, start)],
         "do-mpc": [DoMpc()],
         "gekko": [Gekko()],
         "filterpy": [FilterpyEkf()],

@@ -26,10 +26,14 @@ class WindowData:
     ----------
     newest : (p,) array
         y(t).
+    newest_input : (m,) array
+        u(t).
     prior : (n,) array
         The prior z(t+1-K), of our observer.
     measurements : (K, p) array
         y(t+1-K), ..., y(t).
+    inputs : (K, m) array
+        u(t+1-K), ..., u(t).
     candidate : (K + 1, n) array
         The observer's states z(t+1-K), ..., z(t+1).
     disturbances : (K, n) array
@@ -37,8 +41,10 @@ class WindowData:
     """
 
     newest: Array
+    newest_input: Array
     prior: Array
     measurements: Array
+    inputs: Array
     candidate: Array
     disturbances: Array
 

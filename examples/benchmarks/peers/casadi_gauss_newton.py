@@ -27,11 +27,13 @@ class CasadiGaussNewton(CasadiSqp):
 
         n, count, cost = problem.n, problem.horizon, problem.cost
         x = ca.SX.sym("x", (count + 1) * n)
-        parameters = ca.SX.sym("p", n + problem.p * count)
+        parameters = ca.SX.sym("p", n + (problem.p + problem.m) * count)
+        inputs = ca.reshape(parameters[n + problem.p * count :], problem.m, count)
         states = ca.vertsplit(x, n)
         residuals, weights = [states[0]], [cost.prior]
         for i in range(count):
-            residuals += [states[i + 1] - problem.step(states[i]), problem.output(states[i])]
+            moved = problem.step(states[i], inputs[:, i])
+            residuals += [states[i + 1] - moved, problem.output(states[i])]
             weights += [cost.disturbance, cost.noise]
         slopes = ca.jacobian(ca.vertcat(*residuals), x)
         weight = ca.diagcat(*(ca.sparsify(ca.DM(one)) for one in weights))

@@ -70,7 +70,7 @@ class CasadiProgram(Peer):
             import casadi as ca
         except ImportError as error:
             raise UnavailableError("CasADi is not installed: pip install casadi") from error
-        self._n, self._count = problem.n, problem.horizon
+        self._n, self._count, self._m = problem.n, problem.horizon, problem.m
         if not ca.has_nlpsol(self.plugin):
             raise UnavailableError(f"this CasADi comes without {self.plugin}")
         options = self.options(problem)
@@ -78,8 +78,8 @@ class CasadiProgram(Peer):
         if self.compiled:
             solver = self._compile(ca, solver, options)
         self._prepare(solver)
-        x = ca.SX.sym("x", problem.n)
-        self._model = InPlace(ca.Function("f", [x], [problem.step(x)]))
+        x, u = ca.SX.sym("x", problem.n), ca.SX.sym("u", problem.m)
+        self._model = InPlace(ca.Function("f", [x, u], [problem.step(x, u)]))
 
     def _program(self, ca: Any, problem: Problem) -> dict[str, Any]:
         n, p, count, cost = problem.n, problem.p, problem.horizon, problem.cost
@@ -87,16 +87,17 @@ class CasadiProgram(Peer):
         kind = ca.MX if by_stage else ca.SX
         step, output = problem.step, problem.output
         if by_stage:
-            x = ca.SX.sym("x", n)
-            step = ca.Function("f", [x], [step(x)])
+            x, u = ca.SX.sym("x", n), ca.SX.sym("u", problem.m)
+            step = ca.Function("f", [x, u], [step(x, u)])
             output = ca.Function("h", [x], [output(x)])
         states = [kind.sym(f"x{i}", n) for i in range(count + 1)]
         prior, measured = kind.sym("prior", n), kind.sym("y", p, count)
+        inputs = kind.sym("u", problem.m, count)
         offset = states[0] - prior
         objective = offset.T @ cost.prior @ offset
         variables, gaps = [], []
         for i in range(count):
-            moved = step(states[i])
+            moved = step(states[i], inputs[:, i])
             variables.append(states[i])
             if self.form == "states":
                 w = states[i + 1] - moved
@@ -108,7 +109,7 @@ class CasadiProgram(Peer):
             objective += w.T @ cost.disturbance @ w + v.T @ cost.noise @ v
         return {
             "x": ca.vertcat(*variables, states[count]),
-            "p": ca.veccat(prior, measured),
+            "p": ca.veccat(prior, measured, inputs),
             "f": objective,
             "g": ca.vertcat(*gaps),
         }
@@ -135,19 +136,21 @@ class CasadiProgram(Peer):
         self._stages = answer[: count * width].reshape(count, width)
         self._end = answer[count * width :]
         parameters = call.arguments["p"]
-        self._prior, self._measured = parameters[:n], parameters[n:].reshape(count, -1)
+        self._prior, first = parameters[:n], parameters.size - self._m * count
+        self._measured = parameters[n:first].reshape(count, -1)
+        self._inputs = parameters[first:].reshape(count, self._m)
         self._continues = False
 
     def restart(self) -> None:
         """Do not start at another record's solution."""
         self._continues = False
 
-    def _shift(self) -> None:
+    def _shift(self, newest_input: Array) -> None:
         n, model = self._n, self._model
         self._start_stages[:-1] = self._stages[1:]
         self._start_stages[-1, :n] = self._end
         self._start_stages[-1, n:] = 0.0
-        model.arguments["i0"][:] = self._end
+        model.arguments["i0"][:], model.arguments["i1"][:] = self._end, newest_input
         model()
         self._start_end[:] = model.results["o0"]
         if self.multipliers and self.form == "shooting":
@@ -158,7 +161,7 @@ class CasadiProgram(Peer):
         """Solve, and hand out the states."""
         n = self._n
         if self._continues and self.start == "shifted" and np.isfinite(self._end).all():
-            self._shift()
+            self._shift(window.newest_input)
         else:
             self._start_stages[:, :n] = window.candidate[:-1]
             if self.form == "shooting":
@@ -168,6 +171,7 @@ class CasadiProgram(Peer):
         self._continues = True
         self._prior[:] = window.prior
         self._measured[:] = window.measurements
+        self._inputs[:] = window.inputs
         self._call()
         trajectory = np.empty((self._count + 1, n))
         trajectory[:-1] = self._stages[:, :n]
@@ -212,8 +216,10 @@ class InPlace:
         self._trigger()
 
 
-def compile_library(source: Path) -> Path:
+def compile_library(source: Path, further: tuple[str, ...] = ()) -> Path:
     """A C file made into a shared library, which is kept in qpmhe's cache on disk.
+
+    Further arguments of the compiler name headers and libraries.
 
     Raises
     ------
@@ -224,14 +230,15 @@ def compile_library(source: Path) -> Path:
     if compiler is None:
         raise UnavailableError("no C compiler (cc, gcc or clang) found")
     command = [*compiler, *FLAGS, "-fPIC", "-shared"]
-    digest = hashlib.sha256(source.read_bytes() + " ".join(command).encode()).hexdigest()[:32]
+    key = source.read_bytes() + " ".join((*command, *further)).encode()
+    digest = hashlib.sha256(key).hexdigest()[:32]
     folder = cache_directory() / "benchmarks"
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / f"{digest}.so"
     if not library.exists():
         made = source.with_suffix(".so")
         done = subprocess.run(
-            [*command, str(source), "-o", str(made), "-lm"],
+            [*command, str(source), "-o", str(made), *further, "-lm"],
             capture_output=True, text=True, check=False,
         )
         if done.returncode:

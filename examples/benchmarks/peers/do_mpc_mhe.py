@@ -70,7 +70,8 @@ class DoMpc(Peer):
         x = model.set_variable("_x", "x", shape=(n, 1))
         model.set_variable("_p", "prior", shape=(n, 1))
         model.set_variable("_p", "oldest", shape=(p, 1))
-        model.set_rhs("x", problem.step(x), process_noise=True)
+        u = model.set_variable("_tvp", "u", shape=(problem.m, 1)) if problem.m else None
+        model.set_rhs("x", problem.step(x, u), process_noise=True)
         model.set_meas("y", problem.output(x), meas_noise=True)
         model.setup()
         mhe = do_mpc.estimator.MHE(model, [])
@@ -88,6 +89,9 @@ class DoMpc(Peer):
         self._parameters, self._measurements = mhe.get_p_template(), mhe.get_y_template()
         mhe.set_p_fun(lambda _: self._parameters)
         mhe.set_y_fun(lambda _: self._measurements)
+        if problem.m:
+            self._inputs = mhe.get_tvp_template()
+            mhe.set_tvp_fun(lambda _: self._inputs)
         mhe.setup()
         self._mhe = mhe
 
@@ -116,9 +120,11 @@ class DoMpc(Peer):
         self._parameters["oldest"] = y[0]
         for k in range(self._stages):
             self._measurements["y_meas", k] = y[k + 1]
+            if self._problem.m:
+                self._inputs["_tvp", k, "u"] = window.inputs[k]
         mhe.make_step(window.newest)
         states = [state.full().ravel() for state in mhe.opt_x_num["_x", :, -1]]
-        states.append(self._problem.system.f(states[-1], np.zeros(0)))
+        states.append(self._problem.system.f(states[-1], window.newest_input))
         return np.array(states)
 
     def close(self) -> None:

@@ -34,16 +34,17 @@ class FilterpyEkf(Peer):
         except ImportError as error:
             raise UnavailableError("not installed: pip install filterpy casadi") from error
         self._problem = problem
-        x = ca.SX.sym("x", problem.n)
-        moved, seen = problem.step(x), problem.output(x)
-        self._move = _Linearized(ca, x, moved)
-        self._see = _Linearized(ca, x, seen)
+        x, u = ca.SX.sym("x", problem.n), ca.SX.sym("u", problem.m)
+        moved, seen = problem.step(x, u), problem.output(x)
+        self._move = _Linearized(ca, x, u, moved)
+        self._see = _Linearized(ca, x, u, seen)
         move = self._move
 
         class Filter(ExtendedKalmanFilter):  # type: ignore[misc]  # it has no types
             """The nonlinear prediction, which filterpy leaves to a subclass."""
 
             def predict_x(self, u: Any = 0) -> None:
+                move.hold(u)
                 self.x, self.F = move.evaluate(self.x)
 
         self._class = Filter
@@ -61,19 +62,24 @@ class FilterpyEkf(Peer):
     def update(self, window: WindowData) -> Array:
         """Correct by y(t), and predict x(t+1)."""
         self._filter.update(window.newest, self._see.jacobian_at, self._see.value_at)
-        self._filter.predict()
+        self._filter.predict(window.newest_input)
         state: Array = self._filter.x
         return state.copy()
 
 
 class _Linearized:
-    """A function of x with its Jacobian, both from one call."""
+    """A function of x and u with its Jacobian by x, both from one call."""
 
-    def __init__(self, ca: Any, x: Any, value: Any) -> None:
+    def __init__(self, ca: Any, x: Any, u: Any, value: Any) -> None:
         slope = ca.densify(ca.jacobian(value, x))
-        self._call = InPlace(ca.Function("f", [x], [value, slope], ["x"], ["value", "slope"]))
+        names = ["x", "u"], ["value", "slope"]
+        self._call = InPlace(ca.Function("f", [x, u], [value, slope], *names))
         self._x, self._value = self._call.arguments["x"], self._call.results["value"]
         self._slope = self._call.results["slope"].reshape(x.shape[0], value.shape[0]).T
+
+    def hold(self, u: Array) -> None:
+        """Take u for the calls that follow."""
+        self._call.arguments["u"][:] = u
 
     def evaluate(self, x: Array) -> tuple[Array, Array]:
         self._x[:] = x

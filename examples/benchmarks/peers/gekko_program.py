@@ -35,12 +35,13 @@ class Gekko(Peer):
         model = self._model = GEKKO(remote=False)
         self._prior = [model.Param(0.0) for _ in range(n)]
         self._measured = [[model.Param(0.0) for _ in range(p)] for _ in range(count)]
+        self._inputs = [[model.Param(0.0) for _ in range(problem.m)] for _ in range(count)]
         self._states = [[model.Var(0.0) for _ in range(n)] for _ in range(count + 1)]
         cost, states = problem.cost, self._states
         self._add(cost.prior, [x - z for x, z in zip(states[0], self._prior, strict=True)])
         expressions = _Expressions(problem)
         for i in range(count):
-            moved, seen = expressions.at(model, states[i])
+            moved, seen = expressions.at(model, states[i], self._inputs[i])
             w = [x - f for x, f in zip(states[i + 1], moved, strict=True)]
             v = [y - h for y, h in zip(self._measured[i], seen, strict=True)]
             self._add(cost.disturbance, w)
@@ -61,9 +62,12 @@ class Gekko(Peer):
         """Set all values, solve, and read the states."""
         for parameter, value in zip(self._prior, window.prior, strict=True):
             parameter.value = float(value)
-        for row, values in zip(self._measured, window.measurements, strict=True):
-            for parameter, value in zip(row, values, strict=True):
-                parameter.value = float(value)
+        for rows, given in (
+            (self._measured, window.measurements), (self._inputs, window.inputs)
+        ):
+            for row, values in zip(rows, given, strict=True):
+                for parameter, value in zip(row, values, strict=True):
+                    parameter.value = float(value)
         for row, values in zip(self._states, window.candidate, strict=True):
             for variable, value in zip(row, values, strict=True):
                 variable.value = float(value)
@@ -86,13 +90,13 @@ class _Expressions:
     def __init__(self, problem: Problem) -> None:
         import casadi as ca
 
-        x = ca.SX.sym("x", problem.n)
+        x, u = ca.SX.sym("x", problem.n), ca.SX.sym("u", problem.m)
         self._ca = ca
         self._sizes = (problem.n, problem.p)
-        self._function = ca.Function("model", [x], [problem.step(x), problem.output(x)])
+        self._function = ca.Function("model", [x, u], [problem.step(x, u), problem.output(x)])
 
-    def at(self, model: Any, x: list[Any]) -> tuple[list[Any], list[Any]]:
-        """The model's f and h at a list of GEKKO variables."""
+    def at(self, model: Any, x: list[Any], u: list[Any]) -> tuple[list[Any], list[Any]]:
+        """The model's f and h at lists of GEKKO variables and parameters."""
         ca, function = self._ca, self._function
         binary = {
             ca.OP_ADD: lambda a, b: a + b, ca.OP_SUB: lambda a, b: a - b,
@@ -111,7 +115,7 @@ class _Expressions:
             if operation == ca.OP_CONST:
                 work[gives[0]] = function.instruction_constant(k)
             elif operation == ca.OP_INPUT:
-                work[gives[0]] = x[takes[1]]
+                work[gives[0]] = (x, u)[takes[0]][takes[1]]
             elif operation == ca.OP_OUTPUT:
                 outputs[gives[0]][gives[1]] = work[takes[0]]
             elif operation in binary or operation in unary:

@@ -63,7 +63,7 @@ class Qpmhe(Peer):
 
     def setup(self, problem: Problem) -> None:
         """Build the estimator."""
-        system = problem.system
+        system, self._inputs = problem.system, problem.m > 0
         options: dict[str, Any] = {"engine": "python"}
         if not self.variant.startswith("numpy"):
             system = problem.casadi_system()
@@ -83,5 +83,6 @@ class Qpmhe(Peer):
         self._mhe.reset()
 
     def update(self, window: WindowData) -> Array:
-        """One update, by the newest measurement alone."""
-        return self._mhe.update(window.newest).trajectory
+        """One update, by the newest measurement and input alone."""
+        u = window.newest_input if self._inputs else None
+        return self._mhe.update(window.newest, u).trajectory
