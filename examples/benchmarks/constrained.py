@@ -6,6 +6,7 @@ and on the velocities. In one run, on one thread, all take the same windows:
 
 - the compiled step, converged and with one QP;
 - the Python step, converged, by the default backend and by PIQP;
+- acados with HPIPM, converged and one iteration, where ACADOS_SOURCE_DIR is set;
 - CasADi's ``sqpmethod`` with HPIPM, converged, with the Gauss-Newton Hessian, from its previous
   solution, and the time of one of its QPs;
 - PIQP's own update and solve of the Python step's QPs, whose structure it knows already.
@@ -33,15 +34,20 @@ import casadi as ca
 import numpy as np
 import piqp
 from numpy.typing import NDArray
+from peers import UnavailableError, WindowData
+from peers.acados_window import Acados, Bounds
 from report import environment
 from rich.console import Console
 from rich.table import Table
+from stopwatch import timed
 
 import qpmhe
 from qpmhe.models.chain import casadi_output, casadi_rate
 from qpmhe_solvers import QP, RawSolution, Solver, SolverOptions
 
 MASSES, DIMENSION, HORIZON = 2, 3, 30
+# Samples that an estimator takes before it is the next one's turn.
+TURN = 10
 Array = NDArray[np.float64]
 
 
@@ -84,6 +90,15 @@ class Multistage(Solver):
         return RawSolution(np.array(result.x), solved, int(result.info.iter), bounds, duals, "")
 
 
+def moved(dt: float, x: Any) -> Any:
+    """One Runge-Kutta step for a CasADi column."""
+    rate = casadi_rate(MASSES, DIMENSION)
+    k1 = rate(x)
+    k2 = rate(x + dt / 2 * k1)
+    k3 = rate(x + dt / 2 * k2)
+    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + dt * k3))
+
+
 class Hpipm:
     """The window as a program of CasADi, solved by ``sqpmethod`` with HPIPM.
 
@@ -92,13 +107,9 @@ class Hpipm:
 
     def __init__(self, example: Any, sets: dict[str, Any]) -> None:
         n, p, cost, dt = example.system.n, example.system.p, example.cost, example.system.dt
-        rate, output = casadi_rate(MASSES, DIMENSION), casadi_output(MASSES, DIMENSION)
+        output = casadi_output(MASSES, DIMENSION)
         x = ca.SX.sym("x", n)
-        k1 = rate(x)
-        k2 = rate(x + dt / 2 * k1)
-        k3 = rate(x + dt / 2 * k2)
-        moved = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + dt * k3))
-        step = self._step = ca.Function("f", [x], [moved])
+        step = self._step = ca.Function("f", [x], [moved(dt, x)])
         free = {"states": n, "disturbances": n, "noises": p}
         X, W, V = (
             sets.get(name, qpmhe.Box(np.full(size, -np.inf), np.full(size, np.inf)))
@@ -169,6 +180,57 @@ class Hpipm:
         return cost, seconds, stats["t_proc_QP"] / qps
 
 
+class Windows:
+    """acados' solver of the windows, with the boxes as bounds of its states and controls."""
+
+    def __init__(self, example: Any, sets: dict[str, Any], max_qps: int | None) -> None:
+        system = example.system
+        n, p = system.n, system.p
+        self._noises, X, W = (sets.get(one) for one in ("noises", "states", "disturbances"))
+        # The outputs are the positions, which the bounds of v bound.
+        bounded = [] if X is None else list(np.flatnonzero(np.isfinite(X.lower)))
+        bounded = list(range(p)) if self._noises is not None else bounded
+        self._lower, self._upper = np.zeros((2, HORIZON + 1, len(bounded)))
+        if X is not None:
+            self._lower[:], self._upper[:] = X.lower[bounded], X.upper[bounded]
+        self._peer = Acados(max_qps)
+        self._peer.build(
+            lambda x, _: moved(system.dt, x), casadi_output(MASSES, DIMENSION), example.cost,
+            (HORIZON, n, p, 0), Bounds(
+                bounded, self._lower, self._upper, X is not None,
+                None if W is None else np.array([W.lower, W.upper]),
+            ),
+        )
+
+    def update(self, estimate: qpmhe.Estimate, measurements: Array) -> tuple[Array, float]:
+        """Solve the window of an estimate: the trajectory, and the seconds."""
+        if self._noises is not None:
+            self._lower[:-1] = measurements - self._noises.upper
+            self._upper[:-1] = measurements - self._noises.lower
+        candidate, nothing = estimate.candidate, np.zeros((HORIZON, 0))
+        window = WindowData(
+            measurements[-1], nothing[0], candidate[0], measurements, nothing, candidate,
+            np.zeros((HORIZON, candidate.shape[1])),
+        )
+        try:
+            found, seconds, _ = timed(self._peer.update, window)
+        except RuntimeError:  # a window without a solution, perhaps
+            self._peer.restart()
+            return np.full(candidate.shape, np.nan), np.nan
+        return found, seconds
+
+
+def cost(example: Any, trajectory: Array, prior: Array, measurements: Array) -> float:
+    """J of a trajectory."""
+    f, h, weights = example.system.f, example.system.h, example.cost
+    u = np.zeros(0)
+    value = (trajectory[0] - prior) @ weights.prior @ (trajectory[0] - prior)
+    for x, following, y in zip(trajectory[:-1], trajectory[1:], measurements, strict=True):
+        w, v = following - f(x, u), y - h(x, u)
+        value += w @ weights.disturbance @ w + v @ weights.noise @ v
+    return float(value)
+
+
 @dataclass
 class Case:
     """What was measured with one choice of sets."""
@@ -178,6 +240,7 @@ class Case:
     gap: float = 0.0
     solved: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
+    acados: dict[str, float] | None = None
 
 
 def measured(name: str, sets: dict[str, Any], steps: int) -> Case:
@@ -189,24 +252,61 @@ def measured(name: str, sets: dict[str, Any], steps: int) -> Case:
         n=example.system.n, **sets,
     )
     record = scenario.simulate(0, steps).measurements
-
-    def run(**options: Any) -> list[qpmhe.Estimate]:
-        mhe = qpmhe.MovingHorizonEstimator(
+    options: dict[str, dict[str, Any]] = {
+        "compiled, converged": {"engine": "compiled", "max_qps": None},
+        "compiled, one QP": {"engine": "compiled"},
+        "Python, converged": {"engine": "python", "max_qps": None},
+        "Python by PIQP, converged": {"engine": "python", "max_qps": None, "backend": "piqp"},
+        "multistage": {"engine": "python", "max_qps": None, "backend": "multistage"},
+    }
+    ours = {
+        name: qpmhe.MovingHorizonEstimator(
             system, example.observer, example.cost, horizon=HORIZON,
-            initial_state=scenario.initial_estimate, **options,
-        )
-        return [mhe.update(y) for y in record][HORIZON:]
-
-    converged, single = run(engine="compiled", max_qps=None), run(engine="compiled")
-    plain, by_piqp = (
-        run(engine="python", max_qps=None, backend=backend) for backend in ("auto", "piqp")
-    )
-    Multistage.seconds = []
-    run(engine="python", backend="multistage", max_qps=None)
+            initial_state=scenario.initial_estimate, **own,
+        ) for name, own in options.items()
+    }
+    estimates: dict[str, list[qpmhe.Estimate]] = {one: [] for one in ours}
+    times: dict[str, list[float]] = {one: [] for one in ours}
     peer, theirs = Hpipm(example, sets), []
-    for t, estimate in enumerate(converged, HORIZON):
-        theirs.append(peer.update(estimate, record[t + 1 - HORIZON : t + 1]))
+    others: dict[str, Windows] = {}
+    try:
+        others = {
+            "acados, converged": Windows(example, sets, None),
+            "acados, one QP": Windows(example, sets, 1),
+        }
+    except UnavailableError as error:
+        Console().print(f"left out: acados: {error}", highlight=False)
+    answers: dict[str, list[tuple[Array, float]]] = {one: [] for one in others}
+    Multistage.seconds = []
+    for begin in range(0, steps, TURN):
+        share = range(begin, min(begin + TURN, steps))
+        for one, mhe in ours.items():
+            for t in share:
+                estimate, seconds, _ = timed(mhe.update, record[t])
+                estimates[one].append(estimate)
+                times[one].append(seconds)
+        windows = [
+            (estimates["compiled, converged"][t], record[t + 1 - HORIZON : t + 1])
+            for t in share if t >= HORIZON
+        ]
+        for one, other in others.items():
+            answers[one] += [other.update(*window) for window in windows]
+        theirs += [peer.update(*window) for window in windows]
+    converged = estimates["compiled, converged"][HORIZON:]
     solved = [k for k, (cost, _, _) in enumerate(theirs) if np.isfinite(cost)]
+    deviations = np.sqrt(np.diag(np.linalg.inv(example.cost.prior)))
+    pairs = [
+        (k, found) for k, (found, _) in enumerate(answers.get("acados, converged", []))
+        if np.isfinite(found).all()
+    ]
+    differences = [
+        float(np.abs((found - converged[k].trajectory) / deviations).max()) for k, found in pairs
+    ]
+    gaps = [
+        abs(cost(
+            example, found, converged[k].candidate[0], record[k + 1 : k + 1 + HORIZON]
+        ) / converged[k].cost - 1.0) for k, found in pairs
+    ]
     points = {"disturbances": "disturbances", "noises": "noises", "states": "trajectory"}
     active = []
     for estimate in converged:
@@ -222,14 +322,22 @@ def measured(name: str, sets: dict[str, Any], steps: int) -> Case:
         max(abs(theirs[k][0] - converged[k].cost) / converged[k].cost for k in solved),
         len(solved) / len(theirs),
         {
-            "compiled, converged": middle(e.step_time for e in converged),
-            "Python, converged": middle(e.step_time for e in plain),
-            "Python by PIQP, converged": middle(e.step_time for e in by_piqp),
+            **{
+                one: middle(times[one][HORIZON:])
+                for one in ours if one != "multistage"
+            },
+            **{
+                one: middle(seconds for _, seconds in answers[one] if np.isfinite(seconds))
+                for one in others
+            },
             "HPIPM, converged": middle(theirs[k][1] for k in solved),
-            "compiled, one QP": middle(e.step_time for e in single),
             "HPIPM, one QP": middle(theirs[k][2] for k in solved),
             "PIQP, one QP": middle(Multistage.seconds[len(Multistage.seconds) // 3 :]),
         },
+        {
+            "difference": max(differences), "cost_gap": max(gaps),
+            "solved": len(pairs) / len(converged),
+        } if pairs else None,
     )
 
 
@@ -270,10 +378,12 @@ def main() -> None:
     for row in cases[0].seconds:
         table.add_row(row, *(f"{1e6 * one.seconds[row]:.0f}" for one in cases))
     for row in ("converged", "one QP"):
-        table.add_row(f"compiled / HPIPM, {row}", *(
-            f"{one.seconds[f'compiled, {row}'] / one.seconds[f'HPIPM, {row}']:.2f}"
-            for one in cases
-        ))
+        for other in ("HPIPM", "acados"):
+            if f"{other}, {row}" in cases[0].seconds:
+                table.add_row(f"compiled / {other}, {row}", *(
+                    f"{one.seconds[f'compiled, {row}'] / one.seconds[f'{other}, {row}']:.2f}"
+                    for one in cases
+                ))
     for other in ("Python by PIQP", "HPIPM"):
         table.add_row(f"Python / {other}, converged", *(
             f"{one.seconds['Python, converged'] / one.seconds[f'{other}, converged']:.2f}"
@@ -286,6 +396,13 @@ def main() -> None:
             f"{one.gap:.0e}, {100 * one.solved:.0f} % of the windows solved by sqpmethod.",
             highlight=False,
         )
+        if one.acados is not None:
+            console.print(
+                f"{one.name}: acados solved {100 * one.acados['solved']:.0f} % of the windows. "
+                f"Converged, costs agree to {one.acados['cost_gap']:.0e} and trajectories to "
+                f"{one.acados['difference']:.0e} standard deviations of the prior.",
+                highlight=False,
+            )
     if max(one.gap for one in cases) > 1e-4:
         raise SystemExit("the costs differ: nothing to compare")
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -294,6 +411,7 @@ def main() -> None:
         "cases": [
             {
                 "sets": one.name, "active_rows": one.active, "cost_gap": one.gap,
+                "acados": one.acados,
                 "us": {row: 1e6 * seconds for row, seconds in one.seconds.items()},
             }
             for one in cases

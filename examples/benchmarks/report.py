@@ -181,8 +181,9 @@ def show(console: Console, result: Measurement) -> None:
             f"Other processes had the processor for {result.waited:.0%} of the time; this is taken "
             "off, but their traffic in caches and memory is not.", highlight=False,
         )
-    for name, reason in result.left_out:
-        console.print(f"left out: {name}: {reason}", highlight=False, markup=False)
+    for reason in dict.fromkeys(reason for _, reason in result.left_out):
+        names = "; ".join(name for name, own in result.left_out if own == reason)
+        console.print(f"left out: {names}: {reason}", highlight=False, markup=False)
 
 
 def _short(microseconds: float) -> str:

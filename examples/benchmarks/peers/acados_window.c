@@ -179,9 +179,12 @@ void *window_make(const Sizes *sizes, const Arrays *arrays, const double *const 
     one->options = ocp_nlp_solver_opts_create(one->config, one->dims);
     /* The fastest of HPIPM's modes leaves the multipliers of the dynamics undetermined, so that no
        residual tells when SQP has converged; the step does. */
-    int most = 100;
+    int most = 100, hot = 2;
+    double complementarity = 1e-6;
     ocp_nlp_solver_opts_set(one->config, one->options, "qp_hpipm_mode", (void *)"SPEED_ABS");
     ocp_nlp_solver_opts_set(one->config, one->options, "qp_cond_N", &N);
+    ocp_nlp_solver_opts_set(one->config, one->options, "qp_warm_start", &hot);
+    ocp_nlp_solver_opts_set(one->config, one->options, "qp_tol_comp", &complementarity);
     if (!sizes->capped) {
         double smallest = sizes->smallest;
         ocp_nlp_solver_opts_set(one->config, one->options, "max_iter", &most);
