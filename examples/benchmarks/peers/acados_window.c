@@ -8,20 +8,10 @@ x(0) - prior. u(i) are acados' parameters. The matrices are column-major. */
 #include <stdlib.h>
 #include <string.h>
 
-#include "acados_c/external_function_interface.h"
 #include "acados_c/ocp_nlp_interface.h"
 
-/* CasADi's functions, which stand above: window_step of (x, w, u) to f(x, u) + w, and window_step_jac,
-which also has the transposed Jacobian by (w, x). */
-#define TAKE(made, name, options) do { \
-        (made)->casadi_fun = (int (*)(const double **, double **, int *, double *, void *))name; \
-        (made)->casadi_work = &name##_work; \
-        (made)->casadi_sparsity_in = &name##_sparsity_in; \
-        (made)->casadi_sparsity_out = &name##_sparsity_out; \
-        (made)->casadi_n_in = &name##_n_in; \
-        (made)->casadi_n_out = &name##_n_out; \
-        external_function_external_param_casadi_create(made, options); \
-    } while (0)
+/* CasADi's functions, which stand above: window_step of (x, w, u) to f(x, u) + w, and
+window_step_jac, which also has the transposed Jacobian by (w, x). */
 
 typedef struct {
     int stages, n, p, m;
@@ -106,8 +96,8 @@ static void model(Window *one)
     one->steps = calloc(N, sizeof *one->steps);
     one->slopes = calloc(N, sizeof *one->slopes);
     for (int i = 0; i < N; i++) {
-        TAKE(one->steps + i, window_step, &options);
-        TAKE(one->slopes + i, window_step_jac, &options);
+        TAKE(one->steps + i, window_step, external_param_casadi, &options);
+        TAKE(one->slopes + i, window_step_jac, external_param_casadi, &options);
         ocp_nlp_dynamics_model_set_external_param_fun(
             one->config, one->dims, one->in, i, "disc_dyn_fun", one->steps + i);
         ocp_nlp_dynamics_model_set_external_param_fun(

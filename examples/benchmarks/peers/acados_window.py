@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import ctypes
-import os
-import tempfile
 from collections.abc import Sequence
-from contextlib import chdir
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from problems import Problem
 
+from .acados_library import acados_library
 from .base import Array, Peer, UnavailableError, WindowData
-from .casadi_program import compile_library
 
 __all__ = ["Acados", "Bounds"]
-
-_SOURCE = Path(__file__).with_name("acados_window.c")
 
 
 class _Sizes(ctypes.Structure):
@@ -180,36 +174,15 @@ def _linear(output: Any, n: int) -> tuple[Array, Array]:
 
 def _library(step: Any, n: int, m: int) -> ctypes.CDLL:
     """The model's functions and the calls of acados, compiled together."""
-    named = os.environ.get("ACADOS_SOURCE_DIR")
-    if not named:
-        raise UnavailableError("ACADOS_SOURCE_DIR is not set")
-    root = Path(named).absolute()
-    if not (root / "lib" / "libacados.so").exists():
-        raise UnavailableError(f"no lib/libacados.so in {root}; build acados and install it there")
-    for name in ("blasfeo", "hpipm"):  # where libacados.so does not know their place
-        ctypes.CDLL(str(root / "lib" / f"lib{name}.so"), mode=ctypes.RTLD_GLOBAL)
     import casadi as ca
 
     x, w, u = ca.SX.sym("x", n), ca.SX.sym("w", n), ca.SX.sym("u", m)
     moved = step(x, u) + w
-    slope = ca.jacobian(moved, ca.vertcat(w, x))
-    with tempfile.TemporaryDirectory(prefix="mhe_") as folder, chdir(folder):
-        written = ca.CodeGenerator("model", {"casadi_int": "int", "with_header": False})
-        written.add(ca.Function("window_step", [x, w, u], [moved]))
-        written.add(ca.Function("window_step_jac", [x, w, u], [moved, ca.densify(slope.T)]))
-        written.generate()
-        source = Path("window.c").absolute()
-        source.write_text(
-            Path("model.c").read_text(encoding="ascii") + _SOURCE.read_text(encoding="ascii"),
-            encoding="ascii",
-        )
-        include, libraries = root / "include", root / "lib"
-        library = compile_library(source, (
-            f"-I{include}", f"-I{include / 'blasfeo' / 'include'}",
-            f"-I{include / 'hpipm' / 'include'}", f"-L{libraries}", f"-Wl,-rpath,{libraries}",
-            "-lacados", "-lhpipm", "-lblasfeo",
-        ))
-    return ctypes.CDLL(str(library))
+    slope = ca.densify(ca.jacobian(moved, ca.vertcat(w, x)).T)
+    return acados_library([
+        ca.Function("window_step", [x, w, u], [moved]),
+        ca.Function("window_step_jac", [x, w, u], [moved, slope]),
+    ], "acados_window.c")
 
 
 def _diagonal(*blocks: Array) -> Array:

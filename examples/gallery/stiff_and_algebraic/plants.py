@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from examples.benchmarks.fermentation import equations as fermentation
 from examples.benchmarks.swing import equations as swing
 
 from ..problem import Array
@@ -96,19 +97,8 @@ def penicillin(
     x: list[Any], _: list[Any], u: list[Any], parameters: list[Any], of: ModuleType
 ) -> tuple[Any, ...]:
     """Biomass, product and substrate (g/L) and volume (L); feed (g/h), of 500 g/L; the yield."""
-    biomass, product, substrate, volume = x
-    # Stages of a step may have some less than none: there, these rates would have poles.
-    size = of.fabs(substrate)
-    growing = 0.11 * substrate / (0.006 * biomass + size) * biomass
-    making = 0.0055 * substrate / (1e-4 + size * (1.0 + size / 0.1)) * biomass
-    living = 0.029 * substrate / (1e-4 + size) * biomass
-    diluting = u[0] / (500.0 * volume)
-    used = growing / parameters[0] + making / 1.2 + living
-    return (
-        [growing - diluting * biomass, making - (0.01 + diluting) * product,
-         (500.0 - substrate) * diluting - used, u[0] / 500.0],
-        [], [volume, growing, biomass, product],
-    )
+    rates, outputs = fermentation(x, u, parameters[0], of)
+    return rates, [], outputs
 
 
 def polymerisation(
