@@ -34,7 +34,7 @@ from implicit_models import ESTIMATED, MILD, Array, Model
 from peers import UnavailableError
 from peers.acados_integrator import AcadosIntegrator
 from peers.casadi_program import InPlace, compile_library
-from report import environment
+from report import environment, tell_once
 from rich.console import Console
 from rich.table import Table
 from stopwatch import timed
@@ -170,14 +170,12 @@ def estimates(model: Model, samples: int) -> list[dict[str, Any]]:
             lambda sample: slow.update(sample[0], sample[1]).filtered
         )
     except qpmhe.errors.ModelError as error:  # its Newton iteration does not find the stages
-        Console().print(
-            f"{model.name}: left out: fast_newton: {error}", highlight=False, markup=False
-        )
+        tell_once(f"{model.name}: left out: fast_newton: {error}")
     try:
         other = do_mpc_step(model)
         calls["do-mpc"] = lambda sample: other((sample[0], sample[2]))
     except ImportError:
-        Console().print("do-mpc is not installed")
+        tell_once("left out: do-mpc is not installed")
     times: dict[str, list[float]] = {name: [] for name in calls}
     errors: dict[str, list[Array]] = {name: [] for name in calls}
     for t in range(samples):
@@ -281,7 +279,7 @@ def step_times(model: Model, count: int) -> dict[str, Any]:
         calls["acados"] = by_acados(model, x, u, False)
         calls["acados, one Jacobian"] = by_acados(model, x, u, True)
     except UnavailableError as error:
-        Console().print(f"left out: acados: {error}", highlight=False)
+        tell_once(f"left out: acados: {error}")
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(40):
         for name, call in calls.items():

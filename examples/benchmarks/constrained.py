@@ -36,7 +36,7 @@ import piqp
 from numpy.typing import NDArray
 from peers import UnavailableError, WindowData
 from peers.acados_window import Acados, Bounds
-from report import environment
+from report import environment, tell_once
 from rich.console import Console
 from rich.table import Table
 from stopwatch import timed
@@ -275,7 +275,7 @@ def measured(name: str, sets: dict[str, Any], steps: int) -> Case:
             "acados, one QP": Windows(example, sets, 1),
         }
     except UnavailableError as error:
-        Console().print(f"left out: acados: {error}", highlight=False)
+        tell_once(f"left out: acados: {error}")
     answers: dict[str, list[tuple[Array, float]]] = {one: [] for one in others}
     Multistage.seconds = []
     for begin in range(0, steps, TURN):

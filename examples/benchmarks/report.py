@@ -8,6 +8,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Iterable
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from rich.table import Table
 
 from qpmhe.codegen.compiler import find_compiler
 
-__all__ = ["environment", "picture", "rows", "show", "write"]
+__all__ = ["environment", "picture", "rows", "show", "tell_once", "write"]
 
 #: Shares of the time lost to other processes above this are reported.
 BUSY = 0.03
@@ -100,6 +101,12 @@ def _compiler() -> str | None:
         return None
     done = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)
     return (done.stdout.splitlines() or [compiler[0]])[0]
+
+
+@cache
+def tell_once(text: str) -> None:
+    """Print a line, unless it has been printed."""
+    Console().print(text, highlight=False, markup=False)
 
 
 def rows(result: Measurement) -> list[dict[str, Any]]:
