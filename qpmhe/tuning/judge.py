@@ -14,6 +14,9 @@ from .structures import Structure
 
 # Standard errors by which a gain of the second search is beyond chance.
 _CHANCE = 2.0
+# By how many per cent predictions from the start must be better for it to stay: less says little
+# of weights, which outliers, intervals and gaps depend on, too.
+_MATTERS = 5.0
 
 
 @dataclass(frozen=True)
@@ -115,11 +118,12 @@ def judge(
         )
     best = 2 if share > _CHANCE * doubt else 1
     loss, spread, _ = blocks.gain(scores[best], scores[0])
-    if loss > spread:
+    if loss > spread and (score.truth or loss > _MATTERS):
         return points[0], (
-            f"as at the start: the estimator's mean square {what} on {blocks.name} is larger with "
-            "the tuned weights. The model's error is not white noise, or the records are too "
-            "short; tune with the truth, fewer parameters, or a better model."
+            f"as at the start: the estimator's mean square {what} on {blocks.name} is {loss:.2g} % "
+            f"smaller with these than with the tuned weights (standard error {spread:.2g} %). The "
+            "model's error is not white noise, or the records are too short; tune with the truth, "
+            "fewer parameters, or a better model."
         )
     if best == 2:
         return refined, (

@@ -5,6 +5,7 @@ import functools
 import json
 import signal
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -349,6 +350,22 @@ def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors,
         assert found > least + 0.1
         (note,) = tuning.notes
         assert note.startswith("disturbance level and noise level are outside of their intervals")
+
+
+@pytest.mark.parametrize(("share", "truth", "stays"), [
+    (1.03, False, False), (1.03, True, True), (1.2, False, True), (0.9, False, False),
+])
+def test_the_start_stays_where_it_is_better_by_what_matters(share, truth, stays):
+    """Three blocks agree on the mean square with tuned weights, as a share of that at the start."""
+    block = np.repeat(np.arange(3), 4)
+    blocks = judge.Blocks([SimpleNamespace(block=block, held=np.ones(12, np.bool_))])
+    squares = {0.0: np.ones(12), 1.0: share + 0.002 * (block - 1.0)}
+    score = SimpleNamespace(truth=truth, samples=lambda theta: [squares[min(theta, 1.0)]])
+    structure = SimpleNamespace(start=0.0, weights=lambda theta: theta)
+    theta, text = judge.judge(blocks, score, structure, 1.0, 2.0)
+    assert theta == (0.0 if stays else 1.0)
+    assert text.startswith("as at the start" if stays else "by the likelihood")
+    assert not stays or f"is {100.0 * (share - 1.0) / share:.2g} % smaller with these" in text
 
 
 @pytest.mark.slow
