@@ -154,6 +154,16 @@ def _tables(name: str, rows: list[int], columns: list[int]) -> list[str]:
     )]
 
 
+def _by_rows(name: str, rows: list[int], count: int) -> list[str]:
+    """The order of nonzeros by their rows in C, and where those of each row begin."""
+    order = np.argsort(rows, kind="stable").tolist()
+    first = np.searchsorted(np.sort(rows), range(count + 1)).tolist()
+    return [
+        f"static const int mhe_{name}_{word}[] = {{{', '.join(map(str, table)) or '0'}}};\n"
+        for word, table in (("order", order), ("first", first))
+    ]
+
+
 def _constraint_slopes(model: CasadiModel) -> tuple[Any, Any, Any, Any]:
     """Arguments, values and derivatives of the nonlinear constraints."""
     ca, function = import_casadi(), model.constraints
@@ -410,6 +420,7 @@ def filter_files(
         calls.append(_call(f"mhe_call_{name}", function.name(), function))
     for name, slope in slopes.items():
         calls += _tables(name, *slope.sparsity().get_triplet())
+        calls += _by_rows(name, slope.sparsity().get_triplet()[0], slope.size1())
     if model.is_implicit and functions:
         assert model.how is not None
         name = "mhe_f_jacobian" if model.how.steps == 1 else "mhe_substep_jacobian"
@@ -431,6 +442,7 @@ def _implicit_filter_parts(model: CasadiModel) -> list[str]:
         line for name, rows in (("A", n), ("C", p))
         for line in _tables(name, np.repeat(np.arange(rows), n).tolist(), [*range(n)] * rows)
     ]
+    tables += _by_rows("A", np.repeat(np.arange(n), n).tolist(), n)
     return [*tables, *_model_parts(model, False), template("filter_implicit.c")]
 
 

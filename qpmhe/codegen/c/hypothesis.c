@@ -1,6 +1,8 @@
 /* A record under a hypothesis: the extended Kalman filter of qpmhe/diagnosis/bank.py, which is
  * linearised behind its measurement update for the step, in units of the usual noise. */
 
+#include <float.h>
+
 /* A hypothesis: the record as it has it, and the filter's numbers. */
 typedef struct {
     const real *start, *prior, *disturbance, *noise; /* R in units: one, or one of each sample */
@@ -19,14 +21,19 @@ typedef struct {
     real *outputs, *gains;
 } mhe_filtered;
 
-/* out += (I + scale (A - I)) B, by the nonzeros of A. */
-static void mhe_add_moved(const real *A, real scale, const real *B, real *out)
+/* out += (I + scale (A - I)) B, by the nonzeros of A: each row is summed up in registers. */
+static void mhe_add_moved(const real *A, real scale, const real *restrict B, real *restrict out)
 {
-    for (int i = 0; scale != 1 && i < NX * NX; i++) out[i] += (1 - scale) * B[i];
-    for (int a = 0; a < MHE_A_NONZEROS; a++) {
-        const real factor = scale * A[a], *from = B + mhe_A_column[a] * NX;
-        real *to = out + mhe_A_row[a] * NX;
-        for (int j = 0; j < NX; j++) to[j] += factor * from[j];
+    for (int i = 0; i < NX; i++) {
+        real row[NX];
+        for (int j = 0; j < NX; j++) row[j] = out[i * NX + j];
+        for (int j = 0; scale != 1 && j < NX; j++) row[j] += (1 - scale) * B[i * NX + j];
+        for (int k = mhe_A_first[i]; k < mhe_A_first[i + 1]; k++) {
+            const int a = mhe_A_order[k];
+            const real factor = scale * A[a], *from = B + mhe_A_column[a] * NX;
+            for (int j = 0; j < NX; j++) row[j] += factor * from[j];
+        }
+        for (int j = 0; j < NX; j++) out[i * NX + j] = row[j];
     }
 }
 
@@ -42,26 +49,69 @@ static void mhe_move_covariance(const real *A, real scale, const real *Q, real *
 }
 
 /* P = (I - K C) P (I - K C)' + K R K', with C P in `seen` and K by columns. */
-static void mhe_correct_covariance(const real *C, const real *seen, const real *K,
-                                   const real *noise, real *P)
+static void mhe_correct_covariance(const real *C, const real *restrict seen,
+                                   const real *restrict K, const real *noise, real *restrict P)
 {
-    real weighed[NY * NX] = {0}; /* K R - (I - K C) P C', by columns */
-    for (int j = 0; j < NX; j++)
+    real weighed[NY * NX]; /* K R - (I - K C) P C', by columns */
+    for (int j = 0; j < NX; j++) {
+        real row[NX];
+        for (int l = 0; l < NX; l++) row[l] = P[j * NX + l];
         for (int i = 0; i < NY; i++)
-            for (int l = 0; l < NX; l++) P[j * NX + l] -= seen[i * NX + j] * K[i * NX + l];
-    for (int i = 0; i < NY; i++)
+            for (int l = 0; l < NX; l++) row[l] -= seen[i * NX + j] * K[i * NX + l];
+        for (int l = 0; l < NX; l++) P[j * NX + l] = row[l];
+    }
+    for (int i = 0; i < NY; i++) {
+        real row[NX] = {0};
         for (int l = 0; l < NY; l++)
-            for (int j = 0; j < NX; j++)
-                weighed[i * NX + j] += noise[i * NY + l] * K[l * NX + j];
+            for (int j = 0; j < NX; j++) row[j] += noise[i * NY + l] * K[l * NX + j];
+        for (int j = 0; j < NX; j++) weighed[i * NX + j] = row[j];
+    }
     for (int a = 0; a < MHE_C_NONZEROS; a++) {
         const int i = mhe_C_row[a], l = mhe_C_column[a];
         for (int j = 0; j < NX; j++)
             weighed[i * NX + j] -= C[i * NX + l] * P[l * NX + j];
     }
-    for (int j = 0; j < NX; j++)
+    for (int j = 0; j < NX; j++) {
+        real row[NX];
+        for (int l = 0; l < NX; l++) row[l] = P[j * NX + l];
         for (int i = 0; i < NY; i++)
-            for (int l = 0; l < NX; l++) P[j * NX + l] += K[i * NX + j] * weighed[i * NX + l];
+            for (int l = 0; l < NX; l++) row[l] += K[i * NX + j] * weighed[i * NX + l];
+        for (int l = 0; l < NX; l++) P[j * NX + l] = row[l];
+    }
     mhe_symmetrise(NX, P);
+}
+
+/* B := S^-1 B and e := S^-1 e for B (NY, NX), as `mhe_solve_for`, which does not know the sizes. */
+static void mhe_solve_gain(const real *S, real *restrict B, real *restrict e)
+{
+    for (int r = 1; r < NY; r++) {
+        real row[NX];
+        for (int c = 0; c < NX; c++) row[c] = B[r * NX + c];
+        for (int j = 0; j < r; j++) {
+            const real factor = S[j * NY + r] / S[j * NY + j];
+            for (int c = 0; c < NX; c++) row[c] -= factor * B[j * NX + c];
+            e[r] -= factor * e[j];
+        }
+        for (int c = 0; c < NX; c++) B[r * NX + c] = row[c];
+    }
+    for (int j = NY - 1; j >= 0; j--) {
+        real row[NX];
+        for (int c = 0; c < NX; c++) row[c] = B[j * NX + c];
+        for (int r = j + 1; r < NY; r++) {
+            for (int c = 0; c < NX; c++) row[c] -= S[j * NY + r] * B[r * NX + c];
+            e[j] -= S[j * NY + r] * e[r];
+        }
+        for (int c = 0; c < NX; c++) B[j * NX + c] = row[c] / S[j * NY + j];
+        e[j] /= S[j * NY + j];
+    }
+}
+
+/* Whether all are finite: in no order, unlike a sum. */
+static int mhe_finite(int n, const real *a)
+{
+    int infinite = 0;
+    for (int i = 0; i < n; i++) infinite |= !(fabs(a[i]) <= DBL_MAX);
+    return !infinite;
 }
 
 /* Correct x and P by a sample, and add to its log likelihood; 0 where that fails. */
@@ -72,7 +122,7 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
     const real *noise = r->noise + (r->changes ? (size_t)t * NY * NY : 0);
     const real *y = r->y + (size_t)t * NY;
     real expected[NY], nonzeros[SIZE(MHE_C_NONZEROS)], C[NY * NX] = {0}, seen[NY * NX] = {0};
-    real e[NY], S[NY * NY] = {0}, gain[NY * (NX + 1)], K[NY * NX]; /* K by columns */
+    real e[NY], S[NY * NY] = {0}, solved[NY], K[NY * NX]; /* K by columns */
     unsigned char kept[NY];
     mhe_call_output(x, r->u + (size_t)t * (NU + 1), expected, nonzeros);
     for (int a = 0; a < MHE_C_NONZEROS; a++)
@@ -110,12 +160,12 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
         if (!kept[i]) e[i] = 0;
         for (int j = 0; j < NX; j++) {
             if (!kept[i]) C[i * NX + j] = seen[i * NX + j] = 0;
-            gain[i * (NX + 1) + j] = seen[i * NX + j];
+            K[i * NX + j] = seen[i * NX + j];
         }
-        gain[i * (NX + 1) + NX] = e[i];
+        solved[i] = e[i];
     }
-    if (!mhe_all_finite(NX, x) || !mhe_all_finite(NY, e) || !mhe_each_finite(NY * NY, S) ||
-        !mhe_each_finite(NY * NX, C))
+    if (!mhe_all_finite(NX, x) || !mhe_all_finite(NY, e) || !mhe_finite(NY * NY, S) ||
+        !mhe_finite(NY * NX, C))
         return 0;
     if (out) {
         memcpy(out->states + (size_t)t * NX, x, sizeof(real) * NX);
@@ -128,14 +178,11 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
         if (!mhe_invert(NY, copy, out->weights + (size_t)t * NY * NY)) return 0;
     }
     if (!mhe_decompose(NY, S)) return 0;
-    mhe_solve_for(NY, S, NX + 1, gain);
+    mhe_solve_gain(S, K, solved);
     real cost = 0;
     for (int i = 0; i < NY; i++) {
-        cost += (real)0.5 * (e[i] * gain[i * (NX + 1) + NX] + log(S[i * NY + i]));
-        for (int j = 0; j < NX; j++) {
-            K[i * NX + j] = gain[i * (NX + 1) + j];
-            x[j] += K[i * NX + j] * e[i];
-        }
+        cost += (real)0.5 * (e[i] * solved[i] + log(S[i * NY + i]));
+        for (int j = 0; j < NX; j++) x[j] += K[i * NX + j] * e[i];
     }
     *log_ = log_likelihood - cost;
     for (int j = 0; j < NX; j++)
