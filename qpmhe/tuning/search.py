@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -33,6 +34,9 @@ _LIKELY, _STAY = 3e-2, 1e-3
 NORMAL = 1.959964
 # Step of the score's differences; the estimator's iterations make it less smooth than a filter.
 _STEP = 1e-2
+# The search of the estimator ends where a step gains less than this share; a step is one that
+# L-BFGS-B's line search takes: by how much the value falls, and the slope along it.
+_ENDS, _ARMIJO, _WOLFE = 1e-5, 1e-3, 0.9
 _HESSIAN_STEP = 1e-3
 # Newton's steps at most, the gain (in the likelihood's logarithm) that is the last one, curvatures
 # that are none, and how far off a Hessian is still the one of the minimum.
@@ -45,6 +49,10 @@ _SHORT = 1000
 
 class TuningCheckpointError(QpmheError):
     """A checkpoint that is damaged, or belongs to another search."""
+
+
+class _EndedError(Exception):
+    """A search has ended."""
 
 
 class SearchProgress:
@@ -370,6 +378,12 @@ def refine(
     advance(f"estimator, at most about {most:.2g} s")
     anchor = min((theta, structure.start), key=plain)
     best: list[Any] = [anchor if known is None else known, value]
+    # The newest point with a gradient, and the one at which the search stands.
+    newest: list[Any] = []
+    here: list[Any] = []
+
+    def difference(point: Array, move: Array) -> float:
+        return (total(point + move) - total(point - move)) / (2 * _STEP)
 
     def cost(point: Array) -> tuple[float, Array]:
         value, (unlikely, slope) = total(point), likelihood.gradient(point)
@@ -379,16 +393,30 @@ def refine(
         if value < best[1]:
             best[:] = point.copy(), value
         slope = share * slope
+        if here:
+            # Where the search is going to end here, the slope along its way tells.
+            at, before, by = here
+            way, gain = point - at, before - value
+            size = float(np.linalg.norm(way))
+            if -_ARMIJO * (by @ way) <= gain <= _ENDS * max(abs(before), abs(value), 1.0):
+                along = slope @ way + size * difference(point, _STEP / size * way)
+                if abs(along) <= _WOLFE * abs(by @ way):
+                    raise _EndedError
         for k, move in enumerate(_STEP * np.eye(len(point))):
-            slope[k] += (total(point + move) - total(point - move)) / (2 * _STEP)
+            slope[k] += difference(point, move)
             advance(f"estimator, score {best[1]:.5g}")
         checkpoint.note("estimator", best[0], best[1], False)
+        newest[:] = point.copy(), value, slope
+        if not here:
+            here[:] = newest
         return value, slope
 
-    minimize(
-        cost, best[0], jac=True, method="L-BFGS-B", bounds=structure.limits,
-        options={"maxiter": _REFINEMENTS, "ftol": 1e-5},
-    )
+    with suppress(_EndedError):
+        minimize(
+            cost, best[0], jac=True, method="L-BFGS-B", bounds=structure.limits,
+            callback=lambda _: here.__setitem__(slice(None), newest),
+            options={"maxiter": _REFINEMENTS, "ftol": _ENDS},
+        )
     checkpoint.note("estimator", best[0], best[1], True)
     found: Array = best[0]
     return found
