@@ -14,7 +14,7 @@ from qpmhe_solvers.values import finite, shown
 
 from .._checks import Array, numbers, vector
 from ..errors import InvalidInputError, OptionError, ShapeError
-from ..estimation.time_index import paired_record
+from ..estimation.time_index import index_of, paired_record
 from ..model.system import System
 from ..models.scenario import Record
 
@@ -162,7 +162,7 @@ def checked_data(
     records: Any, system: System, inputs: int, initial_state: ArrayLike | None
 ) -> list[Data]:
     """The records as `qpmhe.tune` takes them."""
-    if isinstance(records, (TuningRecord, Record)):
+    if isinstance(records, (TuningRecord, Record)) or index_of(records) is not None:
         records = [records]
     if not isinstance(records, Sequence) or isinstance(records, str) or not len(records):
         raise InvalidInputError(
@@ -183,7 +183,7 @@ def checked_data(
             made = one
         elif isinstance(one, tuple) and 1 <= len(one) <= 3:
             made = TuningRecord(*one)
-        elif isinstance(one, np.ndarray):
+        elif isinstance(one, np.ndarray) or index_of(one) is not None:
             made = TuningRecord(one)
         else:
             raise InvalidInputError(

@@ -85,8 +85,9 @@ def tune(
         The model; or a function ``make(**parameters)`` that makes it.
     records : list
         Of (Y,), (Y, U) or (Y, U, X), arrays of measurements (T, p), inputs (T, m) and true states
-        (T, n) or (T + 1, n); of `qpmhe.tuning.TuningRecord`, which also has lengths of steps; or
-        of simulated records. NaN in Y is a missing measurement.
+        (T, n) or (T + 1, n), Series or DataFrames; of `qpmhe.tuning.TuningRecord`, which also has
+        lengths of steps; or of simulated records. One record without inputs may be a Series or
+        DataFrame itself. NaN in Y is a missing measurement.
     prior, disturbance, noise : (n, n), (r, r) and (p, p) array_like
         Covariances of the initial error, of w and of v to start from, in squared units. A guess
         within a factor of a hundred will do. Zero variances of a disturbance stay zero.

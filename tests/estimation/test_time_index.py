@@ -164,6 +164,17 @@ def test_tuning_pairs_rows_and_fills_gaps():
         np.testing.assert_array_equal(data.truth[dropped], truth[dropped])
 
 
+def test_tuning_takes_a_series_or_a_list_of_them():
+    system = qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1)
+    y = record(INDEXES["dates"])[0].drop(INDEXES["dates"][4])
+    (expected,) = checked_data([(y,)], system, 0, [0.0, 0.0])
+    for records in (y, [y], y["y"], [y["y"]]):
+        (data,) = checked_data(records, system, 0, [0.0, 0.0])
+        np.testing.assert_array_equal(data.y, expected.y)
+    with pytest.raises(InvalidInputError, match=r"records\[0\] has no inputs.*\(measurements, inp"):
+        checked_data(y, discrete(), 1, [0.0, 0.0])
+
+
 def test_a_table_holds_each_state_at_its_own_time(tmp_path):
     y, u = record(INDEXES["zone"])
     rng = np.random.default_rng(0)
