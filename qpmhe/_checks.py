@@ -230,6 +230,20 @@ def check_problem(state: Any, mine: tuple[int, ...]) -> None:
         )
 
 
+def label_list(labels: Sequence[str], n: int | None = None) -> list[str]:
+    """The labels, one for each of the n states, checked."""
+    given = list(labels) if np.iterable(labels) and not isinstance(labels, str) else None
+    if given is None or not all(isinstance(label, str) for label in given):
+        raise InvalidInputError(
+            f"labels are {labels!r}; expected a sequence of strings, one per state."
+        )
+    if len(given) != n if n is not None else not given:
+        raise ShapeError(
+            f"labels are {given}; expected {'at least 1' if n is None else n}, one per state."
+        )
+    return given
+
+
 def need(module: str, purpose: str, extra: str = "studies") -> ModuleType:
     """Import an optional package, or raise with the extra that installs it."""
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 from types import FrameType
 from typing import Any
@@ -15,7 +15,7 @@ from qpmhe_solvers import Solver
 from qpmhe_solvers.errors import report_unknown_options
 from qpmhe_solvers.values import integer, shown
 
-from .._checks import count, flag, numbers, positive
+from .._checks import count, flag, label_list, numbers, positive
 from ..costs import Cost
 from ..errors import InvalidInputError, OptionError, ShapeError
 from ..model.sets import ConvexSet
@@ -34,7 +34,7 @@ from .sample_arguments import SampleArguments, with_parameters
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require, with_scaled_constraints
 from .step_length import TriedInputs, check_step, explosion
-from .time_index import paired_record
+from .time_index import names_of, paired_record
 
 Array = NDArray[np.float64]
 
@@ -213,6 +213,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         self._initial_state: Array
         self._initial_state, self._own_system = self._checked_start(initial_state, own)
         self._first_state = self._initial_state  # which `reset` does not change
+        self._labels = names_of(initial_state)
         if not is_copy:
             usual = self._arguments.usual_input
             check_correction(self._own_system, observer, cost, self._initial_state, usual)
@@ -502,6 +503,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         covariances: bool = False,
         smoothed: int | None = None,
         time_unit: Any = "s",
+        labels: Sequence[str] | None = None,
         may_compile: bool = True,
     ) -> Run:
         """Update with each sample of a record, starting at the current state.
@@ -528,6 +530,9 @@ class MovingHorizonEstimator(EstimatorMemory):
         time_unit : str or pandas.Timedelta
             The model's unit of time, for an index of times and for figures: ``"s"``, ``"min"``,
             ``"h"``, ...
+        labels : sequence of str, optional
+            Names of the states, with units, for the run's page and figures. If left out, those of
+            an ``initial_state`` that is a Series with names, else the model's.
         may_compile : bool
             Whether ``engine="auto"`` may change the engine before the first sample.
 
@@ -546,6 +551,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         """
         flag("covariances", covariances)
         flag("may_compile", may_compile)
+        labels = self._labels if labels is None else label_list(labels, self.system.n)
         if smoothed is not None:
             smoothed = count(
                 "smoothed", smoothed, 0, most=self.horizon - 1,
@@ -570,7 +576,7 @@ class MovingHorizonEstimator(EstimatorMemory):
         except EngineChangeError as change:
             self._change_engine(change)
         if at_once is not None:
-            at_once.source = self.run_source(ys, whole, time_unit=time_unit)
+            at_once.source = self.run_source(ys, whole, None, time_unit, labels)
             at_once.index, at_once.engine_reason = index, reason
             return at_once
         start, observer_start = self.state.copy(), self.observer_state
@@ -590,24 +596,25 @@ class MovingHorizonEstimator(EstimatorMemory):
         run = Run.of(start, estimates, blocks, observer_start=observer_start)
         if late is not None:
             run.smoothed, run.smoothed_covariances = late.smoothed()
-        run.source, run.index = self.run_source(ys, whole, lengths, time_unit), index
+        run.source, run.index = self.run_source(ys, whole, lengths, time_unit, labels), index
         run.engine_reason = reason
         return run
 
     def run_source(
         self, measurements: Array, inputs: Array | None, steps: Array | None = None,
-        time_unit: Any = "s",
+        time_unit: Any = "s", labels: Sequence[str] | None = None,
     ) -> RunSource:
         """The source of a run that is assembled from single updates.
 
         Parameters
         ----------
-        measurements, inputs, steps, time_unit
+        measurements, inputs, steps, time_unit, labels
             As for `RunSource`.
         """
         system, cost = self._engine.usual.applied(self._engine.system, self.cost)
         return RunSource(
-            system, self.observer, cost, self.settings, measurements, inputs, steps, time_unit
+            system, self.observer, cost, self.settings, measurements, inputs, steps, time_unit,
+            self._labels if labels is None else labels,
         )
 
 

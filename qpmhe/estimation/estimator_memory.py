@@ -44,6 +44,7 @@ class EstimatorMemory:
     settings: Settings
     _engine: Engine
     _initial_state: Array
+    _labels: list[str] | None
     _first_state: Array
     _arguments: SampleArguments
     _own_system: System
@@ -292,6 +293,7 @@ class EstimatorMemory:
             "settings": self.settings,
             "first_state": self._first_state,
             "initial_state": self.initial_state,
+            "labels": self._labels,
             "engine": self.engine,
             "state": self.state_dict(),
         }
@@ -303,7 +305,7 @@ class EstimatorMemory:
         self.__init__(  # type: ignore[misc]  # on a fresh, empty instance
             *saved["arguments"], initial_state=saved["first_state"], **options
         )
-        self.settings = saved["settings"]
+        self.settings, self._labels = saved["settings"], saved.get("labels")
         self.load_state_dict(saved["state"])
         if not np.array_equal(saved["initial_state"], saved["first_state"]):
             # How the model is called and scaled depends on both; X is that of `set` by now.

@@ -50,6 +50,8 @@ class RunSource(NamedTuple):
         Step lengths; None if all are usual.
     time_unit : str or pandas.Timedelta
         The model's unit of time.
+    labels : sequence of str or None
+        Names of the states, if the user has given any.
     """
 
     system: System
@@ -60,6 +62,7 @@ class RunSource(NamedTuple):
     inputs: Array | None
     steps: Array | None = None
     time_unit: Any = "s"
+    labels: Sequence[str] | None = None
 
 
 def deviations(covariances: Array) -> Array:
@@ -151,7 +154,7 @@ class Run:
     time_unit : str
         The model's unit of time; ``s`` unless `MovingHorizonEstimator.run` got another one.
     labels : list of str or None
-        Names of the states, with units, where the model knows them.
+        Names of the states, with units, where the user or the model says them.
     """
 
     source: RunSource | None = None
@@ -268,9 +271,10 @@ class Run:
 
     @property
     def labels(self) -> list[str] | None:
-        """Names of the states, with units, where the model knows them."""
-        if self.source is None:
-            return None if self._labels is None else list(self._labels)
+        """Names of the states, with units, where the user or the model says them."""
+        given = self._labels if self.source is None else self.source.labels
+        if given is not None or self.source is None:
+            return None if given is None else list(given)
         signals = self.source.system.signals
         if signals is None or len(signals.states) != self.states.shape[1]:
             return None

@@ -249,6 +249,14 @@ def index_of(values: Any) -> Any:
     return values.index if is_of_pandas else None
 
 
+def names_of(values: Any) -> list[str] | None:
+    """The names of a Series' entries; None for anything else, and where they are no texts."""
+    index = index_of(values)
+    if index is None or np.ndim(values) != 1 or not all(isinstance(one, str) for one in index):
+        return None
+    return [*index]
+
+
 def has_times(index: Any) -> bool:
     """Whether an index is one of times."""
     pandas: Any = sys.modules.get("pandas")

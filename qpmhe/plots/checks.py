@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -31,20 +31,6 @@ def check_estimate(estimate: Any) -> None:
             f"estimate is of type {type(estimate).__name__}; expected a qpmhe.Estimate, as "
             "MovingHorizonEstimator.update returns it. plots.states draws a Run."
         )
-
-
-def label_list(labels: Sequence[str], n: int | None = None) -> list[str]:
-    """The labels, one for each of the n states, checked."""
-    given = list(labels) if np.iterable(labels) and not isinstance(labels, str) else None
-    if given is None or not all(isinstance(label, str) for label in given):
-        raise InvalidInputError(
-            f"labels are {labels!r}; expected a sequence of strings, one per state."
-        )
-    if len(given) != n if n is not None else not given:
-        raise ShapeError(
-            f"labels are {given}; expected {'at least 1' if n is None else n}, one per state."
-        )
-    return given
 
 
 def sample_times(times: ArrayLike) -> NDArray[Any]:

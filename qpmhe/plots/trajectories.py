@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, flag, positive
+from .._checks import Array, flag, label_list, positive
 from ..errors import InvalidInputError
 from ..estimation.run import deviations
-from .checks import check_estimate, check_run, curve, label_list, named_curves, sample_times
+from .checks import check_estimate, check_run, curve, named_curves, sample_times
 from .style import (
     MEASURED,
     PROVED,
@@ -112,8 +112,8 @@ def states(
         Label of the time axis; the run's unit of time where the time between samples is known,
         else samples.
     labels, truth, axes, residual
-        As for `trajectories`. Labels that are left out are the model's names of its states, where
-        it has such: see `qpmhe.System.signals`.
+        As for `trajectories`. Labels that are left out are the run's: those given to
+        `MovingHorizonEstimator.run`, or the model's (see `qpmhe.System.signals`).
     sigmas : float
         Half the width of a band, in standard deviations.
     band : (lower, upper), optional
@@ -269,7 +269,7 @@ def window(
 
 
 def run_labels(run: Run) -> list[str]:
-    """The names of a run's states with units, where the model knows them; else x1, x2, ..."""
+    """The names of a run's states with units, where it has them; else x1, x2, ..."""
     return run.labels or _names(None, run.states.shape[1])
 
 

@@ -1,6 +1,7 @@
 """Records from pandas: an index of times is the time axis; all else is paired by position."""
 
 import pickle
+from copy import deepcopy
 from types import SimpleNamespace
 
 import numpy as np
@@ -244,6 +245,33 @@ def test_a_run_keeps_its_unit_of_time_and_its_names_without_its_source(kind, tmp
         assert axes[-1].get_xlabel() == ("" if kind == "dates" else f"time t ({name})")
         if kind != "dates":
             np.testing.assert_array_equal(axes[0].lines[0].get_xdata(), one.elapsed)
+
+
+def test_a_run_has_the_names_that_the_user_gives(tmp_path):
+    y, u = record(INDEXES["seconds"])
+    system = of_ode(1.0)
+    cost = qpmhe.QuadraticCost.from_covariances(prior=np.eye(2), **COVARIANCES)
+    named = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.3, 0.2]), cost, horizon=5, engine="python",
+        initial_state=pd.Series({"angle (rad)": 0.0, "rate (rad/s)": 0.0}))
+    assert estimator(system).run(y, u).labels is None
+    for options in ({}, {"covariances": True}):  # all steps at once, and one by one
+        run = (deepcopy(named) if options else named).run(y, u, **options)
+        assert run.labels == ["angle (rad)", "rate (rad/s)"]
+        given = estimator(system.with_origin(signals=Signals((Signal("a"), Signal("b"))))).run(
+            y, u, labels=("first", "second"), **options)
+        given.save(tmp_path / "run.npz")
+        for one in (given, qpmhe.load_run(tmp_path / "run.npz"), pickle.loads(pickle.dumps(given))):
+            assert one.labels == ["first", "second"]
+            assert [axis.get_ylabel() for axis in qpmhe.plots.states(one)] == one.labels
+    plain = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger([0.3, 0.2]), cost, horizon=5, engine="python",
+        initial_state=pd.Series([0.0, 0.0]))
+    assert plain.run(y, u).labels is None
+    for wrong in (["a"], "ab", [1, 2], 3):
+        with pytest.raises((InvalidInputError, ShapeError), match="labels are"):
+            plain.run(y, u, labels=wrong)
+    assert plain.time == T
 
 
 def test_a_run_of_an_older_file_counts_samples(tmp_path):
