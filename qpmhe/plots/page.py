@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from .steps import costs
 from .style import LIGHT, run_times
-from .trajectories import add_bands, run_labels, trajectories
+from .trajectories import run_labels, trajectories
 
 if TYPE_CHECKING:
     from ..estimation.run import Run
@@ -37,11 +37,12 @@ def run_page(run: Run) -> str:
         figure = Figure(figsize=(5.6, 0.5 + 1.1 * total), layout="constrained")
         panels = list(figure.subplots(total, 1, sharex=True, squeeze=False)[:, 0])
         times, when = run_times(run, None, None)
+        errors = run.covariances
         trajectories(
             times, None, {"estimate": run.states[:, :count]},
             run_labels(run)[:count], "" if run.has_costs else when, panels[:count],
+            covariances=None if errors is None else errors[:, :count, :count],
         )
-        add_bands(run.covariances, times, [panel.lines[0] for panel in panels[:count]], 2.0)
         if run.has_costs:
             costs(run, axes=panels[-1])
         data = BytesIO()

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._checks import Array, flag, label_list, positive
-from ..errors import InvalidInputError
+from .._checks import Array, flag, label_list, numbers, positive
+from ..errors import InvalidInputError, ShapeError
 from ..estimation.run import deviations
 from .checks import check_estimate, check_run, curve, named_curves, sample_times
 from .style import (
@@ -38,6 +38,7 @@ _WIDE = 600.0
 def trajectories(
     times: Array, truth: Array | None, estimates: Mapping[str, Array], labels: Sequence[str],
     time_label: str, axes: Any = None, *, residual: Residual | None = None,
+    covariances: Array | None = None, sigmas: float = 2.0,
 ) -> list[Any]:
     """True states and estimates over time, one panel a state, as in the paper's figure.
 
@@ -59,11 +60,19 @@ def trajectories(
     residual : optional
         The system's ``state_residual``: estimates of angles are drawn in the same turn as the
         truth.
+    covariances : (T + 1, n, n) array, optional
+        Those of the first of the estimates, of which a band is drawn; (T, n, n) are those of all
+        times but the first.
+    sigmas : float
+        Half the width of the band, in standard deviations.
 
     Raises
     ------
+    OptionError
+        If sigmas is not above zero.
     ShapeError
-        If labels, curves and axes do not fit the same states, or curves do not fit the times.
+        If labels, curves, covariances and axes do not fit the same states, or curves do not fit
+        the times.
     InvalidInputError
         If something is not an array, labels are not strings, axes are not Axes, or there are too
         many estimates.
@@ -72,6 +81,8 @@ def trajectories(
     length, n = when.size, len(names)
     curves = named_curves(estimates, length, n, len(STYLES))
     real = None if truth is None else curve("truth", truth, length, n)
+    half = None if covariances is None else (
+        positive("sigmas", sigmas) * deviations(_checked_covariances(covariances, length, n)))
     if real is not None and residual is not None:
         curves = {label: residual.aligned(values, real) for label, values in curves.items()}
     drawn = panels(n, axes)
@@ -80,6 +91,8 @@ def trajectories(
             panel.plot(when, real[:, j], **REAL)
         for style, (label, values) in zip(line_styles(curves), curves.items(), strict=True):
             panel.plot(when, values[:, j], linewidth=1.3, label=label, **style)
+        if half is not None and len(half):
+            _add_band(panel.lines[-len(curves)], when, half[:, j], sigmas)
         panel.set_ylabel(names[j])
         panel.margins(x=0.01)
     drawn[-1].set_xlabel(time_label)
@@ -149,10 +162,10 @@ def states(
     if guarded is not None:
         lines["guarded"] = guarded
     names = run_labels(run) if labels is None else label_list(labels, n)
-    drawn = trajectories(times, truth, lines, names, when, axes, residual=residual)
+    drawn = trajectories(times, truth, lines, names, when, axes, residual=residual,
+                         covariances=covariances, sigmas=sigmas)
     date_axis(run, dt, drawn[-1])
     middle = [panel.lines[-len(lines)] for panel in drawn]
-    add_bands(covariances, times, middle, sigmas)
     measured = add_measurements(run, times, middle, drawn_states)
     if band is not None:
         lower, upper = (
@@ -164,27 +177,30 @@ def states(
                 times, lower[:, j], upper[:, j], color=PROVED, linewidth=0.0, zorder=0.5,
                 label="holds the true state (proved)",
             )
-    if band is not None or measured or covariances is not None:
+    if band is not None or measured:
         _legend(drawn, axes)
     return drawn
 
 
-def add_bands(
-    covariances: Array | None, times: Array, lines: Sequence[Any], sigmas: float
-) -> None:
-    """Fill between so many standard deviations about the last points of the first states' lines."""
-    if covariances is None or not len(covariances):
-        return
-    half = sigmas * deviations(covariances)
-    for j, line in enumerate(lines):
-        # A line of the usual width hides the band where samples stand close.
-        line.set_linewidth(max(0.5, min(1.3, _WIDE / len(half))))
-        middle = line.get_ydata()[-len(half) :]
-        line.axes.fill_between(
-            times[-len(half) :], middle - half[:, j], middle + half[:, j],
-            color=STYLES[0]["color"], alpha=0.35, linewidth=0.0,
-            label=f"± {sigmas:g} standard deviations",
+def _checked_covariances(values: ArrayLike, length: int, n: int) -> Array:
+    found = numbers("covariances", values, finite=False)
+    if found.shape not in ((length, n, n), (length - 1, n, n)):
+        raise ShapeError(
+            f"covariances have shape {found.shape}; expected ({length}, {n}, {n}), one for each "
+            "time, or one less, without that of the first."
         )
+    return found
+
+
+def _add_band(line: Any, times: Array, half: Array, sigmas: float) -> None:
+    """Fill to both sides of the last points of a line."""
+    # A line of the usual width hides the band where samples stand close.
+    line.set_linewidth(max(0.5, min(1.3, _WIDE / len(half))))
+    middle = line.get_ydata()[-len(half) :]
+    line.axes.fill_between(
+        times[-len(half) :], middle - half, middle + half, color=line.get_color(), alpha=0.35,
+        linewidth=0.0, label=f"± {sigmas:g} standard deviations",
+    )
 
 
 def add_measurements(run: Run, times: Array, lines: Sequence[Any], drawn_states: Array) -> bool:
@@ -235,7 +251,8 @@ def _check_sides(lower: Array, upper: Array) -> None:
 
 
 def window(
-    estimate: Estimate, *, dt: float | None = None, labels: Sequence[str] | None = None,
+    estimate: Estimate, *, covariances: Array | None = None, sigmas: float = 2.0,
+    dt: float | None = None, labels: Sequence[str] | None = None,
     time_label: str | None = None, axes: Any = None,
 ) -> list[Any]:
     """The window of one estimate: the observer's candidate, and the estimated trajectory.
@@ -244,6 +261,10 @@ def window(
     ----------
     estimate : Estimate
         From `MovingHorizonEstimator.update`.
+    covariances : (N_t + 1, n, n) array, optional
+        Those of the trajectory, from `MovingHorizonEstimator.covariances`, for its band.
+    sigmas : float
+        Half the width of the band, in standard deviations.
     dt, labels, time_label, axes
         As for `states`; an estimate does not know the time between samples.
 
@@ -261,7 +282,8 @@ def window(
         f"candidate, J = {estimate.candidate_cost:.3g}": estimate.candidate,
     }
     when = time_label or time_words(dt)
-    drawn = trajectories(times, None, lines, _names(labels, n), when, axes)
+    drawn = trajectories(times, None, lines, _names(labels, n), when, axes,
+                         covariances=covariances, sigmas=sigmas)
     for panel in drawn:
         for line in panel.lines[-2:]:
             line.set(marker="o", markersize=3.0)

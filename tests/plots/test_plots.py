@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import qpmhe
@@ -166,6 +167,33 @@ def test_the_window_stands_at_its_times(case):
         np.testing.assert_array_equal(candidate.get_ydata(), estimate.candidate[:, j])
         # Seventeen samples, the last at t = 16: the window ends at the estimate of x(17).
         np.testing.assert_array_equal(best.get_xdata(), np.arange(7, 18))
+
+
+def test_a_window_and_a_trajectory_have_the_band_of_their_covariances():
+    mhe = estimator()
+    for y in SCENARIO.simulate(0, 17).measurements:
+        estimate = mhe.update(y)
+    errors = mhe.covariances()
+    assert not any(panel.collections for panel in plots.window(estimate))
+    drawn = plots.window(estimate, covariances=errors, sigmas=3.0)
+    others = plots.trajectories(
+        np.arange(11), None, {"EKF": estimate.trajectory, "other": estimate.candidate},
+        ["a", "b"], "time", covariances=errors[1:])
+    for axes, sigmas, rest in ((drawn, 3.0, estimate.trajectory),
+                               (others, 2.0, estimate.trajectory[1:])):
+        for j, panel in enumerate(axes):
+            (band,) = panel.collections
+            half = sigmas * np.sqrt(errors[-len(rest):, j, j])
+            ends = (rest[:, j] - half).min(), (rest[:, j] + half).max()
+            assert extents(band)[:, 1] == pytest.approx(ends)
+            assert band.get_facecolor()[0, :3] == pytest.approx(to_rgb(panel.lines[0].get_color()))
+        (legend,) = axes[0].figure.legends
+        assert f"± {sigmas:g} standard deviations" in [one.get_text() for one in legend.get_texts()]
+    for wrong in (errors[0], errors[2:], errors[:, :1, :1]):
+        with pytest.raises(ShapeError, match="covariances have shape"):
+            plots.window(estimate, covariances=wrong)
+    with pytest.raises(OptionError, match="sigmas is 0"):
+        plots.window(estimate, covariances=errors, sigmas=0)
 
 
 def test_costs_outcomes_and_times_of_steps(case, monkeypatch):
