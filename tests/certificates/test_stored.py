@@ -107,6 +107,8 @@ def test_files_that_were_changed_or_are_of_another_version_are_refused(file):
         (text.replace('"version": 3', '"version": 2'), "has the version 2 .*expected 3.*again"),
         (text.replace("qpmhe certificate", "a recipe"), "is no certificate of an observer"),
         ("[1, 2]", "is no certificate of an observer"), ("{", "it is not JSON"),
+        *((text.replace('"version": 3', f'"version": 3, "more": {number}'), "was changed since")
+          for number in ("NaN", "1e999")),
     ):
         file.write_text(content)
         with pytest.raises(OptionError, match=words):
