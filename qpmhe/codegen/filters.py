@@ -135,7 +135,7 @@ class LikelihoodLibrary(FilterLibrary):
         return costs
 
     def follow(self, x: Array, inputs: Array) -> Array:
-        """States (K, n) a step behind x (K, n), with inputs (K, m + 1), the step's length last."""
+        """States (K, n) an implicit step behind x, with inputs (K, m + 1), its length the last."""
         x, inputs = (np.ascontiguousarray(one, np.float64) for one in (x, inputs))
         reached = np.empty_like(x)
         self._library.mhe_steps(ctypes.c_int64(len(x)), *map(_at, (x, inputs, reached)))

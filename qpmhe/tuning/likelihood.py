@@ -97,7 +97,7 @@ class Likelihood:
 
     @property
     def follow(self) -> Callable[[Array, Array], Array] | None:
-        """The compiled model's step, as `LikelihoodLibrary.follow` has it; None without one."""
+        """The compiled model's implicit step, see `LikelihoodLibrary.follow`; None without one."""
         one = None if self._remade else self._filter(self.structure.first)
         return None if one is None else one.follow
 
@@ -221,7 +221,8 @@ class _Filter:
     @property
     def follow(self) -> Callable[[Array, Array], Array] | None:
         """See `Likelihood.follow`."""
-        return None if self._library is None else self._library.follow
+        implicit = self._step is None
+        return self._library.follow if implicit and self._library is not None else None
 
     def _covariances(self, weights: Weights) -> tuple[Array, Array, Array]:
         entering = self._system.state_covariance(weights.disturbance)

@@ -256,14 +256,6 @@ static void mhe_filter_back(const mhe_record *r, int t, const mhe_kept *k, real 
     for (int i = 0; i < NU; i++) by_u[i] += by_input[i];
 }
 
-/* The states behind a step from some others. */
-void mhe_steps(int64_t count, const real *x, const real *u, real *next)
-{
-    real A[SIZE(MHE_A_NONZEROS)];
-    for (int64_t k = 0; k < count; k++)
-        mhe_call_step(x + k * NX, u + k * (NU + 1), next + k * NX, A);
-}
-
 /* Bytes that the adjoint keeps of a sample. */
 size_t mhe_kept_size(void) { return sizeof(mhe_kept); }
 
