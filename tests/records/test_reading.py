@@ -89,7 +89,7 @@ def test_records_without_a_single_sample_and_files_that_cannot_be_read(here):
         assert "--encoding" not in message
     Path("out.csv").unlink(missing_ok=True)
     Path("nothing.parquet").write_bytes(b"PAR1 and nothing else")
-    for name, words in (("nowhere.csv", "cannot be read"), (".", "cannot be read"),
+    for name, words in (("nowhere.csv", "cannot be read"), (".", "it is a folder"),
                         ("nothing.parquet", "Parquet")):
         with pytest.raises(RecordError, match=words):
             estimate(CONTINUOUS, name, overwrite=True)
