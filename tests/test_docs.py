@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import io
+import json
 import re
 import shutil
 import subprocess
@@ -185,6 +186,27 @@ def test_the_site_needs_no_network_and_leaves_no_formula_raw(tmp_path):
         for target in fetched_by_styles(style.read_text(encoding="utf-8")):
             assert not urlsplit(target).netloc, f"{style} fetches {target}"
             assert style.parent.joinpath(target).is_file(), f"{style} names {target}"
+    sections = searched(tmp_path)
+    for words, page in {
+        "stiff": "how-to/stiff/", "dae": "how-to/algebraic/", "ros": "how-to/bridges/",
+        "enkf": "reference/baselines/", "rts": "how-to/delay-and-time-indices/",
+        "smoothing": "how-to/delay-and-time-indices/", "real time": "how-to/deadlines/",
+    }.items():
+        found = {where for where, each in sections.items() if set(words.split()) <= each}
+        assert page in found, f"{words}: {sorted(found)}"
+        # Few enough to look through.
+        assert len({where.partition("#")[0] for where in found}) <= 20, words
+
+
+def searched(site):
+    """The words of each section of the site, as its search splits them."""
+    index = json.loads((site / "search/search_index.json").read_text(encoding="utf-8"))
+    separator = re.compile(index["config"]["separator"])
+    return {
+        one["location"]: {*separator.split(
+            re.sub(r"<[^>]+>", " ", f"{one['title']} {one['text']}").lower())}
+        for one in index["docs"]
+    }
 
 
 def test_formulas_are_split_where_they_have_space_and_a_wrong_one_stops_the_build(monkeypatch):

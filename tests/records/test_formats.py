@@ -391,7 +391,7 @@ def test_estimates_of_two_clocks_are_those_of_the_merged_rows(here):
 
 
 def same_record(here):
-    """One record of the continuous model in four kinds of files, and the columns where needed."""
+    """One record of the continuous model in several kinds of files, and the columns if needed."""
     put("lines.csv", lines(50, irregular=False, gaps=0.0))
     table = pd.read_csv("lines.csv").ffill()
     table["time"] = times = np.arange(50) * DT
@@ -405,10 +405,11 @@ def same_record(here):
         file["time"] = times
         for name, values in columns.items():
             file[name] = values
-    bag("run", "MCAP", [(f"/{name}", EPOCH + (times * 1e9).round(), None, values)
-                        for name, values in columns.items()])
+    for folder, plugin in (("run", "MCAP"), ("old", "SQLITE3")):
+        bag(folder, plugin, [(f"/{name}", EPOCH + (times * 1e9).round(), None, values)
+                             for name, values in columns.items()])
     named = {"outputs": "y1=/y.data", "inputs": "u1=/u.data"}
-    return {"record.mf4": {}, "record.mat": {}, "record.h5": {}, "run": named}
+    return {"record.mf4": {}, "record.mat": {}, "record.h5": {}, "run": named, "old/old.db3": named}
 
 
 def test_every_kind_is_the_same_record(here):
@@ -425,7 +426,8 @@ def test_every_kind_is_the_same_record(here):
 @pytest.mark.slow
 @covering(
     strength=1, out=["out.csv", "out.jsonl", "out.parquet"],
-    name=["record.csv", "record.jsonl", "record.parquet", "record.mf4", "record.h5", "run"],
+    name=["record.csv", "record.jsonl", "record.parquet", "record.mf4", "record.mat", "record.h5",
+          "run", "old/old.db3"],
 )
 def test_killed_runs_resume_byte_for_byte(here, name, out):
     """SIGKILL at a random row, and while a checkpoint, or the Parquet file, takes its place."""
@@ -527,9 +529,14 @@ def test_a_folder_without_metadata_is_no_bag_yet(here):
 
 @pytest.mark.parametrize(("name", "module", "extra"), [
     ("x.mf4", "asammdf", "mf4"), ("x.h5", "h5py", "hdf5"), ("x.mcap", "rosbags.highlevel", "ros"),
+    ("x.mat", "pymatreader", "mat"), ("x.csv", "pandas", "studies"),
+    ("x.parquet", "pyarrow", "studies"),
 ])
 def test_a_missing_package_is_named_with_its_command(here, monkeypatch, name, module, extra):
-    Path(name).write_bytes(b"MDF     " + bytes(100))
+    if name == "x.mat":
+        mat73(name, {"time": T2, "y": SLOW})
+    else:
+        Path(name).write_bytes(b"MDF     " + bytes(100))
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(qpmhe.errors.InvalidInputError, match=rf"pip install 'qpmhe\[{extra}\]'"):
         read(name)

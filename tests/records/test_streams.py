@@ -1,9 +1,11 @@
-"""JSON lines in and out, and the time from a line in to its line out."""
+"""JSON lines in and out, memory, and the time from a line in to its line out."""
 
 import json
 import os
 import re
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,7 +14,19 @@ from qpmhe.errors import OptionError
 from qpmhe.records import Latency, RecordError
 
 from .oscillator import as_json, lines
-from .tools import CONTINUOUS, DISCRETE, STEPS, command, estimate, finish, get, put, start, talk
+from .tools import (
+    CONTINUOUS,
+    DISCRETE,
+    STEPS,
+    command,
+    estimate,
+    finish,
+    get,
+    put,
+    rows,
+    start,
+    talk,
+)
 
 
 def test_json_lines_are_the_record_and_the_rows_of_csv(here):
@@ -84,6 +98,34 @@ def test_quantiles_are_those_of_all_times_to_one_percent():
     assert np.isnan(Latency().quantile(0.5))
     with pytest.raises(OptionError, match="--deadline is 0"):
         Latency(deadline=0)
+
+
+# Its peak, which a process does not take over from the one that starts it.
+_PEAK = """
+import re, sys
+from pathlib import Path
+from qpmhe.records import estimate_record
+
+estimate_record(*sys.argv[1:], max_qps=0, engine="python", step_time=False)
+print(re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="this system does not say")
+def test_a_record_of_ten_times_the_size_takes_no_more_memory(here):
+    rest, peaks = ",0.123456" * 100, []
+    for samples in (5_500, 55_000):
+        with open("record.csv", "w") as file:
+            file.write("time,y1,y2" + ",c" * 100 + "\n")
+            file.writelines(f"{k},{k % 7},{k % 3}{rest}\n" for k in range(samples))
+        done = subprocess.run(
+            [sys.executable, "-c", _PEAK, DISCRETE, "record.csv", f"{samples}.csv"],
+            capture_output=True, text=True, check=True, timeout=300)
+        peaks.append(int(done.stdout) / 1024)
+        assert rows(f"{samples}.csv") == samples + 1
+    assert os.path.getsize("record.csv") > 49e6
+    assert peaks[1] - peaks[0] < 4.0, peaks
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="this system has no such signal")
