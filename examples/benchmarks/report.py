@@ -137,6 +137,7 @@ def _row(result: Measurement, one: Series, base: float | None) -> dict[str, Any]
         "mean_us": 1e6 * float(np.mean([*one.times.values()])),
         "quartiles_us": [low, high],
         "ratio": None if base is None or same is False else base / median,
+        "times_ours": _times_ours(result, one, same),
         "is_reference": one is result.reference,
         "excess": float(np.median(excess)) if excess.size else None,
         "excess_worst": float(excess.max()) if excess.size else None,
@@ -148,6 +149,17 @@ def _row(result: Measurement, one: Series, base: float | None) -> dict[str, Any]
         "setup_s": one.setup_seconds,
         "limitations": one.peer.limitations,
     }
+
+
+def _times_ours(result: Measurement, one: Series, same: bool | None) -> float | None:
+    """Its median over our compiled step's, converged or with one QP as it is."""
+    amount = "converged" if one.peer.converges else "1 QP"
+    ours = next((
+        other for other in result.series if other.peer.name == f"qpmhe compiled, {amount}"
+    ), None)
+    if one.peer.kind != "peer" or ours is None or same is False:
+        return None
+    return _quantiles(one)[1] / _quantiles(ours)[1]
 
 
 def show(console: Console, result: Measurement) -> None:
@@ -183,6 +195,11 @@ def show(console: Console, result: Measurement) -> None:
             f"{row['setup_s']:.2f}",
         )
     console.print(table)
+    told = "; ".join(
+        f"{row['estimator']} {row['times_ours']:.3g}" for row in table_rows if row["times_ours"]
+    )
+    if told:
+        console.print(f"Times as long as our compiled step: {told}.", highlight=False)
     if result.waited > BUSY:
         console.print(
             f"Other processes had the processor for {result.waited:.0%} of the time; this is taken "
