@@ -519,7 +519,6 @@ def test_bad_input(error, words, given, options):
         qpmhe.diagnose(given(), **options)
 
 
-@pytest.mark.slow
 def test_page_is_one_file_with_escaped_names(tmp_path):
     case = planted.measured("vehicle", 1, planted.dead)
     found = qpmhe.diagnose(case.run(), outputs=["<b>r1", "r2 & co", "b1", "b2"])

@@ -155,7 +155,6 @@ def embedded(page):
     return re.findall(r"<script[^>]*>(.*?)</script>", page.read_text("utf-8"), re.DOTALL)
 
 
-@pytest.mark.slow
 def test_the_report_is_whole_and_needs_no_network():
     page = written()
     folder, text = page.parent, page.read_text(encoding="utf-8")
