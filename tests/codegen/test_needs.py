@@ -25,8 +25,8 @@ COUNTS = ("qps", "corrections", "nearest_points", "iterations")
 
 @pytest.mark.parametrize(("name", "cap"), [
     ("inputs", None), ("restored", 3), ("states in a polytope", 2), ("soft states", 1),
-    ("restored", None), ("mixed losses", 2), ("fewer disturbances in sets", 2), ("soft states", None),
-    ("held in sets", 1), ("graduated reinitialized", 2),
+    ("restored", None), ("mixed losses", 2), ("fewer disturbances in sets", 2),
+    ("soft states", None), ("held in sets", 1), ("graduated reinitialized", 2),
 ])
 def test_no_step_takes_more_than_is_said(name, cap, tmp_path):
     """Nor do the active set and the interior point together take more iterations than the cap."""
