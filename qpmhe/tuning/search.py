@@ -381,6 +381,7 @@ def refine(
     # The newest point with a gradient, and the one at which the search stands.
     newest: list[Any] = []
     here: list[Any] = []
+    first: Array = best[0]
 
     def difference(point: Array, move: Array) -> float:
         return (total(point + move) - total(point - move)) / (2 * _STEP)
@@ -400,7 +401,8 @@ def refine(
             size = float(np.linalg.norm(way))
             if -_ARMIJO * (by @ way) <= gain <= _ENDS * max(abs(before), abs(value), 1.0):
                 along = slope @ way + size * difference(point, _STEP / size * way)
-                if abs(along) <= _WOLFE * abs(by @ way):
+                # The first step, which has a largest length, may end where it still descends.
+                if (along if at is first else abs(along)) <= _WOLFE * abs(by @ way):
                     raise _EndedError
         for k, move in enumerate(_STEP * np.eye(len(point))):
             slope[k] += difference(point, move)
@@ -408,7 +410,7 @@ def refine(
         checkpoint.note("estimator", best[0], best[1], False)
         newest[:] = point.copy(), value, slope
         if not here:
-            here[:] = newest
+            here[:] = first, value, slope
         return value, slope
 
     with suppress(_EndedError):

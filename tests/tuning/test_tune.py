@@ -13,7 +13,7 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError
 from qpmhe.model.signals import Signal, Signals
-from qpmhe.tuning import TuningCheckpointError, TuningRecord, contest, judge, load, search
+from qpmhe.tuning import TuningCheckpointError, TuningRecord, contest, judge, load, score, search
 from qpmhe.tuning.structures import Correlated
 
 tuning_module = sys.modules["qpmhe.tuning.tune"]
@@ -324,6 +324,25 @@ def test_the_estimators_own_error_leaves_the_scale_to_the_likelihood(objective):
     changes = [tuning.values[name] / tuning.likeliest[name] for name in tuning.values]
     assert np.prod(changes) == pytest.approx(1.0, rel=0.4)
     assert tuning.values["noise y1"] == pytest.approx(tuning.likeliest["noise y1"], rel=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_estimators_search_ends_without_a_gradient_that_changes_nothing(seed, monkeypatch):
+    totals, found = [], []
+    total = score.Score.total
+    monkeypatch.setattr(score.Score, "total", lambda *given: (totals.append(1), total(*given))[1])
+    for wolfe in (0.9, -np.inf):  # the second never ends early
+        monkeypatch.setattr(search, "_WOLFE", wolfe)
+        totals.clear()
+        tuning = tuned(
+            [simulated(seed, 200)], objective="prediction", horizon=3, max_qps=0,
+            structure={"disturbance": "scalar", "noise": "scalar"})
+        found.append((len(totals), tuning.noise, tuning.disturbance, tuning.judgement))
+    assert found[0][0] < found[1][0]
+    for mine, expected in zip(found[0][1:3], found[1][1:3], strict=True):
+        np.testing.assert_array_equal(mine, expected)
+    assert found[0][3] == found[1][3]
 
 
 @pytest.mark.slow
