@@ -188,7 +188,7 @@ class Windows:
         n, p = system.n, system.p
         self._noises, X, W = (sets.get(one) for one in ("noises", "states", "disturbances"))
         # The outputs are the positions, which the bounds of v bound.
-        bounded = [] if X is None else list(np.flatnonzero(np.isfinite(X.lower)))
+        bounded = [] if X is None else list(np.flatnonzero(np.isfinite([X.lower, X.upper]).any(0)))
         bounded = list(range(p)) if self._noises is not None else bounded
         self._lower, self._upper = np.zeros((2, HORIZON + 1, len(bounded)))
         if X is not None:
