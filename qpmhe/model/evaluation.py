@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, dict[str, Array], Callable[[], object]]
 # Makes buffers for a number of states and the wanted results.
 Maker = Callable[[int, tuple[str, ...]], Buffers]
+Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 _MOST_KEPT = 64
 # Kinds of CasADi's functions that print nothing where they fail.
@@ -29,6 +30,8 @@ _MAKING = threading.RLock()
 NAMES = ("f", "h", "f_jacobian", "h_jacobian")
 VALUES = ("f", "h")
 RESIDUALS = ("residuals",)
+# The entries of both Jacobians that may be other than 0, by rows: see `VirtualMachine.pattern`.
+ENTRIES = ("entries",)
 
 
 class Evaluator:
@@ -54,13 +57,24 @@ class Evaluator:
         value: Array = result[0].copy() if single else result.copy()
         return value
 
-    def stage(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """f, h and their joint Jacobian at one state: good until the next call."""
-        states, inputs, results, evaluate = self._buffers(1, NAMES)
+    def stage(
+        self, x: Array, u: Array, by_entries: bool = False
+    ) -> tuple[Array, Array, Array]:
+        """f, h and their joint Jacobian, or its entries, at one state: good until the next call."""
+        names = VALUES + ENTRIES if by_entries else NAMES
+        states, inputs, results, evaluate = self._buffers(1, names)
         states[...] = x
         inputs[...] = u
         evaluate()
+        if by_entries:
+            return results["f"][0], results["h"][0], results["entries"][0]
         return results["f"], results["h"], results["joint"]
+
+    @property
+    def pattern(self) -> Places | None:
+        """Rows and columns of the joint Jacobian's entries; None where they are not known."""
+        found: Places | None = getattr(self._maker, "pattern", None)
+        return found
 
     def residuals(self, trajectory: Array, y: Array, u: Array) -> Array:
         """A fresh array of w and v along a trajectory."""
@@ -72,12 +86,17 @@ class Evaluator:
         value: Array = results["residuals"].copy()
         return value
 
-    def prepare(self, horizon: int) -> None:
-        """Make the buffers of the first window and of a full one, in this thread."""
-        self._buffers(1, NAMES)
+    def prepare(self, horizon: int, by_entries: bool = False) -> None:
+        """Make the buffers of the first window and of a full one, in this thread.
+
+        Where Jacobians are evaluated ``by_entries``, none is kept as a matrix.
+        """
+        if by_entries:
+            self._local.__dict__.pop("kept", None)
+        self._buffers(1, VALUES + ENTRIES if by_entries else NAMES)
         for count in dict.fromkeys((1, horizon)):
             self._buffers(count, RESIDUALS)
-            for name in NAMES:
+            for name in VALUES + ENTRIES if by_entries else NAMES:
                 self._buffers(count, (name,))
 
     def _buffers(self, count: int, names: tuple[str, ...]) -> Buffers:
@@ -149,10 +168,14 @@ def separate_calls(
     return evaluate
 
 
-def results_of(model: CasadiModel, count: int, names: tuple[str, ...]) -> dict[str, Array]:
+def results_of(
+    model: CasadiModel, count: int, names: tuple[str, ...], entries: int = 0
+) -> dict[str, Array]:
     """Arrays for the wanted results at so many states, by name."""
     n, p = model.n, model.p
-    shapes = {"f": (n,), "h": (p,), "f_jacobian": (n, n), "h_jacobian": (p, n)}
+    shapes: dict[str, tuple[int, ...]] = {
+        "f": (n,), "h": (p,), "f_jacobian": (n, n), "h_jacobian": (p, n), "entries": (entries,),
+    }
     if names == RESIDUALS:
         return {"residuals": np.zeros((count, n + p)), "y": np.zeros((count, p))}
     results = {name: np.zeros((count, *shapes[name])) for name in names}
@@ -242,7 +265,8 @@ class VirtualMachine:
             if count > 1:
                 function = function.map(count)
         states, inputs = np.zeros((count, model.n)), np.zeros((count, model.m + timed))
-        results = results_of(model, count, names)
+        entries = self.pattern[0].size if "entries" in names else 0
+        results = results_of(model, count, names, entries)
         all_inputs = inputs if timed else np.full((count, model.m + 1), model.dt or 0.0)
         run = fixed_call(
             function, (states, all_inputs), [results[name] for name in names], self._fallible
@@ -258,6 +282,24 @@ class VirtualMachine:
                 again[0]()
 
         return states, inputs, results, evaluate
+
+    @cached_property
+    def pattern(self) -> Places:
+        """Rows and columns, by rows, of the entries of [A; C] that may be other than 0.
+
+        The diagonal of A is among them in any case.
+        """
+        with _MAKING:
+            columns, rows = self._joint().sparsity().get_triplet()
+        return np.array(rows, np.intp), np.array(columns, np.intp)
+
+    def _joint(self) -> Any:
+        """[A; C] with the diagonal of A, transposed: CasADi stores by columns, NumPy by rows."""
+        if "joint" not in self._expressions:
+            ca, (a, c) = import_casadi(), (self._slope(which) for which in VALUES)
+            a = ca.project(a, a.sparsity() + ca.Sparsity.diag(self._model.n))
+            self._expressions["joint"] = ca.vertcat(a, c).T
+        return self._expressions["joint"]
 
     def _functions(self, names: tuple[str, ...]) -> tuple[Any, dict[str, Any]]:
         """A function of x and (u, dt) to all of these results, and one to each."""
@@ -284,12 +326,18 @@ class VirtualMachine:
                 made[name] = model.step()(made["x"], u, dt)
             elif name == "h":
                 made[name] = model.h(made["x"], u)
+            elif name == "entries":
+                joint = self._joint()
+                made[name] = ca.sparsity_cast(joint, ca.Sparsity.dense(joint.nnz(), 1))
             else:
-                which = name.partition("_")[0]
-                slope = model.slope(which, self._expression(which), made["x"], u, dt)
                 # Transposed: CasADi stores by columns, NumPy by rows.
-                made[name] = ca.densify(slope.T)
+                made[name] = ca.densify(self._slope(name.partition("_")[0]).T)
         return made[name]
+
+    def _slope(self, which: str) -> Any:
+        """The Jacobian of f or h by x."""
+        value, made, m = self._expression(which), self._expressions, self._model.m
+        return self._model.slope(which, value, made["x"], made["given"][:m], made["given"][m])
 
     def _residuals(self, count: int) -> Buffers:
         states, inputs, values, evaluate_values = self(count, VALUES)

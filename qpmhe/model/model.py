@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -17,7 +18,7 @@ from ..errors import ModelError
 from .accuracy import Choice
 from .derivatives import Jacobian
 from .discretize import Discretization
-from .evaluation import Evaluator
+from .evaluation import Evaluator, Places
 from .expressions import CasadiModel
 from .functions import BatchedFunction, Trusted
 from .points import Points
@@ -280,6 +281,37 @@ class Model:
         functions = self.functions
         return functions.f_jacobian.batch(x, u), functions.h_jacobian.batch(x, u)
 
+    @property
+    def pattern(self) -> Places | None:
+        """Rows and columns, by rows, of the entries of [A; C] that may be other than 0.
+
+        The diagonal of A is among them. None where they are not known: of functions that are no
+        expressions.
+        """
+        kernel = self.functions.kernel
+        return kernel.pattern if isinstance(kernel, Evaluator) else None
+
+    @property
+    def _evaluator(self) -> Evaluator:
+        """What evaluates entries in a pattern."""
+        kernel = self.functions.kernel
+        assert isinstance(kernel, Evaluator)
+        return kernel
+
+    def entries(self, x: Array, u: Array) -> Array:
+        """The entries (K, e) of `linear` in the `pattern`."""
+        found = self._evaluator.one("entries", x, u)
+        if math.isfinite(np.vdot(found, found)):
+            return found
+        pattern = self.pattern
+        assert pattern is not None
+        joint = np.concatenate(self.linear(x, u), axis=1)  # some are taken beside these states
+        return np.asarray(joint[:, *pattern])
+
+    def stage_by_entries(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """f, h and the entries (e,) of the Jacobian at a state; good until the next call."""
+        return self._evaluator.stage(x, u, True)
+
     @cached_property
     def residuals(self) -> Along:
         """A function of x (K + 1, n), y (K, p) and u (K, m) to w and v, a new array (K, n + p).
@@ -292,9 +324,12 @@ class Model:
         """Second derivatives of f and h, weighed by forces (K, n + p): see `SecondDerivatives`."""
         return self.second_derivatives.at(x, u, forces)
 
-    def prepare(self, horizon: int) -> None:
+    def prepare(self, horizon: int, by_entries: bool = False) -> None:
         """Compile or allocate now what the first updates with this horizon would wait for."""
-        self.functions.prepare(horizon)
+        if by_entries:
+            self._evaluator.prepare(horizon, True)
+        else:
+            self.functions.prepare(horizon)
 
     @cached_property
     def second_derivatives(self) -> SecondDerivatives:

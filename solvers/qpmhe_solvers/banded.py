@@ -13,6 +13,7 @@ from .qp import QP, Array, Places, hessian_entries, rows_entries
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
 from .sparse_order import SparseOrder
+from .sparse_qp import SparseQP
 
 Index = NDArray[np.intp]
 
@@ -33,7 +34,7 @@ class BandedSolver(Solver):
     by ``gbsv``.
     """
 
-    _judges, _keeps = True, False
+    _judges, _keeps, _takes_sparse = True, False, True
 
     def __init__(self, options: SolverOptions) -> None:
         from scipy.linalg.lapack import dgbsv, dpbsv  # late: twice the cost of importing NumPy
@@ -45,14 +46,14 @@ class BandedSolver(Solver):
         self._work: tuple[Array, Array, Array] | None = None
         self._sparse = SparseOrder()
 
-    def _solve(self, qp: QP, start: Array | None) -> Solution:
-        if qp.rows and (qp.row_lower == qp.row_upper).any():
+    def _solve(self, qp: QP | SparseQP, start: Array | None) -> Solution:
+        if isinstance(qp, QP) and qp.rows and (qp.row_lower == qp.row_upper).any():
             return self._solve_scaled(qp)
         step = self._cholesky(qp)
         if step is None:
             message = "the factorisation failed: H is not positive definite, or not finite"
             return Solution(None, SolveStatus.FAILED, 0, message=message)
-        if not qp.bounded and not qp.rows:
+        if isinstance(qp, SparseQP) or not (qp.bounded or qp.rows):
             return Solution(step, SolveStatus.SOLVED, 0)
         return _judged(qp, step, np.zeros(qp.stages * qp.rows), qp.violation(step) <= 0.0)
 
@@ -70,7 +71,7 @@ class BandedSolver(Solver):
             qp, step * scale.step, multipliers * scale.duals[qp.size :], feasible
         )
 
-    def _cholesky(self, qp: QP) -> Array | None:
+    def _cholesky(self, qp: QP | SparseQP) -> Array | None:
         # A root is exact for powers of four alone: an odd unit of the cost goes before.
         unit = _COST_UNITS[math.frexp(qp.band.item(0))[1] % 2]
         found = self._sparse.band(qp, unit)
@@ -78,6 +79,8 @@ class BandedSolver(Solver):
             band, flat = found
             if self._solves(band, flat, band[0]):  # else rounding may have decided: see once more
                 return self._sparse.step(flat).reshape(qp.stages, qp.n)
+        if isinstance(qp, SparseQP):
+            return None
         work = self._work
         if work is None or self._size != (qp.stages, qp.n):
             band, step = np.empty((qp.stages, qp.n, 2 * qp.n)), np.empty((qp.stages, qp.n))

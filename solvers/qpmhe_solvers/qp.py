@@ -201,6 +201,11 @@ class QP:
         return _remade(self.sizes, self.numbers, self.bounded, self.key)
 
     @property
+    def diagonal(self) -> Array:
+        """The diagonal of H (K, n), a view."""
+        return self.band[:, :, 0]
+
+    @property
     def lapack_band(self) -> Array:
         """The (2n, K n) lower band in LAPACK's layout, a view without a copy."""
         return self.band.reshape(self.size, 2 * self.n).T

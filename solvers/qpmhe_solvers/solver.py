@@ -19,6 +19,7 @@ from .qp import ARRAYS, QP, Array
 from .sample_qps import sample
 from .scaling import Scale, Scaling
 from .solution import Errors, RawSolution, Residuals, Solution, SolveStatus
+from .sparse_qp import SparseQP
 
 # A claim of success is believed while the recomputed residuals stay below this many times the
 # tolerance, since solvers measure in scaled norms of their own, but not beyond the loosest.
@@ -57,6 +58,8 @@ class Solver(ABC):
     # Whether `_solve` takes QPs in the caller's units and returns a judged Solution: for solvers
     # of this package that hand QPs on, or solve them exactly.
     _judges: ClassVar[bool] = False
+    # Whether `_solve` takes a `SparseQP`, too: for solvers of this package alone.
+    _takes_sparse: ClassVar[bool] = False
     # What the last solve wrote into of what it was lent.
     _wrote: tuple[str, ...] = ()
     # The `ContainedSolver` that used it last.
@@ -67,6 +70,7 @@ class Solver(ABC):
         cls._builtin = cls.__module__.startswith(f"{__package__}.")
         if "_solve" in cls.__dict__:
             cls._judges = cls._judges and cls._builtin
+            cls._takes_sparse = cls._takes_sparse and cls._builtin
 
     def __init__(self, options: SolverOptions) -> None:
         self.options = options
@@ -113,7 +117,7 @@ class Solver(ABC):
         self.solve(sample(3, 2, 2, bounds="part", sides="mixed"))
         self.forget()
 
-    def solve(self, qp: QP, start: Array | None = None) -> Solution:
+    def solve(self, qp: QP | SparseQP, start: Array | None = None) -> Solution:
         """Solve a QP, contain every exception of the solver, and verify its answer.
 
         Parameters
@@ -138,10 +142,10 @@ class Solver(ABC):
             also failed.
         """
         if type(qp) is not QP:
-            _expect_qp(qp)
+            qp = self._readable(qp)
         try:
             if self._judges:
-                return self._solve(qp, start)  # type: ignore[return-value]  # judged already
+                return self._solve(qp, start)  # type: ignore[return-value,arg-type]  # judged already
             if not self._warns:
                 with np.errstate(all="ignore"):
                     return self._checked(qp, start)
@@ -151,6 +155,13 @@ class Solver(ABC):
             raise
         except BaseException as error:  # the wall; a panic of compiled code is no Exception
             return _failure(error)
+
+    def _readable(self, qp: object) -> QP:
+        """A QP as `_solve` takes it; refuses what is none."""
+        if isinstance(qp, SparseQP):
+            return qp if self._takes_sparse else qp.full()  # type: ignore[return-value]
+        _expect_qp(qp)
+        return qp  # type: ignore[return-value]
 
     def _checked(self, qp: QP, start: Array | None) -> Solution:
         """Look at the data, solve, and judge."""
@@ -292,7 +303,7 @@ class ContainedSolver:
         self._shifts = type(solver).shift is not Solver.shift or "shift" in vars(solver)
 
     def solve(
-        self, qp: QP, start: Array | None = None, time_limit: float | None = None
+        self, qp: QP | SparseQP, start: Array | None = None, time_limit: float | None = None
     ) -> Solution:
         """Solve a QP; see `Solver.solve`."""
         solver = self.solver
@@ -304,6 +315,7 @@ class ContainedSolver:
             if self._is_trusted:
                 return solver.solve(qp, start)
             lent = None if start is None else start.copy()
+            qp = qp.full() if isinstance(qp, SparseQP) else qp
             with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
                 return _as_solution(solver.solve(qp.copy(), lent), qp)
         except KeyboardInterrupt:
@@ -316,6 +328,11 @@ class ContainedSolver:
             self._start_afresh()
             solver.time_limit = solver.options.time_limit
         solver._user = self._number
+
+    @property
+    def takes_sparse(self) -> bool:
+        """Whether it solves a `SparseQP` as such."""
+        return self._is_trusted and self.solver._takes_sparse
 
     def shift(self) -> None:
         """Report that the trajectory moved by one stage; see `Solver.shift`."""

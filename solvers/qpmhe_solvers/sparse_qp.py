@@ -1,0 +1,179 @@
+"""A QP without inequalities whose H is held by the entries that may be other than 0."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .qp import QP, Array
+
+Index = NDArray[np.intp]
+
+# By how much the factorisation must have less work than in the order by stages.
+_GAIN = 0.5
+
+
+class Order(NamedTuple):
+    """Where H's entries stand when its unknowns are ordered state by state.
+
+    Attributes
+    ----------
+    unknowns : (K n,) array
+        Numbers by stages of the unknowns in this order.
+    source, target : array
+        Places of H's entries in what holds them, and in LAPACK's lower band.
+    width : int
+        Entries below the diagonal.
+    """
+
+    unknowns: Index
+    source: Index
+    target: Index
+    width: int
+
+    def band(self, flat: Array, unit: float, out: Array | None = None) -> Array:
+        """``unit`` H as LAPACK's lower band, from the flat array that holds its entries."""
+        if out is None:
+            out = np.empty((self.unknowns.size, self.width + 1))
+        out.fill(0.0)
+        out.reshape(-1)[self.target] = flat[self.source] * unit
+        return out.T
+
+
+class Pattern:
+    """Which entries of a stage's band panel (n, 2n) may be other than 0: the diagonal and others.
+
+    Parameters
+    ----------
+    n : int
+        Unknowns a stage.
+    places : array
+        Places of these entries in the flat panel.
+
+    Attributes
+    ----------
+    places : (e,) array
+        These places, those of the diagonal first.
+    columns, rows : (e,) array
+        The entries' columns, and their rows, which are from n on those of the next stage.
+    """
+
+    def __init__(self, n: int, places: Index) -> None:
+        self.n, others = n, np.unique(places)
+        self.places: Index = np.append(2 * n * np.arange(n), others[others % (2 * n) != 0])
+        self.columns, offsets = np.divmod(self.places, 2 * n)
+        self.rows: Index = self.columns + offsets
+
+    def index(self, rows: Index, columns: Index) -> Index:
+        """Where entries at these rows and columns, on or below the diagonal, stand among those."""
+        order = np.argsort(self.places)
+        wanted = columns * 2 * self.n + rows - columns
+        return np.asarray(order[np.searchsorted(self.places, wanted, sorter=order)])
+
+    def of(self, panels: Array) -> Array:
+        """The entries (..., e) of panels (..., n, 2n)."""
+        return np.asarray(panels.reshape(*panels.shape[:-2], -1)[..., self.places])
+
+    def order(self, stages: int) -> Order | None:
+        """The order of the unknowns of so many stages; None if the one by stages is as good."""
+        source = np.arange(stages * self.places.size)
+        stage, entry = np.divmod(source, self.places.size)
+        row, column = (stage * self.n + one[entry] for one in (self.rows, self.columns))
+        there = row < stages * self.n
+        return order_of(stages, self.n, row[there], column[there], source[there])
+
+
+class SparseQP:
+    """A `QP` without inequalities, in memory that grows as the entries of H that may not be 0.
+
+    Parameters
+    ----------
+    stages : int
+        Number K of stages.
+    pattern : Pattern
+        Which entries of each stage's panel may be other than 0.
+    order : Order
+        That of the pattern for so many stages.
+
+    Attributes
+    ----------
+    band : (K, e) array
+        The entries of the panels of `QP.band`, those of the diagonal first.
+    gradient : (K, n) array
+        g.
+    diagonal : (K, n) array
+        The diagonal of H, a view.
+    """
+
+    __slots__ = (
+        "band", "bounded", "diagonal", "gradient", "n", "order", "pattern", "rows", "size",
+        "sizes", "stages",
+    )
+
+    def __init__(self, stages: int, pattern: Pattern, order: Order) -> None:
+        self.stages, self.n, self.rows = stages, pattern.n, 0
+        self.size, self.sizes, self.bounded = stages * self.n, (stages, self.n, 0), False
+        self.pattern, self.order = pattern, order
+        self.band = np.zeros((stages, pattern.places.size))
+        self.gradient, self.diagonal = np.zeros((stages, self.n)), self.band[:, : self.n]
+
+    @property
+    def lapack_band(self) -> Array:
+        """The lower band of H in LAPACK's layout, in the pattern's order: a copy."""
+        return self.order.band(self.band.reshape(-1), 1.0)
+
+    def hessian_times(self, d: Array) -> Array:
+        """H d, (K, n), of increments ``d`` (K, n)."""
+        n, (rows, columns) = self.n, (self.pattern.rows, self.pattern.columns)
+        ahead = np.concatenate((d, np.zeros((1, n)))).reshape(-1)
+        stage = n * np.arange(self.stages)[:, None]
+        below, beside = stage + rows, stage + columns
+        own = rows == columns
+        product = np.bincount(below.reshape(-1), (self.band * ahead[beside]).reshape(-1),
+                              self.size + n)
+        product += np.bincount(beside.reshape(-1), (
+            np.where(own, 0.0, self.band) * ahead[below]
+        ).reshape(-1), self.size + n)
+        return np.asarray(product[: self.size].reshape(self.stages, n))
+
+    def full(self) -> QP:
+        """The same with all entries."""
+        qp = QP(self.stages, self.n)
+        qp.band.reshape(self.stages, -1)[:, self.pattern.places] = self.band
+        qp.gradient, qp.bounded = self.gradient, False
+        return qp
+
+
+def narrow(n: int) -> float:
+    """The entries a column with which a factorisation has enough less work."""
+    return math.sqrt(_GAIN) * 2 * n
+
+
+def order_of(
+    stages: int, n: int, row: Index, column: Index, source: Index
+) -> Order | None:
+    """The order of a pattern of H; None if the order by stages is about as good."""
+    if not source.size or row.max() >= stages * n:  # the last: no entry of H
+        return None
+    place = np.empty(n, np.intp)
+    place[_order_of_states(n, row % n, column % n)] = np.arange(n)
+    at = (place * stages + np.arange(stages)[:, None]).ravel()
+    row, column = at[row], at[column]
+    low, high = np.minimum(row, column), np.maximum(row, column)
+    width = int((high - low).max())
+    if width + 1 > narrow(n):
+        return None
+    return Order(np.argsort(at), source, low * (width + 1) + high - low, width)
+
+
+def _order_of_states(n: int, i: Index, j: Index) -> Index:
+    """The reverse Cuthill-McKee order of a graph of the states."""
+    from scipy.sparse import csr_matrix  # late: as LAPACK
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    graph = csr_matrix((np.ones(2 * i.size), (np.append(i, j), np.append(j, i))), (n, n))
+    found: Index = reverse_cuthill_mckee(graph, symmetric_mode=True)
+    return found
