@@ -53,12 +53,12 @@ class Directions:
 
     def constraints_of(self, system: System, cost: Cost) -> Constraints:
         """The same for a system with other sets, and a cost of d with other weights."""
-        return Constraints(system, cost, PriorCost(system, self.observer, cost).covariance)
+        return Constraints(system, cost, PriorCost(system, self.observer, cost))
 
     def terms_of(self, system: System, cost: Cost) -> tuple[TermForm, ...]:
         """The terms of J that not every estimator has."""
         prior = PriorCost(system, self.observer, cost)
-        basis = Constraints(system, cost, prior.covariance).basis
+        basis = Constraints(system, cost, prior).basis
         forms, rows = CostSum(system, cost, prior, basis).c_forms, self.rows_of(system, cost)
         return forms if cost.space is None else tuple(
             one._replace(data=self._on_d(one.data, rows)) if one.name == SOFT else one

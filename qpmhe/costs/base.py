@@ -431,25 +431,19 @@ class Cost(ABC):
         of the noise. This sample may come with other weights, ``noise`` and ``disturbance``.
         """
         if noise is not None or disturbance is not None:
-            return self._reduced(observed, self.noise if noise is None else noise, disturbance)
+            return self.joint_weight(
+                reduced(self.noise if noise is None else noise, observed), disturbance
+            )
         key = observed.tobytes()
         joint = self._partial.pop(key, None)
         if joint is None:
-            joint = self._reduced(observed, self.noise)
+            joint = self.joint_weight(reduced(self.noise, observed))
             joint.flags.writeable = False
         self._partial[key] = joint
         if len(self._partial) > self._kept:
             with suppress(KeyError):  # other threads may have emptied it meanwhile
                 self._partial.popitem(last=False)
         return joint
-
-    def _reduced(self, observed: Mask, weight: Array, disturbance: Array | None = None) -> Array:
-        reduced = np.zeros_like(weight)
-        there = np.flatnonzero(observed)
-        if there.size:
-            block = inverse(weight)[np.ix_(there, there)]
-            reduced[np.ix_(there, there)] = inverse(block)
-        return self.joint_weight(reduced, disturbance)
 
     def reduction(self, observed: Mask, noise: Array | None = None) -> Array:
         """A matrix T (p, p) with T R T' the weight of the observed components of y alone.
@@ -462,6 +456,15 @@ class Cost(ABC):
             rest = solve(weight[np.ix_(gone, gone)], weight[np.ix_(gone, observed)])
             matrix[np.ix_(observed, gone)] = -rest.T
         return matrix
+
+
+def reduced(weight: Array, observed: Mask) -> Array:
+    """The weight (d, d) of the observed components alone, zero on the others."""
+    found, there = np.zeros_like(weight), np.flatnonzero(observed)
+    if there.size:
+        block = inverse(weight)[np.ix_(there, there)]
+        found[np.ix_(there, there)] = inverse(block)
+    return found
 
 
 def quadratic_form(residuals: Array, weights: Array) -> Array:

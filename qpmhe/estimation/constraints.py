@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from .._linalg import inverse
 from ..costs import Cost, Subspace
 from ..errors import SetError
-from ..model.sets import Box, ConvexSet
+from ..model.sets import Box
 from ..model.system import System
+from ..terms.prior import PriorCost
 from ..terms.rows import Rows, function_rows
 from .conditions import Conditions
 from .description import SET_NAMES
@@ -40,36 +41,47 @@ class Constraints:
         Components whose disturbance is a constant, so that their states follow the model.
     constant : (k,) array
         These constants.
-    basis : (n, n - k) array
-        The directions in which there are disturbances.
     directions : NoiseFreeDirections or None
         The noise-free directions in place of these components, for a `LiftedCost`.
     """
 
     __slots__ = (
-        "basis", "constant", "constraints", "directions", "disturbances", "noise_free", "noises",
-        "states",
+        "_basis", "_n", "constant", "constraints", "directions", "disturbances", "noise_free",
+        "noises", "states",
     )
 
-    def __init__(self, system: System, cost: Cost, prior_covariance: Array) -> None:
-        self.states = _rows("states", system.states, prior_covariance)
-        self.noises = _rows("noises", system.noises, inverse(cost.noise))
+    def __init__(self, system: System, cost: Cost, prior: PriorCost) -> None:
+        self.states: Rows | None = None
+        self.noises: Rows | None = None
+        if system.states is not None:
+            self.states = Rows("states", system.states, prior.covariance)
+        if system.noises is not None:
+            self.noises = Rows("noises", system.noises, inverse(cost.noise))
         self.constraints: Rows | None = None
+        self._n = system.n
+        self._basis: Array | None = None
         nonlinear = system.constraints
         if nonlinear is not None and not nonlinear.soft.all():
             self.constraints = function_rows(~nonlinear.soft, nonlinear.scale)
-        disturbances, spread = system.disturbances, inverse(cost.disturbance)
+        disturbances = system.disturbances
         self.noise_free: NDArray[np.intp] = np.empty(0, np.intp)
         self.constant: Array = np.empty(0)
         self.directions: NoiseFreeDirections | None = None
         if cost.space is None:
-            self.disturbances = _rows("disturbances", disturbances, spread)
+            self.disturbances: Rows | None = None
             if disturbances is not None:
+                self.disturbances = Rows("disturbances", disturbances, inverse(cost.disturbance))
                 self.noise_free = disturbances.fixed_components
                 self.constant = disturbances.lower[self.noise_free]
-            self.basis = np.delete(np.eye(system.n), self.noise_free, axis=1)
         else:
-            self._lift(system, cost.space, spread)
+            self._lift(system, cost.space, inverse(cost.disturbance))
+
+    @property
+    def basis(self) -> Array:
+        """The directions (n, n - k) in which there are disturbances."""
+        if self._basis is None:
+            return np.delete(np.eye(self._n), self.noise_free, axis=1)
+        return self._basis
 
     def _lift(self, system: System, space: Subspace, spread: Array) -> None:
         """Set the rows on d and the noise-free directions of a `LiftedCost`."""
@@ -81,8 +93,8 @@ class Constraints:
             spread = through @ spread @ through.T
         rows = Rows("disturbances", disturbances, spread)
         directions = NoiseFreeDirections(rows, space)
-        self.basis = directions.basis
-        if self.basis.shape[1] < system.n:
+        self._basis = directions.basis
+        if self._basis.shape[1] < system.n:
             self.directions = directions
         mapped = rows.mapped(through, space.noise_free, directions.repeated)
         self.disturbances = mapped if len(mapped.matrix) else None
@@ -254,7 +266,3 @@ def _off(normal: Array, scale: Array) -> Array:
     """The projection I - E N' along orthonormal directions, in scaled numbers."""
     projection: Array = np.eye(scale.size) - scale[:, None] * (normal @ normal.T) / scale
     return projection
-
-
-def _rows(name: str, convex_set: ConvexSet | None, covariance: Array) -> Rows | None:
-    return None if convex_set is None else Rows(name, convex_set, covariance)

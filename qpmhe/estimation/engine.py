@@ -14,17 +14,19 @@ from qpmhe_solvers import Solver, create
 from qpmhe_solvers.solver import ContainedSolver
 
 from .._checks import check_problem
-from ..costs import Cost, lifted
+from ..costs import Cost, QuadraticCost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..memory.record import Mark, MemoryRecord
 from ..memory.snapshot import reading
 from ..model.captured import ComparisonTimes, Due
 from ..model.derivatives import Nearby
+from ..model.evaluation import Places
 from ..model.residuals import difference
 from ..model.system import System
 from ..model.traces import warn_of
 from ..observers import Observer
-from ..terms.sum import root_of_first, weight_of_first
+from ..terms.forms import SparseForm, WholeForm
+from ..terms.sum import further_terms, root_of_first, weight_of_first
 from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .description import check_description, described
@@ -46,6 +48,7 @@ class Tools(NamedTuple):
     usual: Conditions
     system: System
     cost: Cost
+    form: WholeForm
     formulation: Formulation
     subproblem: Subproblem
     optimizer: Optimizer
@@ -83,7 +86,6 @@ class PythonEngine:
             # A trace saves little here, and the observer is the user's to the last bit. The metric
             # of a projection that settles needs exact Jacobians.
             system = system.as_written()
-        system.evaluation.prepare(settings.horizon)
         self._use_system(system)
         system = self._system
         self._observer, self._given_cost = observer, cost
@@ -103,6 +105,7 @@ class PythonEngine:
             self._system = system
         self._reader = ConditionReader(system, self._given_cost)
         self._tools = self._tools_for(usual_conditions(settings))
+        self._system.evaluation.prepare(settings.horizon, self._tools.form.by_entries)
         penalties = self._tools.formulation.sum.penalties
         if settings.qp_limit and penalties is not None:
             solver.prepare((settings.horizon + 1) * (system.n + penalties.size))
@@ -125,21 +128,37 @@ class PythonEngine:
         """What a step uses under these usual conditions."""
         settings = self._settings
         system, cost = usual.applied(self._system, self._cost)
-        formulation = Formulation(system, self._observer, cost)
+        form = self._form_for(system, cost)
+        formulation = Formulation(system, self._observer, cost, form)
         subproblem = Subproblem(
-            system, formulation.constraints, settings.horizon, formulation.sum.penalties
+            system, formulation.constraints, settings.horizon, formulation.sum.penalties, form
         )
         return Tools(
-            usual, system, cost, formulation, subproblem,
+            usual, system, cost, form, formulation, subproblem,
             Optimizer(subproblem, self._solver, settings),
         )
+
+    def _form_for(self, system: System, cost: Cost) -> WholeForm:
+        """How matrices are held: by entries where all that reads them can."""
+        form, settings, observer = None, self._settings, self._observer
+        model, further = system.evaluation, further_terms(system, cost)
+        sets = system.states, system.disturbances, system.noises, system.constraints, cost.space
+        if (
+            settings.qp_limit and self._solver.takes_sparse and not (further or settings.restart)
+            and type(cost) is QuadraticCost and cost.observer_prior is None
+            and all(one is None for one in (*sets, observer.initial_covariance()))
+            and not observer.needs_jacobians and model.pattern is not None
+            and (not system.has_timed or _are_same(model.pattern, system.timed.evaluation.pattern))
+        ):
+            form = SparseForm.of(model.pattern, cost, settings.horizon + 1)
+        return form or WholeForm(system.n, system.p)
 
     def _fresh_window(self, initial_state: Array, tools: Tools) -> Window:
         settings = self._settings
         return Window(
             tools.system, self._observer, tools.cost, settings.horizon, initial_state,
             self._with_terms, settings.projection, self._reinitialized, tools.usual,
-            settings.restart,
+            settings.restart, tools.form,
         )
 
     @property
@@ -472,7 +491,8 @@ class PythonEngine:
             if trial.violation == math.inf:
                 raise InvalidInputError("the model has no finite values along the estimate.")
             return window_covariances(
-                problem.model, trial.trajectory, problem.inputs, trial.weights,
+                problem.model, trial.trajectory, problem.inputs,
+                self._tools.form.whole(trial.weights),
                 weight_of_first(problem.terms, trial),
                 problem.constraints.basis, root_of_first(problem.terms, trial),
             )
@@ -540,6 +560,11 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 window.restate()
         return Memory(self._system, tools, window)
+
+
+def _are_same(one: Places, other: Places | None) -> bool:
+    """Whether two patterns are the same."""
+    return other is not None and all(map(np.array_equal, one, other))
 
 
 def _nearby(system: System) -> tuple[Nearby, Nearby]:

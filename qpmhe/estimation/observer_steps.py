@@ -19,6 +19,7 @@ from ..observers.base import check_written
 from ..observers.projection import ErrorMetric, NearestPoint
 from ..observers.roots import VAGUE
 from ..terms.base import read_only
+from ..terms.forms import WholeForm
 from ..terms.linearization import Stage
 from .conditions import USUAL, Conditions
 from .estimate import Status
@@ -52,6 +53,7 @@ class ObserverSteps(WindowSamples):
     def __init__(
         self, system: System, observer: Observer, cost: Cost, horizon: int, initial_state: Array,
         with_terms: bool, projection: str | None, usual: Conditions, restarts: bool,
+        form: WholeForm,
     ) -> None:
         n, p, m = system.n, system.p, system.m
         covariance, memory = observer.initial_covariance(), observer.initial_memory()
@@ -60,8 +62,8 @@ class ObserverSteps(WindowSamples):
             covariance=covariance is not None, majorised=not cost.quadratic,
             roots=observer.propagates_roots, memory=0 if memory is None else len(memory),
             restarts=restarts,
-        )
-        super().__init__(system, cost, sizes, initial_state, covariance, with_terms)
+        )._replace(shapes=form.shapes)
+        super().__init__(system, cost, sizes, initial_state, covariance, with_terms, form)
         self._observer = observer
         self._with_jacobians = with_terms or observer.needs_jacobians
         # What the covariance restarts at where it is lost; C finds such a loss as no number.
@@ -113,7 +115,6 @@ class ObserverSteps(WindowSamples):
         self._jacobians_finite = True  # of the stage computed last
         #: Why the model failed at the stage computed last; blank if it did not.
         self.failure = ""
-        self._minus_stand_in = -np.eye(n + p, n)  # -G where the model has no Jacobians
 
     def enter_states(self, k: int, time: int) -> None:
         """Project the state before stage k onto its X: no correction leads there."""
@@ -239,6 +240,7 @@ class ObserverSteps(WindowSamples):
         self._evaluating = "the model"
         model, u = self._fill_sample(k, time, observed)
         kernel = model.evaluation.functions.kernel if self._with_jacobians else None
+        form = self._form
         if kernel is None:
             usual = model is self._system
             arguments = view.arguments if usual else (view.arguments[0], u)
@@ -255,9 +257,12 @@ class ObserverSteps(WindowSamples):
                     arguments,
                 )
         else:
-            view.z_next[...], output, jacobian = kernel.stage(view.z, u)
+            view.z_next[...], output, jacobian = (
+                model.evaluation.stage_by_entries(view.z, u) if form.by_entries
+                else kernel.stage(view.z, u)
+            )
             np.subtract(view.y, output, terms.noise)
-            np.negative(jacobian, terms.linear[:, 1:])
+            np.negative(jacobian, terms.slopes)
             flat = jacobian.ravel()
             if not math.isfinite(flat.dot(flat)):
                 self._differentiate(terms, (model.f_jacobian, model.h_jacobian), (view.z, u))
@@ -430,13 +435,13 @@ class ObserverSteps(WindowSamples):
         f_jacobian, h_jacobian = jacobians
         running = "the Jacobian of f"
         try:
-            np.negative(f_jacobian(*arguments), terms.minus_a)
+            np.negative(self._form.jacobian("f", f_jacobian(*arguments)), terms.minus_a)
             running = "the Jacobian of h"
-            np.negative(h_jacobian(*arguments), terms.minus_c)
+            np.negative(self._form.jacobian("h", h_jacobian(*arguments)), terms.minus_c)
         except Exception as raising:  # a user's Jacobian outside its domain
             self.failure = raised(running, raising, arguments[0])
             # An observer without Jacobians goes on; `_cost_and_terms` finds the NaN.
-            terms.linear[:, 1:] = np.nan
+            terms.slopes[...] = np.nan
 
     def _cost_and_terms(self, k: int) -> float:
         """Compute the cost of stage k, or infinity, and the terms that are still missing."""
@@ -453,12 +458,12 @@ class ObserverSteps(WindowSamples):
             self.failure = raised("the cost", error, self._stage_views[k].z)
             return math.inf
         if self.has_terms:
-            jacobian = stage.linear[:, 1:].ravel()
+            jacobian = stage.slopes.ravel()
             # Terms that overflow with finite Jacobians go into the QP, which then fails.
             cost_of_terms = terms.set_stage(stage, weight)
             if not (math.isfinite(cost_of_terms) or math.isfinite(jacobian.dot(jacobian))):
                 self._jacobians_finite = False
-                stage.linear[:, 1:] = self._minus_stand_in
+                stage.slopes[...] = self._form.minus_stand_in
                 terms.set_stage(stage, weight)
         return cost
 
@@ -477,7 +482,7 @@ class ObserverSteps(WindowSamples):
     def _fill_terms(self, k: int) -> None:
         """Fill in the terms of a stage at which the model failed: no residual."""
         stage = self._stage_views[k].terms
-        stage.linear[:, 0], stage.linear[:, 1:] = 0.0, self._minus_stand_in
+        stage.residual[...], stage.slopes[...] = 0.0, self._form.minus_stand_in
         self.majorising_weight[k] = self.weight[k]
         if self.has_terms:
             self.terms.set_stage(stage, self.weight[k])
@@ -494,6 +499,6 @@ class ObserverSteps(WindowSamples):
             try:
                 self._evaluate_model(k, time, view, None if observed.all() else observed)
             except Exception:  # outside of the model's domain, which it was not before
-                view.terms.linear[:, 1:] = self._minus_stand_in
+                view.terms.slopes[...] = self._form.minus_stand_in
             view.z_next[...], view.terms.noise[...] = following, error
             self._cost_and_terms(k)

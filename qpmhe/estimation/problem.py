@@ -16,6 +16,7 @@ from ..model.residuals import difference
 from ..model.system import System
 from ..observers import Observer
 from ..terms.base import Trial
+from ..terms.forms import WholeForm
 from ..terms.prior import PriorCost
 from ..terms.sum import CostSum
 from .conditions import Conditions
@@ -33,15 +34,21 @@ _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 class Formulation:
     """The common data of all problems of an estimator."""
 
-    def __init__(self, system: System, observer: Observer, cost: Cost) -> None:
+    def __init__(
+        self, system: System, observer: Observer, cost: Cost, form: WholeForm | None = None
+    ) -> None:
         self.system, self.cost = system, cost
+        #: How matrices are held.
+        self.form: WholeForm = form or WholeForm(system.n, system.p)
+        #: The usual weight of (w, v).
+        self.usual_weight: Array = self.form.usual_weight(cost)
         self.wraps = not (system.output_residual is None and system.state_residual is None)
-        prior = PriorCost(system, observer, cost)
+        prior = PriorCost(system, observer, cost, self.form)
         self.functions = system.constraints
-        self.constraints = Constraints(system, cost, prior.covariance)
+        self.constraints = Constraints(system, cost, prior)
         self.constrained = bool(self.constraints)
         #: J.
-        self.sum = CostSum(system, cost, prior, self.constraints.basis)
+        self.sum = CostSum(system, cost, prior, self.constraints.basis, self.form)
 
     def problem(self, window: Window) -> Problem:
         """The problem of the present window."""
@@ -112,7 +119,7 @@ class Problem:
         self.measurements, self.span = view.measurements, view.span
         self.time = window.time - window.length
         self.inputs, self.model = view.inputs, formulation.system
-        weights = cost.stage_weight
+        weights = formulation.usual_weight
         # `unusual` only saves time: it stays set for too long, and loading a snapshot sets it.
         if window.unusual:
             if window.has_special_weights:
@@ -302,8 +309,8 @@ class Problem:
         """The part of a trial's J that rounding of its residuals can explain."""
         sizes = np.abs(np.concatenate((trial.trajectory[1:], self.measurements), axis=1))
         sizes = sizes * _ROUNDING
-        weights = np.broadcast_to(np.abs(trial.weights), (len(sizes), *trial.weights.shape[-2:]))
-        return float(np.einsum("ki,kij,kj->", sizes, weights, sizes))
+        weighted = self._formulation.form.times(sizes, np.abs(trial.weights))
+        return float(np.vdot(sizes, weighted))
 
 
 class Solved(NamedTuple):

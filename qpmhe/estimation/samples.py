@@ -12,7 +12,7 @@ from ..costs import Cost
 from ..memory.fields import MemorySizes
 from ..memory.record import MemoryRecord
 from ..model.system import System
-from ..terms.linearization import StageTerms
+from ..terms.forms import WholeForm
 from .conditions import USUAL, Conditions
 from .limits import LARGEST, LEAST_DISCOUNT
 from .stages import StageView, Views, WindowArrays
@@ -32,20 +32,17 @@ class WindowSamples(MemoryRecord):
 
     def __init__(
         self, system: System, cost: Cost, sizes: MemorySizes, initial_state: Array,
-        covariance: Array | None, with_terms: bool,
+        covariance: Array | None, with_terms: bool, form: WholeForm,
     ) -> None:
-        super().__init__(
-            sizes, initial_state, covariance, system.dt or 0.0, cost.stage_weight
-        )
-        n, p, horizon, room = system.n, system.p, self.horizon, self.room
-        self._system, self._cost = system, cost
+        usual = form.usual_weight(cost)
+        super().__init__(sizes, initial_state, covariance, system.dt or 0.0, usual)
+        horizon, room = self.horizon, self.room
+        self._system, self._cost, self._form, self._stage_weight = system, cost, form, usual
         #: Whether the stages have the terms of QPs.
         self.has_terms: bool = with_terms
-        self._n, self._m = n, system.m
+        self._n, self._m = system.n, system.m
         self._quadratic = cost.quadratic
-        self.terms = StageTerms(
-            room, n, p, self.linear, self.panel, self.gradient, self.next_gradient
-        )
+        self.terms = form.terms(room, self.linear, self.panel, self.gradient, self.next_gradient)
         # Views of each stage, and of each full window by its first stage.
         self._stage_views: Sequence[StageView] = Views(
             room, lambda k: StageView(self, self.terms, k)
@@ -174,12 +171,12 @@ class WindowSamples(MemoryRecord):
             self.has_disturbance_weights = True
         if False in observed.tolist():  # NumPy's `all` takes ten times as long
             self._stage_views[k].y[~observed] = 0.0  # any number: its weight is zero
-            self.weight[k] = self._cost.partial_weight(observed, *weights)
+            self.weight[k] = self._form.partial_weight(self._cost, observed, *weights)
             self.is_special[k] = self.unusual = True
             return
-        weight = usual = self._cost.stage_weight
+        weight = usual = self._stage_weight
         if any(one is not None for one in weights):
-            weight = self._cost.joint_weight(*weights)
+            weight = self._form.weight(self._cost, *weights)
         self.weight[k] = weight
         # A usual weight that was given as its own is as good as none.
         self.is_special[k] = weight is not usual and not np.array_equal(weight, usual)
@@ -224,7 +221,7 @@ class WindowSamples(MemoryRecord):
     @property
     def stage_weights(self) -> Array:
         """One weight for all stages (q, q), or one for each where some is special."""
-        return self.weights if self.has_special_weights else self._cost.stage_weight
+        return self.weights if self.has_special_weights else self._stage_weight
 
     @property
     def majorising_weights(self) -> Array:

@@ -30,13 +30,13 @@ class StageView:
         The fitting error y - h(z), read-only.
     y, u : array
         The measurement (p,), and the input (m,).
-    weight, noise_weight : (n + p, n + p) and (p, p) array
-        Weight of the joint residual, and of its error.
+    weight : (n + p, n + p) array
+        Weight of the joint residual, or its entries.
     terms : Stage
         Linearised residual and terms of the QP.
     """
 
-    __slots__ = ("arguments", "error", "noise_weight", "terms", "u", "weight", "y", "z", "z_next")
+    __slots__ = ("arguments", "error", "terms", "u", "weight", "y", "z", "z_next")
 
     def __init__(self, record: MemoryRecord, terms: StageTerms, k: int) -> None:
         self.z, self.z_next = record.z[k], record.z[k + 1]
@@ -45,7 +45,6 @@ class StageView:
             read_only(one) for one in ((self.z, self.u) if self.u.size else (self.z,))
         )
         self.weight = record.weight[k]
-        self.noise_weight = self.weight[self.z.size :, self.z.size :]
         self.terms = Stage(terms, k)
         self.error = read_only(self.terms.noise)
 

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers import QP, Solution, SolveStatus
-from qpmhe_solvers.qp import band_of
 from qpmhe_solvers.solver import ContainedSolver
 
 from ..model.functions import raised_along
 from ..model.residuals import difference
 from ..model.system import System
 from ..terms.base import QuadraticModel, Term, Trial
+from ..terms.forms import WholeForm
 from ..terms.information import window_information
-from ..terms.linearization import Span, StageTerms
+from ..terms.linearization import Span
 from ..terms.rows import Rows
 from ..terms.soft import BEYOND, Penalties
 from ..terms.sum import rows_of_first, weight_of_first
@@ -59,13 +59,14 @@ class Subproblem:
 
     def __init__(
         self, system: System, constraints: Constraints, horizon: int,
-        penalties: Penalties | None = None,
+        penalties: Penalties | None = None, form: WholeForm | None = None,
     ) -> None:
         from scipy.linalg.lapack import dpbtrf  # late: twice the cost of importing NumPy
 
         n, p = system.n, system.p
         self._n, self._p, self._pbtrf = n, p, dpbtrf
-        self._terms = StageTerms(horizon, n, p)
+        self._form = form or WholeForm(n, p)
+        self._terms = self._form.terms(horizon)
         states, w, v = constraints.states, constraints.disturbances, constraints.noises
         # Bounds of states are the QP's own.
         self._x_rows = states.matrix[states.bounds :] if states else np.empty((0, n))
@@ -112,13 +113,10 @@ class Subproblem:
         """
         if trial.trajectory is problem.candidate.trajectory:
             return self._assemble(problem, trial, problem.span, True)
-        states, terms, n = trial.trajectory[:-1], self._terms, self._n
+        states, terms, model = trial.trajectory[:-1], self._terms, problem.model
         count = states.shape[0]
-        model, linear = problem.model, terms.linear[:count]
         try:
-            a, c = model.evaluation.linear(states, problem.inputs)
-            np.negative(a, out=linear[:, :n, 1:])
-            np.negative(c, out=linear[:, n:, 1:])
+            slopes = terms.linearise(model.evaluation, states, problem.inputs)
         except Exception as error:  # a user's Jacobian outside its domain
             self.failure = raised_along(
                 error,
@@ -127,17 +125,17 @@ class Subproblem:
                 problem.inputs,
             )
             return None
-        if not np.isfinite(np.square(linear[:, :, 1:]).sum()):
+        if not np.isfinite(np.square(slopes).sum()):
             self.failure = "the Jacobian of f or h is not finite along the trajectory."
             return None
-        linear[:, :, 0] = trial.residuals
+        terms.residuals[:count] = trial.residuals
         terms.set_all(count, trial.weights)
         return self._assemble(problem, trial, Span(terms, 0, count), False)
 
     def damp(self, qp: QP, problem: Problem, trial: Trial, mu: float) -> None:
         """Give the QP that is around a trial this much damping."""
         if self._damped_trial is not trial:
-            self._damping, self._damped_trial = self._damping_band(problem, trial), trial
+            self._damping, self._damped_trial = self._damping_band(qp, problem, trial), trial
         if self._undamped is None:
             self._undamped = qp.band.copy()
         np.multiply(self._damping, mu, out=qp.band)
@@ -151,23 +149,23 @@ class Subproblem:
                 np.concatenate((rows, added)), np.append(side, np.zeros(len(added)))
             )
 
-    def _damping_band(self, problem: Problem, trial: Trial) -> Array:
+    def _damping_band(self, qp: QP, problem: Problem, trial: Trial) -> Array:
         """The band that a damping of 1 adds."""
-        n, (a, q, _, information) = self._n, self.metric(problem, trial)
+        (a, q, _, information), form = self.metric(problem, trial), self._form
         weighted = q @ a
         columns = np.concatenate((a.transpose(0, 2, 1) @ weighted, -weighted), axis=1)
-        band = np.zeros((len(a) + 1, n, 2 * n))
-        band[:-1] = band_of(columns)
-        band[1:] += band_of(q)
+        band = np.zeros_like(qp.band)
+        band[:-1] = form.band(columns)
+        band[1:] += form.band(q)
+        form.diagonal_of(band[0])[...] += information
         self._information = information
-        band[0, :, 0] += information
         return band
 
     def metric(self, problem: Problem, trial: Trial) -> Metric:
         """The metric of the damping of the QP that is around a trial."""
-        n, minus = self._n, self._minus_jacobian
-        count = len(minus)
-        weights = np.broadcast_to(trial.weights, (count, *trial.weights.shape[-2:]))
+        n, minus = self._n, self._form.whole_slopes(self._minus_jacobian)
+        count, weights = len(minus), self._form.whole(trial.weights)
+        weights = np.broadcast_to(weights, (count, *weights.shape[-2:]))
         a, c, q = -minus[:, :n], minus[:, n:], weights[:, :n, :n]
         basis, spread = problem.constraints.basis, np.full((count, n, n), np.nan)
         information = weight_of_first(problem.terms, trial).diagonal()
@@ -216,9 +214,9 @@ class Subproblem:
         """
         if self._has_ridge or qp is not self._qp or self._elimination is not None:
             return False
-        diagonal, less = qp.band[:, :, 0], qp.band.copy()
-        less[:, :, 0] -= _LOST * diagonal
-        if self._pbtrf(less.reshape(qp.size, -1).T, lower=1, overwrite_ab=1)[1] == 0:
+        diagonal, less = qp.diagonal, np.array(qp.lapack_band, order="F")
+        less[0] -= _LOST * less[0]
+        if self._pbtrf(less, lower=1, overwrite_ab=1)[1] == 0:
             return False
         self._has_ridge = True
         if self._undamped is None:
@@ -357,10 +355,11 @@ class Subproblem:
 
     def _new_qp(self, stages: int) -> QP:
         """A QP of another length in place of the present one."""
-        self._qp = qp = QP(stages, self._n, self._rows)
+        self._qp = qp = self._form.qp(stages, self._rows)
         qp.bounded = False  # until there are bounds
-        qp.row_next[:-1, self._w] = self._w_rows
-        qp.row_own[:, self._x] = self._x_rows
+        if self._rows:
+            qp.row_next[:-1, self._w] = self._w_rows
+            qp.row_own[:, self._x] = self._x_rows
         self._model = QuadraticModel(qp)
         return qp
 

@@ -15,6 +15,7 @@ from ..memory.record import Mark, MemoryRecord
 from ..model.system import System
 from ..observers import Observer
 from ..terms.base import read_only
+from ..terms.forms import WholeForm
 from ..terms.hold import WindowHold
 from .conditions import USUAL, Conditions
 from .estimate import Status
@@ -55,9 +56,11 @@ class Window(ObserverSteps):
         reinitialized: bool = False,
         usual: Conditions = USUAL,
         restarts: bool = False,
+        form: WholeForm | None = None,
     ) -> None:
         super().__init__(
-            system, observer, cost, horizon, initial_state, with_terms, projection, usual, restarts
+            system, observer, cost, horizon, initial_state, with_terms, projection, usual,
+            restarts, form or WholeForm(system.n, system.p),
         )
         self._held = list(system.held)
         self.trust_start()
@@ -214,7 +217,7 @@ class Window(ObserverSteps):
         view = self._stage_views[k]
         if not math.isfinite(self.cost[k]):
             return math.inf
-        return float(view.error.dot(view.noise_weight.dot(view.error)))
+        return float(view.error.dot(view.weight[self._n :, self._n :].dot(view.error)))
 
     @property
     def _observers_ready(self) -> bool:
@@ -253,14 +256,11 @@ class Window(ObserverSteps):
 
     def _set_all_stages(self) -> bool:
         """Compute the Jacobians, terms and costs of all stages; whether all are finite."""
-        view, n, weights = self.view, self._n, self.stage_weights
+        view, weights = self.view, self.stage_weights
         residuals, states = read_only(view.residuals), view.candidate[:-1]
         try:
             if self._with_jacobians:
-                minus_jacobian, inputs, model = view.span.minus_jacobian, self.inputs, self.model
-                a, c = model.evaluation.linear(states, inputs)
-                np.negative(a, minus_jacobian[:, :n])
-                np.negative(c, minus_jacobian[:, n:])
+                self.terms.linearise(self.model.evaluation, states, self.inputs, self.start)
             if self._quadratic:
                 view.costs[...] = checked = self.terms.set_all(self.length, weights, self.start)
             else:

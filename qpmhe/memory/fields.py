@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -140,10 +141,14 @@ _C_DIMENSIONS = {
 
 
 class MemorySizes(NamedTuple):
-    """Dimensions by name, and the features that an estimator has."""
+    """Dimensions by name, and the features that an estimator has.
+
+    ``shapes`` are those of fields that Python holds in another form.
+    """
 
     dimensions: dict[str, int]
     features: frozenset[str]
+    shapes: Mapping[str, tuple[int, ...]] = {}
 
     @classmethod
     def of(
@@ -175,7 +180,8 @@ class MemorySizes(NamedTuple):
 
     def shape(self, field: Field) -> tuple[int, ...]:
         """The shape of one row of a field."""
-        return tuple(self.dimensions[name] for name in field.shape.split())
+        usual = tuple(self.dimensions[name] for name in field.shape.split())
+        return self.shapes.get(field.name, usual)
 
     def first_value(self, field: Field) -> Any:
         """A single value before the first sample; None where there is none yet, or never."""

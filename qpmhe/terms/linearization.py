@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers.qp import band_index
 
+from ..model.model import Model
+from .entries import StageProducts
 from .sparse_stages import SparseStages
 
 Array = NDArray[np.float64]
@@ -17,27 +19,29 @@ class Stage:
 
     Attributes
     ----------
+    residual, slopes : array
+        r (n + p,) and -G (n + p, n), or its entries.
     linear, transposed : array
-        :math:`[r, -G]` (n + p, 1 + n), and its transpose.
+        :math:`[r, -G]` (n + p, 1 + n), and its transpose; not of entries.
     disturbance, noise : array
         The parts w (n,) and v (p,) of r.
     minus_a, minus_c : array
-        The parts -A (n, n) and -C (p, n) of -G.
+        The parts -A (n, n) and -C (p, n) of -G, or their entries.
     panel, gradient, next_gradient : array
         The stage's terms.
     """
 
     __slots__ = (
         "disturbance", "gradient", "linear", "minus_a", "minus_c", "next_gradient", "noise",
-        "panel", "transposed",
+        "panel", "residual", "slopes", "transposed",
     )
 
     def __init__(self, terms: StageTerms, k: int) -> None:
         self.linear = linear = terms.linear[k]
-        self.transposed = linear.T
-        n = linear.shape[1] - 1
-        self.disturbance, self.noise = linear[:n, 0], linear[n:, 0]
-        self.minus_a, self.minus_c = linear[:n, 1:], linear[n:, 1:]
+        self.transposed, n, of_a = linear.T, terms.n, terms.of_a
+        self.residual, self.slopes = terms.residuals[k], terms.slopes[k]
+        self.disturbance, self.noise = self.residual[:n], self.residual[n:]
+        self.minus_a, self.minus_c = self.slopes[:of_a], self.slopes[of_a:]
         self.panel, self.gradient = terms.panel[k], terms.gradient[k]
         self.next_gradient = terms.next_gradient[k]
 
@@ -48,7 +52,7 @@ class Span:
     Attributes
     ----------
     minus_jacobian : (count, n + p, n) array
-        The :math:`-G_i`.
+        The :math:`-G_i`, or their entries.
     panel : (count, n, 2n) array
         The panels.
     gradient_first, gradient_rest : array
@@ -64,7 +68,7 @@ class Span:
 
     def __init__(self, terms: StageTerms, first: int, count: int) -> None:
         last = first + count
-        self.minus_jacobian = terms.linear[first:last, :, 1:]
+        self.minus_jacobian = terms.slopes[first:last]
         self.panel = terms.panel[first:last]
         self.gradient_first = terms.gradient[first]
         self.gradient_rest = terms.gradient[first + 1 : last]
@@ -94,13 +98,18 @@ class StageTerms:
         :math:`[r_i, -G_i]`.
     residuals : (stages, n + p) array
         The :math:`r_i` in it, a view.
+    slopes : (stages, n + p, n) array
+        The :math:`-G_i`, likewise.
+    of_a : int
+        How many rows of these, or entries, are those of -A.
     panel, gradient, next_gradient : array
         (stages, n, 2n), (stages, n), (stages, n).
     """
 
     __slots__ = (
         "_flat", "_gradient_column", "_next_column", "_panel_index", "_sparse", "_square",
-        "_weighted", "_zeros", "gradient", "linear", "next_gradient", "panel", "residuals",
+        "_weighted", "_zeros", "gradient", "linear", "n", "next_gradient", "of_a", "panel",
+        "residuals", "slopes",
     )
 
     def __init__(self, stages: int, n: int, p: int, *arrays: Array) -> None:
@@ -110,6 +119,8 @@ class StageTerms:
             arrays = tuple(np.zeros(shape) for shape in shapes)
         self.linear, self.panel, self.gradient, self.next_gradient = arrays
         self.residuals: Array = self.linear[:, :, 0]
+        self.slopes: Array = self.linear[:, :, 1:]
+        self.n = self.of_a = n
         # Workspace for one stage, with M = [r, -G]: M^T W M, then W M, then a number that stays 0.
         self._flat = np.zeros(wide**2 + q * wide + 1)
         self._square = self._flat[: wide**2].reshape(wide, wide)
@@ -119,6 +130,14 @@ class StageTerms:
         self._gradient_column, self._next_column = self._square[1:, 0], self._weighted[:n, 0]
         self._panel_index = _panel_index(n, p)
         self._sparse = SparseStages.of(n)
+
+    def linearise(self, model: Model, states: Array, inputs: Array, first: int = 0) -> Array:
+        """Set the slopes of successive stages to those of a model; return them, a view."""
+        slopes = self.slopes[first : first + len(states)]
+        a, c = model.linear(states, inputs)
+        np.negative(a, slopes[:, : self.n])
+        np.negative(c, slopes[:, self.n :])
+        return slopes
 
     def set_stage(self, stage: Stage, weight: Array) -> float:
         """Compute a stage's terms from its ``linear``; return its cost, NaN if they overflow."""
@@ -152,6 +171,41 @@ class StageTerms:
         costs: Array = flat[:, 0] + flat.dot(self._zeros)
         return costs
 
+
+class SparseStageTerms(StageTerms):
+    r"""The same of entries: ``linear[i]`` is r (n + p,) and then the entries of -G."""
+
+    __slots__ = ("_products",)
+
+    def __init__(self, stages: int, products: StageProducts, *arrays: Array) -> None:
+        n, q, entries = products.n, products.slopes.starts.size - 1, products.slopes.size
+        if not arrays:
+            shapes = (q + entries,), (products.pattern.places.size,), (n,), (n,)
+            arrays = tuple(np.zeros((stages, *shape)) for shape in shapes)
+        self.linear, self.panel, self.gradient, self.next_gradient = arrays
+        self.residuals, self.slopes = self.linear[:, :q], self.linear[:, q:]
+        self.n, self.of_a = n, int(products.slopes.starts[n])
+        self._products = products
+
+    def linearise(self, model: Model, states: Array, inputs: Array, first: int = 0) -> Array:
+        """See `StageTerms.linearise`."""
+        slopes = self.slopes[first : first + len(states)]
+        np.negative(model.entries(states, inputs), slopes)
+        return slopes
+
+    def set_stage(self, stage: Stage, weight: Array) -> float:
+        """See `StageTerms.set_stage`."""
+        return float(self._products.compute(
+            stage.residual, stage.slopes, weight, stage.panel, stage.gradient, stage.next_gradient
+        ))
+
+    def set_all(self, count: int, weight: Array, first: int = 0) -> Array:
+        """See `StageTerms.set_all`."""
+        span = slice(first, first + count)
+        return self._products.compute(
+            self.residuals[span], self.slopes[span], weight, self.panel[span],
+            self.gradient[span], self.next_gradient[span],
+        )
 
 
 def _panel_index(n: int, p: int) -> NDArray[np.intp]:

@@ -19,6 +19,7 @@ from ..model.system import System
 from ..observers import Observer
 from ..observers.roots import triangle
 from .base import FirstStateDerivative, FirstStateTerm, Trial, WindowData, WindowView
+from .forms import WholeForm
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ class PriorWeights:
             scales = system.scales
             self.typical = cost.prior_variances(covariance) if scales is None else scales * scales
         rule = cost.observer_prior
-        self.added: Array = np.zeros((system.n, system.n))
+        self.added: Array = np.broadcast_to(0.0, (system.n, system.n))
         self.least = self.added
         self._varies = rule is not None and covariance is not None
         fixed = system.disturbances is not None and system.disturbances.fixed_components.size > 0
@@ -164,9 +165,14 @@ class PriorCost:
     ----------
     system, observer, cost
         Those of the estimator.
+    form : WholeForm, optional
+        How matrices are held.
     """
 
-    def __init__(self, system: System, observer: Observer, cost: Cost) -> None:
+    def __init__(
+        self, system: System, observer: Observer, cost: Cost, form: WholeForm | None = None
+    ) -> None:
+        self.form = form or WholeForm(system.n, system.p)
         self.cost, self.residual = cost, system.state_residual
         self.quadratic, self.discounted = cost.quadratic, cost.discount < 1.0
         #: Whether the weight of a window is that of its quadratic form along all trajectories.
@@ -179,9 +185,15 @@ class PriorCost:
         covariance = observer.initial_covariance()
         #: Weight of the initial error of the first window, and one to judge its distance by.
         self.first: InitialWeight = self.weights(covariance)
-        self.first_band = band_of(self.first.weight)
-        #: Covariance of the initial error, regular.
-        self.covariance = inverse(self.first.distance)
+        self.first_band = self.form.band(self.first.weight)
+        if self.form.by_entries:  # it has no root
+            weight = self.form.symmetric(self.first.weight)
+            self.first = InitialWeight(weight, weight)
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the initial error, regular."""
+        return inverse(self.form.matrix(self.first.distance))
 
     def of_window(self, window: WindowData, view: WindowView) -> Prior:
         """The prior of a window."""
@@ -192,6 +204,8 @@ class PriorCost:
             prior.set_weight(self.weights(covariance, root, later))
         if self.discounted:
             prior.factor = float(window.discounts[0])
+            if self.quadratic and not self.follows:
+                prior.band = prior.factor * self.first_band
         if window.smoothed_prior is not None:
             prior.move(window.smoothed_prior)
         return prior
@@ -232,7 +246,7 @@ class Prior(FirstStateTerm):
         """The squared distance of two states, in deviations of the prior."""
         initial = self._initial
         if initial.distance_root is None:
-            return float(offset.dot(initial.distance).dot(offset))
+            return float((offset @ initial.distance).dot(offset))
         seen = initial.distance_root.dot(offset)
         return float(seen.dot(seen))
 
@@ -293,7 +307,7 @@ class Prior(FirstStateTerm):
         rule = self._rule
         offset = trial.trajectory[0] - self.mean if rule.residual is None else self.offset(trial)
         if rule.quadratic and self._initial.root is None:
-            return self.factor * float(offset.dot(self.weight).dot(offset))
+            return self.factor * float((offset @ self.weight).dot(offset))
         return float(self.factor * self._lost(offset))
 
     def cost_of_candidate(self, candidate: Trial) -> float:
@@ -302,7 +316,7 @@ class Prior(FirstStateTerm):
 
     def weight_of_first(self, trial: Trial) -> Array:
         """See `FirstStateTerm.weight_of_first`."""
-        return self._majorised(self.offset(trial))
+        return self._rule.form.matrix(self._majorised(self.offset(trial)))
 
     def root_of_first(self, trial: Trial) -> Array | None:
         """See `Term.root_of_first`."""
@@ -342,10 +356,10 @@ class Prior(FirstStateTerm):
 
     def derivative(self, trial: Trial) -> PriorDerivative:
         """See `Term.derivative`."""
-        cost, offset = self._rule.cost, self.offset(trial)
+        cost, offset, matrix = self._rule.cost, self.offset(trial), self._rule.form.matrix
         return PriorDerivative(
-            cost, offset, self.weight, self.factor, self._force(offset), self._majorised(offset),
-            len(trial.residuals) / cost.discount,
+            cost, offset, matrix(self.weight), self.factor, self._force(offset),
+            matrix(self._majorised(offset)), len(trial.residuals) / cost.discount,
         )
 
 

@@ -8,8 +8,6 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from qpmhe_solvers.qp import band_of
-
 from ..costs import Cost
 from ..model.functions import contained
 from .base import (
@@ -22,6 +20,7 @@ from .base import (
     WindowView,
     read_only,
 )
+from .forms import WholeForm
 
 Array = NDArray[np.float64]
 
@@ -45,14 +44,16 @@ class StageCosts:
     ----------
     cost : Cost
         That of the estimator.
+    form : WholeForm
+        How matrices are held.
     """
 
-    def __init__(self, cost: Cost) -> None:
-        self.cost, self.quadratic = cost, cost.quadratic
+    def __init__(self, cost: Cost, form: WholeForm) -> None:
+        self.cost, self.quadratic, self.form = cost, cost.quadratic, form
         self.discounted = cost.discount < 1.0
         self.evaluate, self.majorise = contained(cost.stage_costs), contained(cost.majorise)
         #: The weight of a usual disturbance, as a band.
-        self.band = band_of(cost.disturbance)
+        self.band = form.band(cost.disturbance)
         #: What usual disturbances add to the bands of all states but the last one, by the length of
         #: the window.
         self.earlier_bands = _EarlierBands(self.band)
@@ -91,7 +92,7 @@ class Stages(Term):
 
     def _with_factors(self, weights: Array) -> Array:
         factors = self._factors
-        return weights if factors is None else weights * factors[:, None, None]
+        return weights if factors is None else weights * self._rule.form.per_stage(factors)
 
     def with_cost(self, cost: Cost) -> Stages:
         """See `Term.with_cost`."""
@@ -104,10 +105,7 @@ class Stages(Term):
         rule, residuals = self._rule, trial.residuals
         if rule.quadratic:
             trial.weights = weights = self._candidate_weights  # the same along all trajectories
-            if weights.ndim == 2:
-                weighted = residuals.dot(weights)
-            else:
-                weighted = np.matmul(residuals[:, None, :], weights)[:, 0]
+            weighted = rule.form.times(residuals, weights)
             return float(weighted.ravel().dot(residuals.ravel()))
         residuals, weights = read_only(residuals), read_only(self.weights)
         costs = rule.evaluate(residuals, weights)
@@ -127,11 +125,11 @@ class Stages(Term):
         Each stage adds its panel to that of its state, and the weight of its disturbance to the
         next.
         """
-        span, weights, factors = model.span, trial.weights, None
+        span, weights, factors, form = model.span, trial.weights, None, self._rule.form
         if model.is_candidate:
             factors = self._factors
         if factors is not None:
-            np.multiply(span.panel, factors[:, None, None], model.earlier_band)
+            np.multiply(span.panel, form.per_stage(factors), model.earlier_band)
             np.multiply(span.gradient_first, factors[0], model.first_gradient)
             np.multiply(span.gradient_rest, factors[1:, None], model.inner_gradient)
             model.inner_gradient += span.next_gradient_rest * factors[:-1, None]
@@ -140,12 +138,11 @@ class Stages(Term):
             model.first_gradient[...] = span.gradient_first
             np.add(span.gradient_rest, span.next_gradient_rest, model.inner_gradient)
             model.last_gradient[...] = span.next_gradient_last
-        if weights.ndim == 2 or self._usual:
+        if form.is_single(weights) or self._usual:
             last = self._rule.band
             np.add(span.panel, self._rule.earlier_bands[len(span.panel)], model.earlier_band)
         else:
-            n = model.gradient.shape[1]
-            bands = band_of(weights[:, :n, :n])
+            bands = form.disturbance_band(weights)
             if factors is None:
                 model.earlier_band[...] = span.panel
             model.earlier_band[1:] += bands[:-1]
@@ -154,21 +151,21 @@ class Stages(Term):
 
     def add_weights(self, diagonal: Array) -> None:
         """See `Term.add_weights`."""
-        weights = self._with_factors(np.broadcast_to(
-            self.weights, (len(diagonal) - 1, *self.weights.shape[-2:])
-        ))
-        n = diagonal.shape[1]
-        diagonal[1:] += np.diagonal(weights, axis1=1, axis2=2)[:, :n]
+        weights, n = self._rule.form.diagonal(self.weights), diagonal.shape[1]
+        if self._factors is not None:
+            weights = weights * self._factors[:, None]
+        diagonal[1:] += weights[..., :n]
 
     def magnitude(self, trial: Trial) -> float:
         """See `Term.magnitude`."""
         residuals, weights = abs(trial.residuals), abs(self.weights)
-        weights = np.broadcast_to(weights, (len(residuals), *weights.shape[-2:]))
-        return float(np.einsum("ki,kij,kj->", residuals, weights, residuals))
+        return float(np.vdot(residuals, self._rule.form.times(residuals, weights)))
 
     def derivative(self, trial: Trial) -> StagesDerivative:
         """See `Term.derivative`."""
-        return StagesDerivative(self._rule.cost, trial, self.weights.copy(), self._factors)
+        form = self._rule.form
+        whole = form.whole(trial.weights), form.whole(self.weights).copy()
+        return StagesDerivative(self._rule.cost, trial.residuals, *whole, self._factors)
 
 
 class StagesDerivative(TermDerivative):
@@ -177,14 +174,15 @@ class StagesDerivative(TermDerivative):
     data = ("stage_weights",)
 
     def __init__(
-        self, cost: Cost, trial: Trial, weights: Array, factors: Array | None
+        self, cost: Cost, residuals: Array, majorising: Array, weights: Array,
+        factors: Array | None,
     ) -> None:
-        self._cost, self._residuals, self._weights = cost, trial.residuals, weights
-        count = len(trial.residuals)
+        self._cost, self._residuals, self._weights = cost, residuals, weights
+        count = len(residuals)
         self._factors = np.ones(count) if factors is None else factors
-        self.majorised = np.broadcast_to(2.0 * trial.weights, (count, *weights.shape[-2:]))
-        self.force = np.einsum("kij,kj->ki", self.majorised, trial.residuals)
-        hessian = cost.stage_hessian(trial.residuals, weights)
+        self.majorised = np.broadcast_to(2.0 * majorising, (count, *weights.shape[-2:]))
+        self.force = np.einsum("kij,kj->ki", self.majorised, residuals)
+        hessian = cost.stage_hessian(residuals, weights)
         self.bent = self._factors[:, None, None] * hessian
         # The newest stage has the age 0.
         self.ages = np.arange(count - 1, -1, -1.0) / cost.discount

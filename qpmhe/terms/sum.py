@@ -13,6 +13,7 @@ from ..costs import Cost
 from ..errors import OptionError
 from ..model.system import System
 from .base import FirstStateTerm, Term, TermForm, Trial, WindowData, WindowView
+from .forms import WholeForm
 from .hold import Hold, WindowHold
 from .prior import Prior, PriorCost
 from .soft import Penalties
@@ -85,10 +86,16 @@ class CostSum:
         The prior of its windows.
     basis : (n, r) array
         The directions in which there are disturbances.
+    form : WholeForm, optional
+        How matrices are held.
     """
 
-    def __init__(self, system: System, cost: Cost, prior: PriorCost, basis: Array) -> None:
-        self._stages, self._prior = StageCosts(cost), prior
+    def __init__(
+        self, system: System, cost: Cost, prior: PriorCost, basis: Array,
+        form: WholeForm | None = None,
+    ) -> None:
+        form = form or WholeForm(system.n, system.p)
+        self._stages, self._prior = StageCosts(cost, form), prior
         #: The terms that not every estimator has, in the order of the sum.
         self._further: list[TermRule] = [
             one for kind in KINDS if kind.belongs(system, cost)

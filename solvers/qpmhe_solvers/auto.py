@@ -15,7 +15,6 @@ from .options import SolverOptions
 from .qp import QP, Array
 from .solution import Solution, SolveStatus
 from .solver import ContainedSolver, Solver
-from .sparse_qp import SparseQP
 
 # daqp is the fastest up to about this many unknowns; beyond, the active set on the banded
 # factorisation is, or a sparse interior point where that takes more exchanges than these.
@@ -45,9 +44,7 @@ class AutoSolver(Solver):
     def __reduce__(self) -> tuple[type[AutoSolver], tuple[SolverOptions]]:
         return type(self), (self.options,)
 
-    def _solve(self, qp: QP | SparseQP, start: Array | None) -> Solution:
-        if isinstance(qp, SparseQP):  # without inequalities
-            return self._banded._solve(qp, start)
+    def _solve(self, qp: QP, start: Array | None) -> Solution:
         limit = self.time_limit
         until = None if limit is None else perf_counter() + limit
         small = qp.size <= _SMALL

@@ -46,14 +46,14 @@ class BandedSolver(Solver):
         self._work: tuple[Array, Array, Array] | None = None
         self._sparse = SparseOrder()
 
-    def _solve(self, qp: QP | SparseQP, start: Array | None) -> Solution:
-        if isinstance(qp, QP) and qp.rows and (qp.row_lower == qp.row_upper).any():
+    def _solve(self, qp: QP, start: Array | None) -> Solution:
+        if qp.rows and (qp.row_lower == qp.row_upper).any():
             return self._solve_scaled(qp)
         step = self._cholesky(qp)
         if step is None:
             message = "the factorisation failed: H is not positive definite, or not finite"
             return Solution(None, SolveStatus.FAILED, 0, message=message)
-        if isinstance(qp, SparseQP) or not (qp.bounded or qp.rows):
+        if not qp.bounded and not qp.rows:
             return Solution(step, SolveStatus.SOLVED, 0)
         return _judged(qp, step, np.zeros(qp.stages * qp.rows), qp.violation(step) <= 0.0)
 
@@ -71,7 +71,7 @@ class BandedSolver(Solver):
             qp, step * scale.step, multipliers * scale.duals[qp.size :], feasible
         )
 
-    def _cholesky(self, qp: QP | SparseQP) -> Array | None:
+    def _cholesky(self, qp: QP) -> Array | None:
         # A root is exact for powers of four alone: an odd unit of the cost goes before.
         unit = _COST_UNITS[math.frexp(qp.band.item(0))[1] % 2]
         found = self._sparse.band(qp, unit)

@@ -117,7 +117,7 @@ class Solver(ABC):
         self.solve(sample(3, 2, 2, bounds="part", sides="mixed"))
         self.forget()
 
-    def solve(self, qp: QP | SparseQP, start: Array | None = None) -> Solution:
+    def solve(self, qp: QP, start: Array | None = None) -> Solution:
         """Solve a QP, contain every exception of the solver, and verify its answer.
 
         Parameters
@@ -145,7 +145,7 @@ class Solver(ABC):
             qp = self._readable(qp)
         try:
             if self._judges:
-                return self._solve(qp, start)  # type: ignore[return-value,arg-type]  # judged already
+                return self._solve(qp, start)  # type: ignore[return-value]  # judged already
             if not self._warns:
                 with np.errstate(all="ignore"):
                     return self._checked(qp, start)
@@ -159,9 +159,8 @@ class Solver(ABC):
     def _readable(self, qp: object) -> QP:
         """A QP as `_solve` takes it; refuses what is none."""
         if isinstance(qp, SparseQP):
-            return qp if self._takes_sparse else qp.full()  # type: ignore[return-value]
-        _expect_qp(qp)
-        return qp  # type: ignore[return-value]
+            return qp if self._takes_sparse else qp.full()
+        return _expect_qp(qp)
 
     def _checked(self, qp: QP, start: Array | None) -> Solution:
         """Look at the data, solve, and judge."""
@@ -303,7 +302,7 @@ class ContainedSolver:
         self._shifts = type(solver).shift is not Solver.shift or "shift" in vars(solver)
 
     def solve(
-        self, qp: QP | SparseQP, start: Array | None = None, time_limit: float | None = None
+        self, qp: QP, start: Array | None = None, time_limit: float | None = None
     ) -> Solution:
         """Solve a QP; see `Solver.solve`."""
         solver = self.solver
@@ -390,13 +389,14 @@ def _crosses(qp: QP, d: Array, far: NDArray[np.bool_]) -> bool:
     return bool((np.append(qp.all_lower > value, qp.all_upper < value) & far).any())
 
 
-def _expect_qp(qp: object) -> None:
+def _expect_qp(qp: object) -> QP:
     """Refuse what is no QP."""
     if not isinstance(qp, QP):
         raise InvalidInputError(
             f"qp is {qp!r}; expected a qpmhe.solvers.QP: create one from its "
             "sizes and fill its arrays, or load one with qpmhe.solvers.load."
         )
+    return qp
 
 
 def _failure(error: BaseException) -> Solution:

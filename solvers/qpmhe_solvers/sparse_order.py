@@ -40,7 +40,7 @@ class SparseOrder:
         self._order: Order | None = None
         self._band = self._side = np.empty(0)
 
-    def band(self, qp: QP | SparseQP, unit: float) -> tuple[Array, Array] | None:
+    def band(self, qp: QP, unit: float) -> tuple[Array, Array] | None:
         """``unit`` H as LAPACK's lower band and -``unit`` g in this order; None if of no use."""
         flat = qp.band.reshape(-1)
         order = qp.order if isinstance(qp, SparseQP) else self._found(qp, flat)

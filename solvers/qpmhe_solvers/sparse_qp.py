@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .qp import QP, Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
 
 Index = NDArray[np.intp]
 
@@ -67,15 +70,17 @@ class Pattern:
         self.columns, offsets = np.divmod(self.places, 2 * n)
         self.rows: Index = self.columns + offsets
 
-    def index(self, rows: Index, columns: Index) -> Index:
-        """Where entries at these rows and columns, on or below the diagonal, stand among those."""
+    def index(self, places: Index) -> Index:
+        """Where these places of the panel stand among the entries."""
         order = np.argsort(self.places)
-        wanted = columns * 2 * self.n + rows - columns
-        return np.asarray(order[np.searchsorted(self.places, wanted, sorter=order)])
+        return np.asarray(order[np.searchsorted(self.places, places, sorter=order)])
 
-    def of(self, panels: Array) -> Array:
-        """The entries (..., e) of panels (..., n, 2n)."""
-        return np.asarray(panels.reshape(*panels.shape[:-2], -1)[..., self.places])
+    def of(self, columns: Array) -> Array:
+        """The entries (..., e) of columns (..., 2n, n), or of diagonal blocks (..., n, n)."""
+        there = self.rows < columns.shape[-2]
+        found = np.zeros((*columns.shape[:-2], self.places.size))
+        found[..., there] = columns[..., self.rows[there], self.columns[there]]
+        return found
 
     def order(self, stages: int) -> Order | None:
         """The order of the unknowns of so many stages; None if the one by stages is as good."""
@@ -86,7 +91,7 @@ class Pattern:
         return order_of(stages, self.n, row[there], column[there], source[there])
 
 
-class SparseQP:
+class SparseQP(QP):
     """A `QP` without inequalities, in memory that grows as the entries of H that may not be 0.
 
     Parameters
@@ -102,49 +107,57 @@ class SparseQP:
     ----------
     band : (K, e) array
         The entries of the panels of `QP.band`, those of the diagonal first.
-    gradient : (K, n) array
-        g.
-    diagonal : (K, n) array
-        The diagonal of H, a view.
     """
 
-    __slots__ = (
-        "band", "bounded", "diagonal", "gradient", "n", "order", "pattern", "rows", "size",
-        "sizes", "stages",
-    )
+    __slots__ = ("order", "pattern")
 
     def __init__(self, stages: int, pattern: Pattern, order: Order) -> None:
-        self.stages, self.n, self.rows = stages, pattern.n, 0
-        self.size, self.sizes, self.bounded = stages * self.n, (stages, self.n, 0), False
+        n = pattern.n
+        self.stages, self.n, self.rows, self.size = stages, n, 0, stages * n
+        self.sizes, self.bounded, self.key = (stages, n, 0), False, 0
         self.pattern, self.order = pattern, order
         self.band = np.zeros((stages, pattern.places.size))
-        self.gradient, self.diagonal = np.zeros((stages, self.n)), self.band[:, : self.n]
+        self.gradient = np.zeros((stages, n))
+
+    def copy(self) -> SparseQP:
+        """A copy of the problem that shares no array."""
+        other = SparseQP(self.stages, self.pattern, self.order)
+        other.band, other.gradient = self.band, self.gradient
+        return other
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.full().__reduce__()
+
+    def full(self) -> QP:
+        """The same problem with all entries."""
+        qp = QP(self.stages, self.n)
+        qp.band.reshape(self.stages, -1)[:, self.pattern.places] = self.band
+        qp.gradient, qp.bounded = self.gradient, False
+        return qp
+
+    @property
+    def diagonal(self) -> Array:
+        """The diagonal of H (K, n), a view."""
+        return self.band[:, : self.n]
 
     @property
     def lapack_band(self) -> Array:
         """The lower band of H in LAPACK's layout, in the pattern's order: a copy."""
         return self.order.band(self.band.reshape(-1), 1.0)
 
+    def csc(self) -> csc_matrix:
+        """See `QP.csc`."""
+        return self.full().csc()
+
     def hessian_times(self, d: Array) -> Array:
         """H d, (K, n), of increments ``d`` (K, n)."""
-        n, (rows, columns) = self.n, (self.pattern.rows, self.pattern.columns)
-        ahead = np.concatenate((d, np.zeros((1, n)))).reshape(-1)
+        n, size = self.n, self.size + self.n
         stage = n * np.arange(self.stages)[:, None]
-        below, beside = stage + rows, stage + columns
-        own = rows == columns
-        product = np.bincount(below.reshape(-1), (self.band * ahead[beside]).reshape(-1),
-                              self.size + n)
-        product += np.bincount(beside.reshape(-1), (
-            np.where(own, 0.0, self.band) * ahead[below]
-        ).reshape(-1), self.size + n)
-        return np.asarray(product[: self.size].reshape(self.stages, n))
-
-    def full(self) -> QP:
-        """The same with all entries."""
-        qp = QP(self.stages, self.n)
-        qp.band.reshape(self.stages, -1)[:, self.pattern.places] = self.band
-        qp.gradient, qp.bounded = self.gradient, False
-        return qp
+        below, beside = ((stage + one).ravel() for one in (self.pattern.rows, self.pattern.columns))
+        flat, ahead = self.band.ravel(), np.append(d.ravel(), np.zeros(n))
+        found = np.bincount(below, flat * ahead[beside], size)
+        found += np.bincount(beside, np.where(below > beside, flat * ahead[below], 0.0), size)
+        return np.asarray(found[: self.size].reshape(self.stages, n))
 
 
 def narrow(n: int) -> float:
@@ -175,5 +188,4 @@ def _order_of_states(n: int, i: Index, j: Index) -> Index:
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     graph = csr_matrix((np.ones(2 * i.size), (np.append(i, j), np.append(j, i))), (n, n))
-    found: Index = reverse_cuthill_mckee(graph, symmetric_mode=True)
-    return found
+    return np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), np.intp)

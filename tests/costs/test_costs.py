@@ -11,6 +11,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Huber, ObserverPrior, Power, QuadraticCost, RobustCost
+from qpmhe.costs.base import reduced
 from qpmhe.errors import InvalidInputError, OptionError, WeightError
 from tests.estimation.plain import spd
 from tests.estimation.spoil import check
@@ -55,7 +56,7 @@ def test_few_patterns_of_missing_components_are_kept():
 
 def test_threads_may_share_a_cost_whose_patterns_are_dropped():
     cost, masks = QuadraticCost(**weights(1, 12)), np.random.default_rng(9).random((64, 12)) < 0.5
-    cost._kept, expected = 2, [cost._reduced(mask, cost.noise) for mask in masks]
+    cost._kept, expected = 2, [cost.joint_weight(reduced(cost.noise, mask)) for mask in masks]
 
     def work(seed):
         for k in np.random.default_rng(seed).integers(0, 64, 400):

@@ -1,0 +1,233 @@
+"""A stage's matrices by the entries that may be other than 0, and sums of their products."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qpmhe_solvers.sparse_qp import Pattern
+
+from ..costs.base import reduced
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Index = NDArray[np.intp]
+
+
+class GroupedSums:
+    """Sums of products of entries of two arrays; each product belongs to the sum of a key.
+
+    Attributes
+    ----------
+    keys : array
+        The keys, sorted: one for each sum.
+    """
+
+    def __init__(self, left: Index, right: Index, keys: Index) -> None:
+        order = np.argsort(keys, kind="stable")
+        self._left, self._right, keys = left[order], right[order], keys[order]
+        starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+        self.keys: Index = keys[starts]
+        self._starts = None if starts.size == keys.size else starts
+
+    def __call__(self, one: Array, other: Array) -> Array:
+        """The sums (..., keys) for entries (..., left) and (..., right)."""
+        products: Array = one.take(self._left, -1) * other.take(self._right, -1)
+        if self._starts is None:
+            return products
+        return np.asarray(np.add.reduceat(products, self._starts, -1))
+
+
+class Entries:
+    """Entries of a matrix, by rows.
+
+    Attributes
+    ----------
+    rows, columns : (e,) array
+        Where they are.
+    """
+
+    def __init__(self, rows: Index, columns: Index, height: int) -> None:
+        order = np.lexsort((columns, rows))
+        self.rows, self.columns = rows[order], columns[order]
+        #: Where each row begins, and the last one ends.
+        self.starts: Index = np.searchsorted(self.rows, np.arange(height + 1))
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return self.rows.size
+
+    def of_rows(self, rows: Index) -> tuple[Index, Index]:
+        """All entries of these rows: which of the rows, and which entry."""
+        first, counts = self.starts[rows], np.diff(self.starts)[rows]
+        which = np.repeat(np.arange(rows.size), counts)
+        ends = np.cumsum(counts)
+        return which, np.arange(which.size) + np.repeat(first - ends + counts, counts)
+
+
+class StageWeights:
+    """The entries of the weights of (w, v): of every window, whatever outputs are missing.
+
+    Without some outputs, those that share entries of the noise's weight with them, by any number of
+    steps, weigh each other: these are blocks.
+
+    Parameters
+    ----------
+    disturbance, noise : array
+        Weights (n, n) and (p, p) whose patterns are meant.
+    """
+
+    def __init__(self, disturbance: Array, noise: Array) -> None:
+        from scipy.sparse import csr_array  # late: few models need it
+        from scipy.sparse.csgraph import connected_components
+
+        n, p = len(disturbance), len(noise)
+        count, labels = connected_components(csr_array(noise), directed=False)
+        block = labels.astype(np.intp)
+        members = Entries(block, np.arange(p), count)
+        which, other = members.of_rows(block)
+        rows, columns = np.nonzero(disturbance)
+        eye = np.arange(n)
+        rows, columns = np.divmod(
+            np.union1d(rows * n + columns, eye * n + eye), n
+        )
+        self.entries = Entries(
+            np.append(rows, n + which), np.append(columns, n + members.columns[other]), n + p
+        )
+        self.n, self._of_w = n, rows.size
+        #: Places of the diagonal.
+        self.diagonal: Index = np.flatnonzero(self.entries.rows == self.entries.columns)
+        #: Whether there is nothing else.
+        self.is_diagonal: bool = self.entries.size == n + p
+        sizes = np.diff(members.starts)
+        self._alone = sizes[block] == 1
+        self._blocks = [
+            members.columns[members.starts[k] : members.starts[k + 1]]
+            for k in np.flatnonzero(sizes > 1)
+        ]
+        self._places = [
+            self.entries.of_rows(n + one)[1] for one in self._blocks
+        ]
+        self._times = GroupedSums(
+            np.arange(self.entries.size), self.entries.columns, self.entries.rows
+        )
+
+    def of(self, disturbance: Array, noise: Array) -> Array:
+        """The entries of the weights (n, n) and (p, p)."""
+        rows, columns, first = self.entries.rows, self.entries.columns, self._of_w
+        return np.append(
+            disturbance[rows[:first], columns[:first]],
+            noise[rows[first:] - self.n, columns[first:] - self.n],
+        )
+
+    def partial(self, disturbance: Array, noise: Array, observed: Mask) -> Array:
+        """The same where only some outputs are observed; see `Cost.partial_weight`."""
+        found = self.of(disturbance, noise)
+        alone = np.flatnonzero(self._alone & ~observed)
+        found[self.entries.starts[self.n + alone]] = 0.0
+        for block, places in zip(self._blocks, self._places, strict=True):
+            if not observed[block].all():
+                found[places] = reduced(noise[np.ix_(block, block)], observed[block]).ravel()
+        return found
+
+    def fit(self, disturbance: Array | None, noise: Array | None) -> bool:
+        """Whether all of these weights, if they are given, is in the pattern."""
+        first = self._of_w
+        for one, part, start in (
+            (disturbance, slice(first), 0), (noise, slice(first, None), self.n)
+        ):
+            if one is not None:
+                rows, columns = self.entries.rows[part] - start, self.entries.columns[part] - start
+                if np.count_nonzero(one[rows, columns]) != np.count_nonzero(one):
+                    return False
+        return True
+
+    def times(self, residuals: Array, weights: Array) -> Array:
+        """W r of residuals (..., q)."""
+        return weights * residuals if self.is_diagonal else self._times(weights, residuals)
+
+
+class StageProducts:
+    r"""What `StageTerms` computes, of the entries of -G and of W.
+
+    Parameters
+    ----------
+    n : int
+        Number of states.
+    slopes : Entries
+        Those of G.
+    weights : StageWeights
+        The weights.
+    prior : array
+        The prior's weight (n, n), whose pattern is added to that of the panels.
+    """
+
+    def __init__(self, n: int, slopes: Entries, weights: StageWeights, prior: Array) -> None:
+        self.slopes, self.weights = slopes, weights
+        of, rows = weights.entries, slopes.rows
+        left, right = slopes.of_rows(of.columns)
+        self._weighted = GroupedSums(left, right, of.rows[left] * n + slopes.columns[right])
+        row, column = np.divmod(self._weighted.keys, n)
+        weighted = Entries(row, column, slopes.starts.size - 1)
+        left, right = weighted.of_rows(rows)
+        below = slopes.columns[left] >= column[right]
+        left, right = left[below], right[below]
+        self._square = GroupedSums(
+            left, right, column[right] * (2 * n - 1) + slopes.columns[left]
+        )
+        self._rows, by_column = rows, np.argsort(slopes.columns, kind="stable")
+        self._gradient = GroupedSums(by_column, rows[by_column], slopes.columns[by_column])
+        # The block that couples to the next stage is -Q A, the upper part of -W G.
+        own = row < n
+        coupling = column[own] * 2 * n + n + row[own] - column[own]
+        squares = self._square.keys
+        of_w = of.rows < n
+        low = of_w & (of.rows >= of.columns)
+        prior_rows, prior_columns = np.nonzero(prior)
+        prior_rows, prior_columns = (
+            one[prior_rows >= prior_columns] for one in (prior_rows, prior_columns)
+        )
+        self.pattern = pattern = Pattern(n, np.concatenate((
+            squares, coupling, of.columns[low] * (2 * n - 1) + of.rows[low],
+            prior_columns * (2 * n - 1) + prior_rows,
+        )))
+        # Places of a panel's entries among [-G' W (-G), -W G, 0].
+        self._panel: Index = np.full(pattern.places.size, squares.size + row.size)
+        self._panel[pattern.index(squares)] = np.arange(squares.size)
+        self._panel[pattern.index(coupling)] = squares.size + np.flatnonzero(own)
+        self._low, self._low_places = np.flatnonzero(low), pattern.index(
+            of.columns[low] * (2 * n - 1) + of.rows[low]
+        )
+        self.n = n
+
+    @staticmethod
+    def work(slopes: Entries, weights: StageWeights) -> int:
+        """A bound of how many products there are."""
+        counts, of = np.diff(slopes.starts), weights.entries
+        weighted = np.bincount(of.rows, counts[of.columns])
+        return int(weighted.sum() + (weighted * counts).sum())
+
+    def disturbance_band(self, weights: Array) -> Array:
+        """The panels (..., e) of the weights of w among those of (w, v)."""
+        found = np.zeros((*weights.shape[:-1], self.pattern.places.size))
+        found[..., self._low_places] = weights[..., self._low]
+        return found
+
+    def compute(
+        self, residuals: Array, slopes: Array, weights: Array, panel: Array, gradient: Array,
+        next_gradient: Array,
+    ) -> Array:
+        """Write the terms of one stage or of several; return their costs, NaN if they overflow."""
+        force = self.weights.times(residuals, weights)
+        weighted = self._weighted(weights, slopes)
+        square = self._square(slopes, weighted)
+        flat = np.concatenate((square, weighted, np.zeros((*square.shape[:-1], 1))), axis=-1)
+        flat.take(self._panel, -1, panel, "clip")
+        gradient[...] = self._gradient(slopes, force)
+        next_gradient[...] = force[..., : self.n]
+        costs: Array = np.einsum("...i,...i->...", residuals, force)
+        # 0 times anything that is not finite is NaN.
+        for one in (flat, force, gradient):
+            costs = costs + one.dot(np.zeros(one.shape[-1]))
+        return costs

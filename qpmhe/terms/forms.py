@@ -1,0 +1,286 @@
+"""How the matrices of a stage are held: whole, or by the entries that may be other than 0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qpmhe_solvers.qp import QP, band_of
+from qpmhe_solvers.sparse_qp import SparseQP
+
+from ..costs import Cost
+from ..model.evaluation import Places
+from .entries import Entries, StageProducts, StageWeights
+from .linearization import SparseStageTerms, StageTerms
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Below so many states, and above this share of entries, BLAS multiplies whole matrices faster.
+_LEAST_STATES = 150
+_MOST_FILLED = 0.05
+
+
+class WholeForm:
+    """Matrices as such: [r, -G] (q, 1 + n), weights (q, q), and panels (n, 2n).
+
+    Parameters
+    ----------
+    n, p : int
+        Numbers of states and outputs; q is their sum.
+
+    Attributes
+    ----------
+    shapes : mapping
+        Shapes of the fields of the memory that are others than there.
+    minus_stand_in : array
+        -G where the model has no Jacobians, as `StageTerms.slopes`.
+    by_entries : bool
+        Whether Jacobians are those of `Model.entries`.
+    """
+
+    by_entries = False
+    shapes: Mapping[str, tuple[int, ...]] = {}
+
+    def __init__(self, n: int, p: int) -> None:
+        self.n, self.p = n, p
+        self.minus_stand_in: Array = -np.eye(n + p, n)
+
+    # Arrays
+
+    def terms(self, stages: int, *arrays: Array) -> StageTerms:
+        """`StageTerms` with these arrays or its own."""
+        return StageTerms(stages, self.n, self.p, *arrays)
+
+    def qp(self, stages: int, rows: int) -> QP:
+        """A QP of so many stages, with so many rows each."""
+        return QP(stages, self.n, rows)
+
+    def fits(self, noise: Array | None, disturbance: Array | None) -> bool:
+        """Whether these weights of a sample, None for usual ones, have this form."""
+        return True
+
+    def loaded(self, rows: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The rows of a saved memory in this form."""
+        return rows
+
+    # Jacobians
+
+    def jacobian(self, which: str, found: Array) -> Array:
+        """A Jacobian of f or h as it stands among the slopes."""
+        return found
+
+    def whole_slopes(self, slopes: Array) -> Array:
+        """Slopes as matrices (..., q, n)."""
+        return slopes
+
+    # Weights
+
+    def usual_weight(self, cost: Cost) -> Array:
+        """The usual weight of (w, v)."""
+        return cost.stage_weight
+
+    def weight(self, cost: Cost, noise: Array | None, disturbance: Array | None) -> Array:
+        """That of a sample with weights of its own, None for a usual one."""
+        return cost.joint_weight(noise, disturbance)
+
+    def partial_weight(
+        self, cost: Cost, observed: Mask, noise: Array | None, disturbance: Array | None
+    ) -> Array:
+        """See `Cost.partial_weight`."""
+        return cost.partial_weight(observed, noise, disturbance)
+
+    def is_single(self, weights: Array) -> bool:
+        """Whether these weights are one for all stages."""
+        return weights.ndim == 2
+
+    def whole(self, weights: Array) -> Array:
+        """Weights as matrices (..., q, q)."""
+        return weights
+
+    def per_stage(self, factors: Array) -> Array:
+        """Numbers of the stages, as factors of weights and panels."""
+        return factors[:, None, None]
+
+    def times(self, residuals: Array, weights: Array) -> Array:
+        """W r of residuals (K, q)."""
+        if weights.ndim == 2:
+            return np.asarray(residuals.dot(weights))
+        weighted: Array = np.matmul(residuals[:, None, :], weights)[:, 0]
+        return weighted
+
+    def diagonal(self, weights: Array) -> Array:
+        """The diagonals (..., q) of weights."""
+        return np.asarray(np.diagonal(weights, axis1=-2, axis2=-1))
+
+    # Panels
+
+    def band(self, matrix: Array) -> Array:
+        """The panel of a symmetric matrix (..., n, n), or of columns (..., 2n, n)."""
+        return band_of(matrix)
+
+    def disturbance_band(self, weights: Array) -> Array:
+        """The panels of the weights of w among those of (w, v)."""
+        return band_of(weights[..., : self.n, : self.n])
+
+    def diagonal_of(self, bands: Array) -> Array:
+        """The diagonals (..., n) of panels, a view."""
+        found: Array = bands[..., 0]
+        return found
+
+    def symmetric(self, matrix: Array) -> Any:
+        """A constant symmetric matrix (n, n), of which there are products."""
+        return matrix
+
+    def matrix(self, symmetric: Any) -> Array:
+        """What `symmetric` has made, as a matrix (n, n)."""
+        found: Array = symmetric
+        return found
+
+
+class SparseForm(WholeForm):
+    """Matrices by their entries in patterns that are known before the first sample.
+
+    Of [r, -G], r and then the entries of -G, by rows. Products are sums of products of entries,
+    whose places are found once. Nothing here has a size of n^2, unless a pattern has.
+
+    Parameters
+    ----------
+    n, p : int
+        Numbers of states and outputs.
+    products : StageProducts
+        The patterns, and what is computed of them.
+    """
+
+    by_entries = True
+
+    def __init__(self, n: int, p: int, products: StageProducts) -> None:
+        self.n, self.p = n, p
+        self._products, self._weights = products, products.weights
+        self._pattern, slopes = products.pattern, products.slopes
+        self._slopes, self._of_a = slopes, int(slopes.starts[n])
+        self.minus_stand_in = -(slopes.rows == slopes.columns).astype(np.float64)
+        self.shapes = {
+            "linear": (n + p + slopes.size,), "weight": (products.weights.entries.size,),
+            "panel": (self._pattern.places.size,),
+        }
+
+    @classmethod
+    def of(cls, places: Places, cost: Cost, stages: int) -> SparseForm | None:
+        """The form for these places of [A; C]; None where it is of no use for so many stages."""
+        n, p = len(cost.disturbance), len(cost.noise)
+        q, most = n + p, _MOST_FILLED * n
+        given = np.count_nonzero(cost.disturbance) + np.count_nonzero(cost.noise)
+        if n < _LEAST_STATES or max(places[0].size, int(given)) > most * q:
+            return None
+        weights, slopes = StageWeights(cost.disturbance, cost.noise), Entries(*places, q)
+        if weights.entries.size > most * q or StageProducts.work(slopes, weights) > n * q:
+            return None
+        products = StageProducts(n, slopes, weights, cost.initial_weight(None))
+        if products.pattern.places.size > 2 * most * n or products.pattern.order(stages) is None:
+            return None
+        return cls(n, p, products)
+
+    # Arrays
+
+    def terms(self, stages: int, *arrays: Array) -> StageTerms:
+        """See `WholeForm.terms`."""
+        return SparseStageTerms(stages, self._products, *arrays)
+
+    def qp(self, stages: int, rows: int) -> QP:
+        """See `WholeForm.qp`; without rows."""
+        order = self._pattern.order(stages)
+        assert order is not None
+        return SparseQP(stages, self._pattern, order)
+
+    def fits(self, noise: Array | None, disturbance: Array | None) -> bool:
+        """See `WholeForm.fits`."""
+        return self._weights.fit(disturbance, noise)
+
+    # Jacobians
+
+    def jacobian(self, which: str, found: Array) -> Array:
+        """See `WholeForm.jacobian`."""
+        is_f = which == "f"
+        part = slice(self._of_a) if is_f else slice(self._of_a, None)
+        rows, columns = self._slopes.rows[part], self._slopes.columns[part]
+        return found[rows if is_f else rows - self.n, columns]
+
+    def whole_slopes(self, slopes: Array) -> Array:
+        """See `WholeForm.whole_slopes`."""
+        found = np.zeros((*slopes.shape[:-1], self.n + self.p, self.n))
+        found[..., self._slopes.rows, self._slopes.columns] = slopes
+        return found
+
+    # Weights
+
+    def usual_weight(self, cost: Cost) -> Array:
+        """See `WholeForm.usual_weight`."""
+        return self._weights.of(cost.disturbance, cost.noise)
+
+    def weight(self, cost: Cost, noise: Array | None, disturbance: Array | None) -> Array:
+        """See `WholeForm.weight`."""
+        return self._weights.of(
+            cost.disturbance if disturbance is None else disturbance,
+            cost.noise if noise is None else noise,
+        )
+
+    def partial_weight(
+        self, cost: Cost, observed: Mask, noise: Array | None, disturbance: Array | None
+    ) -> Array:
+        """See `WholeForm.partial_weight`."""
+        return self._weights.partial(
+            cost.disturbance if disturbance is None else disturbance,
+            cost.noise if noise is None else noise, observed,
+        )
+
+    def is_single(self, weights: Array) -> bool:
+        """See `WholeForm.is_single`."""
+        return weights.ndim == 1
+
+    def whole(self, weights: Array) -> Array:
+        """See `WholeForm.whole`."""
+        q, entries = self.n + self.p, self._weights.entries
+        found = np.zeros((*weights.shape[:-1], q, q))
+        found[..., entries.rows, entries.columns] = weights
+        return found
+
+    def per_stage(self, factors: Array) -> Array:
+        """See `WholeForm.per_stage`."""
+        return factors[:, None]
+
+    def times(self, residuals: Array, weights: Array) -> Array:
+        """See `WholeForm.times`."""
+        return self._weights.times(residuals, weights)
+
+    def diagonal(self, weights: Array) -> Array:
+        """See `WholeForm.diagonal`."""
+        return weights[..., self._weights.diagonal]
+
+    # Panels
+
+    def band(self, matrix: Array) -> Array:
+        """See `WholeForm.band`."""
+        return self._pattern.of(matrix)
+
+    def disturbance_band(self, weights: Array) -> Array:
+        """See `WholeForm.disturbance_band`."""
+        return self._products.disturbance_band(weights)
+
+    def diagonal_of(self, bands: Array) -> Array:
+        """See `WholeForm.diagonal_of`."""
+        return bands[..., : self.n]
+
+    def symmetric(self, matrix: Array) -> Any:
+        """See `WholeForm.symmetric`."""
+        from scipy.sparse import csr_array  # late: few models need it
+
+        return csr_array(matrix)
+
+    def matrix(self, symmetric: Any) -> Array:
+        """See `WholeForm.matrix`."""
+        found: Array = symmetric.toarray()
+        return found
