@@ -231,8 +231,8 @@ class _Follower(PythonEngine):
         self.guide = _Guide(nudge)
         super().__init__(*arguments)
 
-    def _tools_for(self, usual: Conditions) -> Tools:
-        tools = super()._tools_for(usual)
+    def _tools_for(self, usual: Conditions, *more: Any) -> Tools:
+        tools = super()._tools_for(usual, *more)
         self.guide.optimizer = tools.optimizer
         return tools._replace(optimizer=cast("Optimizer", self.guide))
 

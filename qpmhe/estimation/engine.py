@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -60,6 +61,12 @@ class Memory(NamedTuple):
     system: System
     tools: Tools
     window: Window
+
+
+def _any(form: WholeForm) -> bool:
+    """Whether a form fits, where all do."""
+    del form
+    return True
 
 
 class PythonEngine:
@@ -124,11 +131,15 @@ class PythonEngine:
         self._system = system = system.evaluated_by(system.evaluation.copy())
         self._nearby = _nearby(system)
 
-    def _tools_for(self, usual: Conditions) -> Tools:
-        """What a step uses under these usual conditions."""
+    def _tools_for(
+        self, usual: Conditions, fits: Callable[[WholeForm], bool] = _any, /
+    ) -> Tools:
+        """What a step uses under these usual conditions, with matrices in a form that fits."""
         settings = self._settings
         system, cost = usual.applied(self._system, self._cost)
         form = self._form_for(system, cost)
+        if not fits(form):
+            form = WholeForm(system.n, system.p)
         formulation = Formulation(system, self._observer, cost, form)
         subproblem = Subproblem(
             system, formulation.constraints, settings.horizon, formulation.sum.penalties, form
@@ -199,6 +210,8 @@ class PythonEngine:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
         if self._window.time >= self._times.next:
             self._check_trace(u)
+        if own is not None and not _fit(self._tools.form, own):
+            self._hold_whole(own)
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
             window.make_room()  # before the undo point: `undo` cannot reverse it
@@ -254,6 +267,12 @@ class PythonEngine:
             self.replace(before)
             raise
         self._times.end()
+
+    def _hold_whole(self, own: Conditions) -> None:
+        """Hold matrices whole from now on: a sample brings weights of another pattern."""
+        state = self.state_dict()
+        state["window"] = self._tools.form.as_whole(state["window"])
+        self.replace(self._checked_memory(state, lambda form: _fit(form, own)))
 
     def _warn(self) -> None:
         watched = self._window.watched
@@ -417,7 +436,8 @@ class PythonEngine:
             usual = usual._replace(parameters=parameters)
         try:
             with np.errstate(all="ignore"):
-                tools = self._tools_for(usual)
+                own = [one.without(changes) for one in before.window.own.values()]
+                tools = self._tools_for(usual, lambda form: _fit(form, *own))
                 window = self._fresh_window(before.window.initial_state, tools)
                 window.take_over(before.window, changes, parameters)
                 if self._reinitialized and window.length:
@@ -465,7 +485,9 @@ class PythonEngine:
         With its joint residuals along the candidate, and the state of its `ErrorMetric`. With
         ``replay``, the observer runs through the window's samples again.
         """
-        tools = self._tools if usual is self._tools.usual else self._tools_for(usual)
+        tools, own = self._tools, record.own.values()
+        if usual is not tools.usual or not _fit(tools.form, *own):
+            tools = self._tools_for(usual, lambda form: _fit(form, *own))
         window = self._fresh_window(record.z[record.start], tools)
         if window.metric is not None and metric is not None:
             window.metric.state = metric
@@ -543,15 +565,20 @@ class PythonEngine:
             self._solver.forget()
         self.replace(memory)
 
-    def _checked_memory(self, state: dict[str, Any]) -> Memory:
-        """The memory in a state."""
-        with_terms = state["linearized"]
+    def _checked_memory(
+        self, state: dict[str, Any], fits: Callable[[WholeForm], bool] = _any
+    ) -> Memory:
+        """The memory in a state, with matrices in a form that fits."""
+        with_terms, rows = state["linearized"], state["window"]
         if not isinstance(with_terms, bool):
             raise TypeError(f"linearized is {with_terms!r}")
-        tools = self._tools_for(self._reader.load(state["usual"], self._tools.usual))
+        tools = self._tools_for(
+            self._reader.load(state["usual"], self._tools.usual),
+            lambda form: form.holds(rows) and fits(form),
+        )
         window = self._fresh_window(np.zeros(self._system.n), tools)
         window.load_state_dict(
-            state["window"], lambda own: self._reader.load(own, tools.usual),
+            tools.form.taken(rows), lambda own: self._reader.load(own, tools.usual),
             may_be_irregular=self._system.has_timed, is_smoothed=self._smoothed,
             # A graduated loss may leave the trajectory of a widened one.
             ends_alike=self._cost.graduation == 1.0,
@@ -560,6 +587,11 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 window.restate()
         return Memory(self._system, tools, window)
+
+
+def _fit(form: WholeForm, *own: Conditions) -> bool:
+    """Whether the weights of samples have a form."""
+    return all(form.fits(one.noise_weight, one.disturbance_weight) for one in own)
 
 
 def _are_same(one: Places, other: Places | None) -> bool:

@@ -63,9 +63,17 @@ class WholeForm:
         """Whether these weights of a sample, None for usual ones, have this form."""
         return True
 
-    def loaded(self, rows: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The rows of a saved memory in this form."""
-        return rows
+    def holds(self, rows: Mapping[str, Any]) -> bool:
+        """Whether the rows of a memory, in this form or whole, have this form."""
+        return True
+
+    def taken(self, rows: Mapping[str, Any]) -> dict[str, Any]:
+        """The rows of a memory, in this form or whole, in this form."""
+        return dict(rows)
+
+    def as_whole(self, rows: Mapping[str, Any]) -> dict[str, Any]:
+        """The rows of a memory of this form as whole ones."""
+        return dict(rows)
 
     # Jacobians
 
@@ -199,6 +207,42 @@ class SparseForm(WholeForm):
     def fits(self, noise: Array | None, disturbance: Array | None) -> bool:
         """See `WholeForm.fits`."""
         return self._weights.fit(disturbance, noise)
+
+    def holds(self, rows: Mapping[str, Any]) -> bool:
+        """See `WholeForm.holds`."""
+        if np.ndim(rows["linear"]) < 3:
+            return True
+        found = self.taken(rows)
+        found["linear"] = found["linear"][:, self.n + self.p :]
+        given = {**rows, "linear": np.asarray(rows["linear"])[:, :, 1:]}
+        return all(
+            np.count_nonzero(found[name]) == np.count_nonzero(given[name]) for name in self.shapes
+        )
+
+    def taken(self, rows: Mapping[str, Any]) -> dict[str, Any]:
+        """See `WholeForm.taken`."""
+        if np.ndim(rows["linear"]) < 3:
+            return dict(rows)
+        linear, weight, panel = (np.asarray(rows[name]) for name in ("linear", "weight", "panel"))
+        slopes, weights = self._slopes, self._weights.entries
+        entries = linear[:, slopes.rows, 1 + slopes.columns]
+        return {
+            **rows, "linear": np.concatenate((linear[:, :, 0], entries), axis=1),
+            "weight": weight[:, weights.rows, weights.columns],
+            "panel": panel.reshape(len(panel), -1)[:, self._pattern.places],
+        }
+
+    def as_whole(self, rows: Mapping[str, Any]) -> dict[str, Any]:
+        """See `WholeForm.as_whole`."""
+        linear, panel, q = rows["linear"], rows["panel"], self.n + self.p
+        panels = np.zeros((len(panel), 2 * self.n * self.n))
+        panels[:, self._pattern.places] = panel
+        slopes = self.whole_slopes(linear[:, q:])
+        return {
+            **rows, "linear": np.concatenate((linear[:, :q, None], slopes), axis=2),
+            "weight": self.whole(rows["weight"]),
+            "panel": panels.reshape(-1, self.n, 2 * self.n),
+        }
 
     # Jacobians
 
