@@ -191,8 +191,6 @@ class Cost(ABC):
     ----------
     p : int
         Number of outputs.
-    stage_weight : (r + p, r + p) array
-        The joint weight of w and v.
     """
 
     #: Whether the terms are the quadratic forms themselves, which makes weights constant.
@@ -210,6 +208,8 @@ class Cost(ABC):
     #: Smaller eigenvalues of the correlations in an observer's covariance count as this.
     least_correlation: float = SINGULAR
 
+    _joint: Array | None = None  # the stage weight, once it was read
+
     def __init__(
         self, prior: Array | ObserverPrior | None, disturbance: Array, noise: Array,
         discount: float,
@@ -221,11 +221,11 @@ class Cost(ABC):
         self.prior: Array | ObserverPrior = ObserverPrior() if prior is None else prior
         self.disturbance, self.noise = disturbance, noise
         self.p = noise.shape[0]
-        self.stage_weight = self.joint_weight(noise)
         # By pattern, the least recently used first. Estimators in several threads may share it:
         # each of its methods is atomic, and a matrix that two of them compute is the same.
         self._partial: OrderedDict[bytes, Array] = OrderedDict()
-        self._kept = max(_KEPT_LEAST, _KEPT_BYTES // self.stage_weight.nbytes)
+        size = len(disturbance) + len(noise)
+        self._kept = max(_KEPT_LEAST, _KEPT_BYTES // (8 * size * size))
 
     def __repr__(self) -> str:
         factor = self.disturbance_factor
@@ -392,6 +392,13 @@ class Cost(ABC):
             "and prior_weight_gradient."
         )
 
+    @property
+    def stage_weight(self) -> Array:
+        """The joint weight (r + p, r + p) of w and v."""
+        if self._joint is None:
+            self._joint = self.joint_weight(None)
+        return self._joint
+
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
         """The weight of (w, v), of ``disturbance`` and ``noise``; None is the usual weight."""
         size = self.disturbance.shape[0]
@@ -407,7 +414,7 @@ class Cost(ABC):
             other.noise = noise
         if disturbance is not None:
             other.disturbance = disturbance
-        other.stage_weight = other.joint_weight(None)
+        other._joint = None
         other._partial = OrderedDict()
         return other
 

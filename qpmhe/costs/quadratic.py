@@ -81,7 +81,6 @@ class QuadraticCost(Cost):
         )
         if singular:
             cost.disturbance_factor, cost.disturbance = _factor(covariance)
-            cost.stage_weight = cost.joint_weight(None)
         return cost
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import QP
 
+from ..terms.forms import WholeForm
 from .limits import LARGER_REGION, POOR, SMALLER_REGION, WELL
 
 Array = NDArray[np.float64]
@@ -20,33 +22,39 @@ class Metric(NamedTuple):
 
     Attributes
     ----------
-    transitions, weights, spreads : (K, n, n) array
-        A, Q, and the covariance of the disturbances where these are free, stage by stage.
+    form : WholeForm
+        How the following are held.
+    slopes, weights : array
+        -G, and the weights of (w, v), of which Q is a part, stage by stage.
+    spread : callable
+        See `Freed`.
     information : (n,) array
         The diagonal D.
     """
 
-    transitions: Array
+    form: WholeForm
+    slopes: Array
     weights: Array
-    spreads: Array
+    spread: Callable[[int, Array], Array]
     information: Array
 
     def length(self, step: Array) -> float:
         """The length of a step; NaN or infinite where it is lost in rounding or range."""
         with np.errstate(all="ignore"):
-            moved = step[1:] - np.matmul(self.transitions, step[:-1, :, None])[:, :, 0]
+            moved = step[1:] + self.form.times_minus_a(self.slopes, step[:-1])
             square = self.information @ np.square(step[0])
-            square += np.einsum("ki,kij,kj->", moved, self.weights, moved)
+            square += self.form.disturbance_square(self.weights, moved)
             return float(np.sqrt(square))
 
     def descent(self, gradient: Array) -> Array:
         """The direction of steepest descent in this metric, along free disturbances."""
         force, step = gradient.copy(), np.empty_like(gradient)
-        for i in range(len(self.transitions) - 1, -1, -1):
-            force[i] += self.transitions[i].T @ force[i + 1]
+        form, slopes = self.form, self.slopes
+        for i in range(len(slopes) - 1, -1, -1):
+            force[i] -= form.minus_a_transposed(slopes[i], force[i + 1])
         step[0] = -force[0] / self.information
-        for i, a in enumerate(self.transitions):
-            step[i + 1] = a @ step[i] - self.spreads[i] @ force[i + 1]
+        for i in range(len(slopes)):
+            step[i + 1] = -form.times_minus_a(slopes[i], step[i]) - self.spread(i, force[i + 1])
         return step
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from itertools import pairwise
 
 import numpy as np
@@ -16,11 +15,10 @@ from ..model.residuals import difference
 from ..model.system import System
 from ..terms.base import QuadraticModel, Term, Trial
 from ..terms.forms import WholeForm
-from ..terms.information import window_information
 from ..terms.linearization import Span
 from ..terms.rows import Rows
 from ..terms.soft import BEYOND, Penalties
-from ..terms.sum import rows_of_first, weight_of_first
+from ..terms.sum import diagonal_of_first, rows_of_first
 from .constraints import Constraints
 from .elimination import SINGULAR, Around, Eliminated, Elimination
 from .limits import RIDGE
@@ -135,7 +133,7 @@ class Subproblem:
     def damp(self, qp: QP, problem: Problem, trial: Trial, mu: float) -> None:
         """Give the QP that is around a trial this much damping."""
         if self._damped_trial is not trial:
-            self._damping, self._damped_trial = self._damping_band(qp, problem, trial), trial
+            self._damping, self._damped_trial = self._damping_band(problem, trial), trial
         if self._undamped is None:
             self._undamped = qp.band.copy()
         np.multiply(self._damping, mu, out=qp.band)
@@ -149,34 +147,23 @@ class Subproblem:
                 np.concatenate((rows, added)), np.append(side, np.zeros(len(added)))
             )
 
-    def _damping_band(self, qp: QP, problem: Problem, trial: Trial) -> Array:
+    def _damping_band(self, problem: Problem, trial: Trial) -> Array:
         """The band that a damping of 1 adds."""
-        (a, q, _, information), form = self.metric(problem, trial), self._form
-        weighted = q @ a
-        columns = np.concatenate((a.transpose(0, 2, 1) @ weighted, -weighted), axis=1)
-        band = np.zeros_like(qp.band)
-        band[:-1] = form.band(columns)
-        band[1:] += form.band(q)
+        form, information = self._form, self.metric(problem, trial).information
+        band = form.damping(self._minus_jacobian, trial.weights)
         form.diagonal_of(band[0])[...] += information
         self._information = information
         return band
 
     def metric(self, problem: Problem, trial: Trial) -> Metric:
         """The metric of the damping of the QP that is around a trial."""
-        n, minus = self._n, self._form.whole_slopes(self._minus_jacobian)
-        count, weights = len(minus), self._form.whole(trial.weights)
-        weights = np.broadcast_to(weights, (count, *weights.shape[-2:]))
-        a, c, q = -minus[:, :n], minus[:, n:], weights[:, :n, :n]
-        basis, spread = problem.constraints.basis, np.full((count, n, n), np.nan)
-        information = weight_of_first(problem.terms, trial).diagonal()
-        with suppress(np.linalg.LinAlgError):
-            eyes = np.broadcast_to(basis.T, (count, *basis.T.shape))
-            spread = basis @ np.linalg.solve(basis.T @ q @ basis, eyes)
-            seen = c.transpose(0, 2, 1) @ weights[:, n:, n:] @ c
-            found = information + window_information(a, seen, spread).diagonal()
-            if np.isfinite(found).all():
-                information = found
-        return Metric(a, q, spread, information)
+        form, slopes, weights = self._form, self._minus_jacobian, trial.weights
+        freed = form.freed(slopes, weights, problem.constraints.basis)
+        information = diagonal_of_first(problem.terms, trial)
+        found = information + freed.information
+        if np.isfinite(found).all():
+            information = found
+        return Metric(form, slopes, weights, freed.spread, information)
 
     def nearest_point(self, problem: Problem, trial: Trial) -> QP | None:
         """The QP for the nearest trajectory that satisfies the linearised sets; None as in `at`.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from copy import copy
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -104,7 +104,7 @@ class Jacobian:
     ) -> None:
         self.function, self._inputs, self._residual = function, inputs, residual
         n = probes[0][0].size
-        self._eye: Array = np.eye(n)
+        self._n = n
         self._bounds = None if states is None else (states.lower, states.upper)
         self.inner: Array = np.array((np.full(n, -np.inf), np.full(n, np.inf)))
         self.aside: Array = np.zeros(n)
@@ -139,6 +139,10 @@ class Jacobian:
         value: Array = self.batch(x[None], u[None])[0]
         return value
 
+    @cached_property
+    def _eye(self) -> Array:
+        return np.eye(self._n)
+
     @property
     def direct(self) -> Callable[..., Any]:
         """A function of one state, and of the input where there are any."""
@@ -161,7 +165,7 @@ class Jacobian:
         # Powers of two: what a step divides by then costs no rounding, and depends on no other
         # digits of the scales.
         self._sizes = np.ldexp(1.0, np.frexp(scales)[1] - 1)
-        self.aside = _ASIDE * self._sizes * (-_GOLDEN) ** np.arange(len(self._eye))
+        self.aside = _ASIDE * self._sizes * (-_GOLDEN) ** np.arange(self._n)
         if self._bounds is not None and np.isfinite(self._bounds).any():
             lower, upper = self._bounds
             step = np.minimum(_INWARD * self._sizes, _MOST_INWARD * (upper - lower))
@@ -358,7 +362,7 @@ class Jacobian:
         """The same Jacobian, of the same function, evaluated by other means."""
         other = copy(self)
         other.function, other.method = function, method
-        size = self._eye.shape[0]
+        size = self._n
         other._given = BatchedFunction(
             f"{function.name}_jacobian", slope, (*function.shape, size), self._inputs, []
         )

@@ -300,6 +300,11 @@ class Term(ABC):
         """Weight (n, n) of the form that majorises a term in the first state; None of others."""
         return None
 
+    def diagonal_of_first(self, trial: Trial) -> Array | None:
+        """The diagonal (n,) of that weight."""
+        weight = self.weight_of_first(trial)
+        return None if weight is None else weight.diagonal()
+
     def root_of_first(self, trial: Trial) -> Array | None:
         """A root R (n, n) of that weight R'R, where only the root has all digits."""
         return None

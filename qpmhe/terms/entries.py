@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from qpmhe_solvers.sparse_qp import Pattern
 
 from ..costs.base import reduced
+from .selected_inverse import SelectedInverse
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -143,6 +146,26 @@ class StageWeights:
                     return False
         return True
 
+    def spread(self, weights: Array) -> Callable[[int, Array], Array]:
+        """Of a stage and a force (n,) to the solution of Q w = force there."""
+        n, first = self.n, self._of_w
+        if first == n:  # Q is diagonal
+            with np.errstate(all="ignore"):
+                inverse = np.atleast_2d(1.0 / weights[..., :n])
+            return lambda i, force: np.asarray(inverse[min(i, len(inverse) - 1)] * force)
+        from scipy.sparse import csc_array
+        from scipy.sparse.linalg import splu
+
+        rows, columns = self.entries.rows[:first], self.entries.columns[:first]
+        matrices = [
+            csc_array((one[:first], (rows, columns)), (n, n)) for one in np.atleast_2d(weights)
+        ]
+        try:
+            factors = [splu(one) for one in matrices]
+        except RuntimeError:  # one is singular
+            return lambda _, force: np.full_like(force, np.nan)
+        return lambda i, force: np.asarray(factors[min(i, len(factors) - 1)].solve(force))
+
     def times(self, residuals: Array, weights: Array) -> Array:
         """W r of residuals (..., q)."""
         return weights * residuals if self.is_diagonal else self._times(weights, residuals)
@@ -199,7 +222,9 @@ class StageProducts:
         self._low, self._low_places = np.flatnonzero(low), pattern.index(
             of.columns[low] * (2 * n - 1) + of.rows[low]
         )
-        self.n = n
+        self.n, of_a = n, np.arange(slopes.starts[n])
+        self._forwards = GroupedSums(of_a, slopes.columns[of_a], rows[of_a])
+        self._backwards = GroupedSums(of_a, rows[of_a], slopes.columns[of_a])
 
     @staticmethod
     def work(slopes: Entries, weights: StageWeights) -> int:
@@ -213,6 +238,54 @@ class StageProducts:
         found = np.zeros((*weights.shape[:-1], self.pattern.places.size))
         found[..., self._low_places] = weights[..., self._low]
         return found
+
+    def times_minus_a(self, slopes: Array, states: Array) -> Array:
+        """-A x of states (..., n), for entries of -G."""
+        return self._forwards(slopes, states)
+
+    def minus_a_transposed(self, slopes: Array, forces: Array) -> Array:
+        """-A' f of forces (..., n), for entries of -G."""
+        return self._backwards(slopes, forces)
+
+    def damping(self, slopes: Array, weights: Array) -> Array:
+        """The panels (K + 1, e) of the sum of |d(i+1) - A d(i)|^2 in the weights of w."""
+        slopes = slopes.copy()
+        slopes[:, self.slopes.starts[self.n] :] = 0.0
+        return self._hessian(slopes, weights)
+
+    def _hessian(self, slopes: Array, weights: Array) -> Array:
+        """The panels (K + 1, e) of all stages."""
+        count, n, q = len(slopes), self.n, self.slopes.starts.size - 1
+        panels = np.zeros((count + 1, self.pattern.places.size))
+        unused = np.empty((2, count, n))
+        self.compute(np.zeros((count, q)), slopes, weights, panels[:-1], *unused)
+        panels[1:] += self.disturbance_band(weights)
+        return panels
+
+    def information(self, slopes: Array, weights: Array) -> Array:
+        """The diagonal (n,) of what the data of K stages say about the first state.
+
+        With H the Hessian of J without terms in the first state, it is that of
+        :math:`H_{00} - H_{01} H_{11}^{-1} H_{10}`, of which the inverse is needed only where a
+        column of :math:`H_{10}` is not 0.
+        """
+        count, pattern, n = len(slopes), self.pattern, self.n
+        band = self._hessian(slopes, weights)
+        order = pattern.order_by_states(count)
+        at = np.argsort(order.unknowns)
+        below = np.flatnonzero(pattern.rows >= n)
+        below = below[np.argsort(pattern.columns[below], kind="stable")]
+        place, column = at[pattern.rows[below] - n], pattern.columns[below]
+        members = Entries(column, np.arange(column.size), n)
+        one, other = members.of_rows(column)
+        rows, columns = place[one], place[other]
+        reach = int(np.abs(rows - columns).max(initial=0))
+        inverse = SelectedInverse(order.band(band[1:].reshape(-1), 1.0), reach)
+        value = band[0, below]
+        lost = np.bincount(
+            column[one], value[one] * inverse(rows, columns) * value[other], n
+        )
+        return np.asarray(np.maximum(band[0, :n] - lost, 0.0))
 
     def compute(
         self, residuals: Array, slopes: Array, weights: Array, panel: Array, gradient: Array,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from qpmhe_solvers.sparse_qp import SparseQP
 from ..costs import Cost
 from ..model.evaluation import Places
 from .entries import Entries, StageProducts, StageWeights
+from .information import window_information
 from .linearization import SparseStageTerms, StageTerms
 
 Array = NDArray[np.float64]
@@ -22,6 +24,21 @@ Mask = NDArray[np.bool_]
 # Below so many states, and above this share of entries, BLAS multiplies whole matrices faster.
 _LEAST_STATES = 150
 _MOST_FILLED = 0.05
+
+
+class Freed(NamedTuple):
+    """What a damping's metric needs of stages whose disturbances are free.
+
+    Attributes
+    ----------
+    spread : callable
+        Of a stage and a force (n,) to the force times the disturbances' covariance there.
+    information : (n,) array
+        The diagonal of what the data say about the first state; NaN where that is lost.
+    """
+
+    spread: Callable[[int, Array], Array]
+    information: Array
 
 
 class WholeForm:
@@ -85,6 +102,29 @@ class WholeForm:
         """Slopes as matrices (..., q, n)."""
         return slopes
 
+    def times_minus_a(self, slopes: Array, states: Array) -> Array:
+        """-A x of states (..., n)."""
+        found: Array = np.matmul(slopes[..., : self.n, :], states[..., None])[..., 0]
+        return found
+
+    def minus_a_transposed(self, slopes: Array, forces: Array) -> Array:
+        """-A' f of forces (..., n)."""
+        found: Array = np.matmul(forces[..., None, :], slopes[..., : self.n, :])[..., 0, :]
+        return found
+
+    def freed(self, slopes: Array, weights: Array, basis: Array) -> Freed:
+        """What is free where the disturbances are, in the directions ``basis``."""
+        n, count = self.n, len(slopes)
+        weights = np.broadcast_to(weights, (count, *weights.shape[-2:]))
+        a, c, q = -slopes[:, :n], slopes[:, n:], weights[:, :n, :n]
+        spread, information = np.full((count, n, n), np.nan), np.full(n, np.nan)
+        with suppress(np.linalg.LinAlgError):
+            eyes = np.broadcast_to(basis.T, (count, *basis.T.shape))
+            spread = basis @ np.linalg.solve(basis.T @ q @ basis, eyes)
+            seen = c.transpose(0, 2, 1) @ weights[:, n:, n:] @ c
+            information = window_information(a, seen, spread).diagonal()
+        return Freed(lambda i, force: np.asarray(spread[i] @ force), information)
+
     # Weights
 
     def usual_weight(self, cost: Cost) -> Array:
@@ -108,6 +148,13 @@ class WholeForm:
     def whole(self, weights: Array) -> Array:
         """Weights as matrices (..., q, q)."""
         return weights
+
+    def disturbance_square(self, weights: Array, disturbances: Array) -> float:
+        """The sum of w'Qw of disturbances (K, n), for weights of (w, v)."""
+        weighted = self.times(
+            np.concatenate((disturbances, np.zeros((len(disturbances), self.p))), axis=1), weights
+        )
+        return float(np.vdot(disturbances, weighted[:, : self.n]))
 
     def per_stage(self, factors: Array) -> Array:
         """Numbers of the stages, as factors of weights and panels."""
@@ -138,6 +185,17 @@ class WholeForm:
         """The diagonals (..., n) of panels, a view."""
         found: Array = bands[..., 0]
         return found
+
+    def damping(self, slopes: Array, weights: Array) -> Array:
+        """The panels (K + 1, ...) of the sum of |d(i+1) - A d(i)|^2 in the weights of w."""
+        n, count = self.n, len(slopes)
+        a, q = -slopes[:, :n], np.broadcast_to(weights[..., :n, :n], (count, n, n))
+        weighted = q @ a
+        columns = np.concatenate((a.transpose(0, 2, 1) @ weighted, -weighted), axis=1)
+        band = np.zeros((count + 1, n, 2 * n))
+        band[:-1] = band_of(columns)
+        band[1:] += band_of(q)
+        return band
 
     def symmetric(self, matrix: Array) -> Any:
         """A constant symmetric matrix (n, n), of which there are products."""
@@ -259,6 +317,21 @@ class SparseForm(WholeForm):
         found[..., self._slopes.rows, self._slopes.columns] = slopes
         return found
 
+    def times_minus_a(self, slopes: Array, states: Array) -> Array:
+        """See `WholeForm.times_minus_a`."""
+        return self._products.times_minus_a(slopes, states)
+
+    def minus_a_transposed(self, slopes: Array, forces: Array) -> Array:
+        """See `WholeForm.minus_a_transposed`."""
+        return self._products.minus_a_transposed(slopes, forces)
+
+    def freed(self, slopes: Array, weights: Array, basis: Array) -> Freed:
+        """See `WholeForm.freed`; all directions are free."""
+        information = np.full(self.n, np.nan)
+        with suppress(np.linalg.LinAlgError):
+            information = self._products.information(slopes, weights)
+        return Freed(self._weights.spread(weights), information)
+
     # Weights
 
     def usual_weight(self, cost: Cost) -> Array:
@@ -317,6 +390,10 @@ class SparseForm(WholeForm):
     def diagonal_of(self, bands: Array) -> Array:
         """See `WholeForm.diagonal_of`."""
         return bands[..., : self.n]
+
+    def damping(self, slopes: Array, weights: Array) -> Array:
+        """See `WholeForm.damping`."""
+        return self._products.damping(slopes, weights)
 
     def symmetric(self, matrix: Array) -> Any:
         """See `WholeForm.symmetric`."""

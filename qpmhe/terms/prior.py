@@ -318,6 +318,10 @@ class Prior(FirstStateTerm):
         """See `FirstStateTerm.weight_of_first`."""
         return self._rule.form.matrix(self._majorised(self.offset(trial)))
 
+    def diagonal_of_first(self, trial: Trial) -> Array:
+        """See `Term.diagonal_of_first`."""
+        return np.asarray(self._majorised(self.offset(trial)).diagonal())
+
     def root_of_first(self, trial: Trial) -> Array | None:
         """See `Term.root_of_first`."""
         return self._root(self.offset(trial))

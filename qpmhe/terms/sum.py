@@ -151,6 +151,16 @@ def weight_of_first(terms: Sequence[Term], trial: Trial) -> Array:
     return found
 
 
+def diagonal_of_first(terms: Sequence[Term], trial: Trial) -> Array:
+    """The diagonal (n,) of `weight_of_first`."""
+    found = np.zeros(trial.trajectory.shape[1])
+    for term in terms:
+        diagonal = term.diagonal_of_first(trial)
+        if diagonal is not None:
+            found += diagonal
+    return found
+
+
 def root_of_first(terms: Sequence[Term], trial: Trial) -> Array | None:
     """Rows (k, n) whose square is `weight_of_first`, where that has lost digits; else None."""
     roots = [term.root_of_first(trial) for term in terms]

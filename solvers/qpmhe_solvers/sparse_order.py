@@ -83,5 +83,8 @@ class SparseOrder:
         source = np.flatnonzero(there)
         if self._growths <= _MOST_GROWTHS and source.size <= narrow(qp.n) * qp.size:
             column, offset = np.divmod(source, 2 * qp.n)
-            self._known = order_of(qp.stages, qp.n, column + offset, column, source)
+            row = column + offset
+            if source.size and row.max() < qp.size:  # else what is no entry of H
+                found = order_of(qp.stages, qp.n, row, column, source)
+                self._known = found if found.width < narrow(qp.n) else None
         return self._known

@@ -84,6 +84,11 @@ class Pattern:
 
     def order(self, stages: int) -> Order | None:
         """The order of the unknowns of so many stages; None if the one by stages is as good."""
+        found = self.order_by_states(stages)
+        return found if found.width < narrow(self.n) else None
+
+    def order_by_states(self, stages: int) -> Order:
+        """The order of the unknowns of so many stages."""
         source = np.arange(stages * self.places.size)
         stage, entry = np.divmod(source, self.places.size)
         row, column = (stage * self.n + one[entry] for one in (self.rows, self.columns))
@@ -165,20 +170,14 @@ def narrow(n: int) -> float:
     return math.sqrt(_GAIN) * 2 * n
 
 
-def order_of(
-    stages: int, n: int, row: Index, column: Index, source: Index
-) -> Order | None:
-    """The order of a pattern of H; None if the order by stages is about as good."""
-    if not source.size or row.max() >= stages * n:  # the last: no entry of H
-        return None
+def order_of(stages: int, n: int, row: Index, column: Index, source: Index) -> Order:
+    """The order of a pattern of H."""
     place = np.empty(n, np.intp)
     place[_order_of_states(n, row % n, column % n)] = np.arange(n)
     at = (place * stages + np.arange(stages)[:, None]).ravel()
     row, column = at[row], at[column]
     low, high = np.minimum(row, column), np.maximum(row, column)
     width = int((high - low).max())
-    if width + 1 > narrow(n):
-        return None
     return Order(np.argsort(at), source, low * (width + 1) + high - low, width)
 
 

@@ -144,6 +144,48 @@ def test_where_rounding_decides_the_promise_holds(seed):
         assert not estimate.status & qpmhe.Status.SOLVER_FAILED
 
 
+@pytest.mark.parametrize("options", [
+    {}, {"kind": "tree", "banded": True}, {"kind": "random", "discount": 0.8}, {"units": 1e3},
+], ids=str)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.filterwarnings("ignore:the observer was far")
+def test_shorter_steps_have_the_same_metric(monkeypatch, seed, options):
+    """Lengths, steepest descent and damping, where a full step does not lower J."""
+    case, generator = Case(seed, **options), np.random.default_rng(seed)
+    step, kinds = generator.normal(size=(HORIZON + 1, N)) * case.unit, []
+    case.Y *= 10.0
+
+    def take(mhe):
+        found, subproblem = [], mhe._engine._tools.subproblem
+        usual = subproblem.metric
+
+        def metric(problem, trial):
+            made = usual(problem, trial)
+            d = step[: len(trial.trajectory)]
+            qp = subproblem._qp
+            damped = qp.copy()
+            damped.band[...] = subproblem._form.damping(subproblem._minus_jacobian, trial.weights)
+            found.append([
+                made.information * case.unit**2, made.length(d),
+                made.descent(d / case.unit**2) / case.unit, damped.hessian_times(d) * case.unit,
+                qp.hessian_times(d) * case.unit,
+            ])
+            return made
+
+        monkeypatch.setattr(subproblem, "metric", metric)
+        for y in case.Y:
+            mhe.update(y)
+        kinds.append(subproblem._form.by_entries)
+        return found
+
+    found, expected = both(monkeypatch, case, take, max_qps=3)
+    assert kinds == [True, False]
+    assert len(found) == len(expected) > 3
+    for one, other in zip(found, expected, strict=True):
+        for value, right in zip(one, other, strict=True):
+            assert value == pytest.approx(right, rel=1e-9, abs=1e-9 * np.abs(right).max())
+
+
 @pytest.mark.parametrize("candidate", ["observer", "reinitialized"])
 @pytest.mark.parametrize("arrival", ["filtered", "smoothed"])
 def test_so_are_those_of_other_candidates(monkeypatch, candidate, arrival):
