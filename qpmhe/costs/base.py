@@ -208,8 +208,6 @@ class Cost(ABC):
     #: Smaller eigenvalues of the correlations in an observer's covariance count as this.
     least_correlation: float = SINGULAR
 
-    _joint: Array | None = None  # the stage weight, once it was read
-
     def __init__(
         self, prior: Array | ObserverPrior | None, disturbance: Array, noise: Array,
         discount: float,
@@ -395,9 +393,7 @@ class Cost(ABC):
     @property
     def stage_weight(self) -> Array:
         """The joint weight (r + p, r + p) of w and v."""
-        if self._joint is None:
-            self._joint = self.joint_weight(None)
-        return self._joint
+        return self.joint_weight(None)
 
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
         """The weight of (w, v), of ``disturbance`` and ``noise``; None is the usual weight."""
@@ -414,7 +410,6 @@ class Cost(ABC):
             other.noise = noise
         if disturbance is not None:
             other.disturbance = disturbance
-        other._joint = None
         other._partial = OrderedDict()
         return other
 

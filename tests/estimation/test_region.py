@@ -25,8 +25,8 @@ def qp_around(sets):
 def test_a_path_without_length_or_numbers_promises_nothing():
     """As where the QP's step is rounding, or weights and steps are beyond the range of numbers."""
     qp, metric = qp_around(None)
-    none = np.zeros((len(metric.transitions) + 1, 3))
-    lost = metric._replace(spreads=np.full_like(metric.spreads, np.nan))
+    none = np.zeros((len(metric.slopes) + 1, 3))
+    lost = metric._replace(spread=lambda _, force: np.full_like(force, np.nan))
     for one, end in ((lost, none), (lost, none * np.nan), (lost, none + 1e200)):
         path = Dogleg(one, qp, end, 1.0)
         for radius in (path.length / 3.0, np.nan):
@@ -37,14 +37,15 @@ def test_a_path_without_length_or_numbers_promises_nothing():
 def test_the_dogleg_is_powells(sets):
     """By dense matrices, in d(0) and the disturbances that are free."""
     qp, metric = qp_around(sets)
-    n, count = 3, len(metric.transitions)
+    n, count = 3, len(metric.slopes)
+    weights = np.broadcast_to(metric.weights, (count, *metric.weights.shape[-2:]))[:, :n, :n]
     free = np.delete(np.eye(n), [] if sets is None else [1], axis=1)
     k = free.shape[1]
     follow = np.zeros((count + 1, n, n + count * k))
     follow[0, :, :n] = np.eye(n)
     scale = np.zeros((n + count * k,) * 2)
     scale[:n, :n] = np.diag(metric.information)
-    for i, (a, q) in enumerate(zip(metric.transitions, metric.weights, strict=True)):
+    for i, (a, q) in enumerate(zip(-metric.slopes[:, :n], weights, strict=True)):
         own = slice(n + i * k, n + (i + 1) * k)
         follow[i + 1] = a @ follow[i]
         follow[i + 1][:, own] += free
