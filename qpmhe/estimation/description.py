@@ -127,6 +127,8 @@ def _describe(name: str, value: Any, found: dict[str, Any]) -> None:
         for kind in type(value).__mro__:
             slots = getattr(kind, "__slots__", ())
             parts |= {key: getattr(value, key) for key in slots if hasattr(value, key)}
+        if isinstance(value, Cost):
+            parts["stage_weight"] = value.stage_weight
         for key in sorted(parts):
             _describe(f"{name}.{key.lstrip('_')}", parts[key], found)
 
