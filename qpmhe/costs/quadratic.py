@@ -115,7 +115,7 @@ class QuadraticCost(Cost):
 
     def prior_cost(self, offset: Array, weight: Array) -> float:
         """The quadratic form; see `Cost.prior_cost`."""
-        return float((offset @ weight).dot(offset))
+        return float(offset.dot(weight).dot(offset))
 
     def majorise_prior(self, offset: Array, weight: Array) -> Array:
         """The weight itself; see `Cost.majorise_prior`."""

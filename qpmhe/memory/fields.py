@@ -192,12 +192,14 @@ class MemorySizes(NamedTuple):
         is_there = not field.when or field.when in self.features
         return np.zeros(self.shape(field)) if is_there and not field.may_be_missing else None
 
-    def record_type(self, engine: str, room: int) -> np.dtype[Any]:
-        """A record in Python: its fields are contiguous arrays with ``room`` stages."""
-        return np.dtype([
-            (one.name, _KINDS[one.kind], (room + (one.rows == "state"), *self.shape(one)))
+    def arrays(self, engine: str, room: int) -> dict[str, Any]:
+        """The fields of a record in Python, with ``room`` stages."""
+        return {
+            one.name: np.zeros(
+                (room + (one.rows == "state"), *self.shape(one)), _KINDS[one.kind]
+            )
             for one in self.fields(engine, "stage", "state")
-        ], align=True)
+        }
 
     def c_fields(self, of_stage: bool) -> list[tuple[str, Field]]:
         """The members of ``mhe_stage``, or those of ``mhe_estimator`` before its stages.

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 #: scalar operations would be in a compiler for seconds.
 LEAST, LEAST_SPARSE = 400, 2000
 #: A function of more operations takes longer in CasADi's virtual machine, and in a compiler, than
-#: it is worth.
-MOST_OPERATIONS = 20_000
+#: it is worth; of many states, so many for each are worth it.
+MOST_OPERATIONS, MOST_OF_EACH = 20_000, 50
 
 
 def _casadi() -> Any:

@@ -18,7 +18,7 @@ from .evaluation import Evaluator, machine
 from .expressions import CasadiModel, import_casadi, symbols
 from .functions import BatchedFunction, Trusted
 from .points import ALL, USUAL, Magnitude, Points, points
-from .products import MOST_OPERATIONS, operations, with_slope
+from .products import MOST_OF_EACH, MOST_OPERATIONS, operations, with_slope
 from .sets import ConvexSet
 from .tracing import Traced, difference, expressed
 
@@ -164,9 +164,9 @@ class ModelTrace:
         size, count = self._width if name == "f" else self._p, operations(found.function)
         if found.function.numel_out() != size:
             return Traced(None, f"it returns shape {found.shape} of symbols; expected ({size},)")
-        if count > MOST_OPERATIONS:
+        if count > (most := max(MOST_OPERATIONS, MOST_OF_EACH * self._n)):
             return Traced(None, (
-                f"it takes {count} operations, more than {MOST_OPERATIONS}; write a product with "
+                f"it takes {count} operations, more than {most}; write a product with "
                 "a matrix as A @ x, which is one"
             ))
         if self._sources is None:

@@ -26,7 +26,7 @@ from qpmhe_solvers.values import shown
 from .operations import ExpressionRecord
 from .points import ALL
 from .points import arguments as arguments_at
-from .products import Products
+from .products import MOST_OF_EACH, Products
 from .stand_ins import numpy_on_symbols
 from .symbols import (
     _MACHINERY,
@@ -139,6 +139,7 @@ def expressed(
     for deeper in (False, True):  # a model that needs no more is traced without
         made = Products()
         record = ExpressionRecord(casadi, watched, made if products else None)
+        record.most_operations = max(record.most_operations, MOST_OF_EACH * sizes[0])
         watch = _watch(record) if watched else contextlib.nullcontext()
         with numpy_on_symbols(record, deeper), watch:
             value, error = run(record, function, [record.symbols(one) for one in columns])

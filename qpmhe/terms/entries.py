@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -15,6 +16,21 @@ from .selected_inverse import SelectedInverse
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]
+
+
+# Below so many states, and above this share of entries, BLAS multiplies whole matrices faster.
+_LEAST_STATES = 150
+_MOST_FILLED = 0.05
+
+
+def has_enough_states(n: int) -> bool:
+    """Whether entries of matrices of so many states may be fewer than is worth it."""
+    return n >= _LEAST_STATES
+
+
+def is_sparse(count: int, shape: tuple[int, ...]) -> bool:
+    """Whether so many entries of a matrix are few."""
+    return count <= _MOST_FILLED * math.prod(shape)
 
 
 class GroupedSums:
@@ -292,6 +308,13 @@ class StageProducts:
         next_gradient: Array,
     ) -> Array:
         """Write the terms of one stage or of several; return their costs, NaN if they overflow."""
+        with np.errstate(all="ignore"):
+            return self._computed(residuals, slopes, weights, panel, gradient, next_gradient)
+
+    def _computed(
+        self, residuals: Array, slopes: Array, weights: Array, panel: Array, gradient: Array,
+        next_gradient: Array,
+    ) -> Array:
         force = self.weights.times(residuals, weights)
         weighted = self._weighted(weights, slopes)
         square = self._square(slopes, weighted)

@@ -14,16 +14,12 @@ from qpmhe_solvers.sparse_qp import SparseQP
 
 from ..costs import Cost
 from ..model.evaluation import Places
-from .entries import Entries, StageProducts, StageWeights
+from .entries import Entries, StageProducts, StageWeights, has_enough_states, is_sparse
 from .information import window_information
 from .linearization import SparseStageTerms, StageTerms
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-# Below so many states, and above this share of entries, BLAS multiplies whole matrices faster.
-_LEAST_STATES = 150
-_MOST_FILLED = 0.05
 
 
 class Freed(NamedTuple):
@@ -163,9 +159,9 @@ class WholeForm:
     def times(self, residuals: Array, weights: Array) -> Array:
         """W r of residuals (K, q)."""
         if weights.ndim == 2:
-            return np.asarray(residuals.dot(weights))
-        weighted: Array = np.matmul(residuals[:, None, :], weights)[:, 0]
-        return weighted
+            weighted: Array = residuals.dot(weights)
+            return weighted
+        return np.asarray(np.matmul(residuals[:, None, :], weights)[:, 0])
 
     def diagonal(self, weights: Array) -> Array:
         """The diagonals (..., q) of weights."""
@@ -200,6 +196,10 @@ class WholeForm:
     def symmetric(self, matrix: Array) -> Any:
         """A constant symmetric matrix (n, n), of which there are products."""
         return matrix
+
+    def square(self, symmetric: Any, vector: Array) -> float:
+        """The form s'Ws of a vector s (n,) and what `symmetric` has made of W."""
+        return float(vector.dot(symmetric).dot(vector))
 
     def matrix(self, symmetric: Any) -> Array:
         """What `symmetric` has made, as a matrix (n, n)."""
@@ -238,15 +238,20 @@ class SparseForm(WholeForm):
     def of(cls, places: Places, cost: Cost, stages: int) -> SparseForm | None:
         """The form for these places of [A; C]; None where it is of no use for so many stages."""
         n, p = len(cost.disturbance), len(cost.noise)
-        q, most = n + p, _MOST_FILLED * n
-        given = np.count_nonzero(cost.disturbance) + np.count_nonzero(cost.noise)
-        if n < _LEAST_STATES or max(places[0].size, int(given)) > most * q:
+        q = n + p
+        given = int(np.count_nonzero(cost.disturbance) + np.count_nonzero(cost.noise))
+        if not (
+            has_enough_states(n) and is_sparse(places[0].size, (q, n)) and is_sparse(given, (q, q))
+        ):
             return None
         weights, slopes = StageWeights(cost.disturbance, cost.noise), Entries(*places, q)
-        if weights.entries.size > most * q or StageProducts.work(slopes, weights) > n * q:
+        if not is_sparse(weights.entries.size, (q, q)):
+            return None
+        if StageProducts.work(slopes, weights) > n * q:
             return None
         products = StageProducts(n, slopes, weights, cost.initial_weight(None))
-        if products.pattern.places.size > 2 * most * n or products.pattern.order(stages) is None:
+        pattern = products.pattern
+        if not is_sparse(pattern.places.size, (n, 2 * n)) or pattern.order(stages) is None:
             return None
         return cls(n, p, products)
 
@@ -400,6 +405,10 @@ class SparseForm(WholeForm):
         from scipy.sparse import csr_array  # late: few models need it
 
         return csr_array(matrix)
+
+    def square(self, symmetric: Any, vector: Array) -> float:
+        """See `WholeForm.square`."""
+        return float(symmetric.dot(vector).dot(vector))
 
     def matrix(self, symmetric: Any) -> Array:
         """See `WholeForm.matrix`."""

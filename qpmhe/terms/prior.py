@@ -246,7 +246,7 @@ class Prior(FirstStateTerm):
         """The squared distance of two states, in deviations of the prior."""
         initial = self._initial
         if initial.distance_root is None:
-            return float((offset @ initial.distance).dot(offset))
+            return self._rule.form.square(initial.distance, offset)
         seen = initial.distance_root.dot(offset)
         return float(seen.dot(seen))
 
@@ -272,8 +272,10 @@ class Prior(FirstStateTerm):
 
     def _lost(self, offset: Array) -> float:
         """Gamma of an offset. With a root, of what the root makes of it: no digits cancel then."""
-        root, evaluate = self._initial.root, self._rule.evaluate
+        rule, root, evaluate = self._rule, self._initial.root, self._rule.evaluate
         if root is None:
+            if rule.form.by_entries:  # of a quadratic cost alone
+                return rule.form.square(self.weight, offset)
             return float(evaluate(offset, self.weight))
         return float(evaluate(root.dot(offset), np.eye(len(root))))
 
@@ -307,7 +309,7 @@ class Prior(FirstStateTerm):
         rule = self._rule
         offset = trial.trajectory[0] - self.mean if rule.residual is None else self.offset(trial)
         if rule.quadratic and self._initial.root is None:
-            return self.factor * float((offset @ self.weight).dot(offset))
+            return self.factor * rule.form.square(self.weight, offset)
         return float(self.factor * self._lost(offset))
 
     def cost_of_candidate(self, candidate: Trial) -> float:

@@ -1,82 +1,76 @@
-"""A stage's products of sparse matrices, for models of many states that depend on few others."""
+"""A stage's terms where whole matrices turn out to have few entries, of models without a trace."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .entries import Entries, StageProducts, StageWeights, has_enough_states, is_sparse
+
 Array = NDArray[np.float64]
 
-# Below so many states, and above this share of entries, BLAS multiplies them faster.
-_LEAST_STATES = 150
-_MOST_FILLED = 0.05
-
-
-class _Sparse:
-    """Sparse copies of matrices of one shape, with the pattern of the one before."""
-
-    __slots__ = ("_made", "_places", "_source")
-
-    def __init__(self) -> None:
-        from scipy.sparse import csr_array  # late: few models need it
-
-        self._made = csr_array
-        self._source: NDArray[np.intp] | None = None
-        self._places: Any = None
-
-    def of(self, matrix: Array) -> Any:
-        """The matrix in compressed rows; None if too many of its entries are not 0."""
-        flat = matrix.reshape(-1)
-        count = np.count_nonzero(flat)
-        if count > _MOST_FILLED * flat.size:
-            return None
-        if self._source is None or np.count_nonzero(flat[self._source]) != count:
-            self._source = np.flatnonzero(flat)
-            rows, columns = np.divmod(self._source, matrix.shape[1])
-            self._places = columns, np.searchsorted(rows, np.arange(matrix.shape[0] + 1))
-        return self._made((flat[self._source], *self._places), shape=matrix.shape)
+# A pattern that has grown so often is not searched for again.
+_MOST_GROWTHS = 8
 
 
 class SparseStages:
-    r"""What `StageTerms` computes for a stage, where [r, -G] and W are sparse."""
+    """What `StageTerms` computes for a stage, by the entries of [r, -G] and W that are not 0.
 
-    __slots__ = ("_linear", "_states", "_weight")
+    The pattern is kept from stage to stage, and grows where an entry outside of it is not 0.
+    """
+
+    __slots__ = ("_growths", "_products", "_states", "_there")
 
     def __init__(self, n: int) -> None:
-        self._states, self._linear, self._weight = n, _Sparse(), _Sparse()
+        self._states, self._growths = n, 0
+        self._products: StageProducts | None = None
+        self._there: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None
 
     @classmethod
     def of(cls, n: int) -> SparseStages | None:
         """Of so many states; None where they are too few."""
-        return cls(n) if n >= _LEAST_STATES else None
+        return cls(n) if has_enough_states(n) else None
 
     def set_stage(
         self, linear: Array, weight: Array, panel: Array, gradient: Array, next_gradient: Array
     ) -> float | None:
         """See `StageTerms.set_stage`; None, and nothing set, where one of them is not sparse."""
-        n = self._states
-        slopes, weights = self._linear.of(linear), self._weight.of(weight)
-        if slopes is None or weights is None:
+        residual, slopes, n = linear[:, 0], linear[:, 1:], self._states
+        count = int(np.count_nonzero(linear) - np.count_nonzero(residual))
+        weighed = int(np.count_nonzero(weight))
+        if not (is_sparse(count, slopes.shape) and is_sparse(weighed, weight.shape)):
             return None
-        residual = linear[:, 0]
-        slopes = slopes[:, 1:]
-        weighted_residual, weighted = weights @ residual, (weights @ slopes).tocoo()
-        square = (slopes.T @ weighted.tocsr()).tocoo()
+        for _ in range(2):
+            known = self._products
+            if known is not None:
+                of_g, of_w = known.slopes, known.weights.entries
+                entries, weights = slopes[of_g.rows, of_g.columns], weight[of_w.rows, of_w.columns]
+                found = np.count_nonzero(entries), np.count_nonzero(weights)
+                if found[0] == count and found[1] == weighed:
+                    break
+            self._grow(slopes, weight)
+        else:
+            return None
+        values = np.empty(known.pattern.places.size)
+        cost = known.compute(residual, entries, weights, values, gradient, next_gradient)
         panel.fill(0.0)
-        row, column = square.row, square.col
-        lower = row >= column
-        panel[column[lower], (row - column)[lower]] = square.data[lower]
-        row, column = weighted.row, weighted.col
-        own = row < n
-        panel[column[own], (n + row - column)[own]] = weighted.data[own]
-        gradient[...] = slopes.T @ weighted_residual
-        next_gradient[...] = weighted_residual[:n]
-        # 0 times anything that is not finite is NaN.
-        with np.errstate(all="ignore"):
-            zero = 0.0 * (
-                slopes.data.sum() + weighted.data.sum() + square.data.sum()
-                + weighted_residual.sum()
-            )
-            return float(residual @ weighted_residual + zero)
+        panel.reshape(2 * n * n)[known.pattern.places] = values
+        return float(cost)
+
+    def _grow(self, slopes: Array, weight: Array) -> None:
+        """Find the pattern of what was in it before or is not zero now."""
+        n, self._products = self._states, None
+        self._growths += 1
+        if self._growths > _MOST_GROWTHS:
+            return
+        there, weighed = slopes != 0.0, weight != 0.0
+        if self._there is not None:
+            there |= self._there[0]
+            weighed |= self._there[1]
+        there[:n].reshape(-1)[:: n + 1] = True
+        self._there = there, weighed
+        rows, columns = np.nonzero(there)
+        entries = Entries(rows, columns, len(there))
+        weights = StageWeights(weighed[:n, :n], weighed[n:, n:])
+        if StageProducts.work(entries, weights) <= there.size:
+            self._products = StageProducts(n, entries, weights, np.empty((0, 0)))

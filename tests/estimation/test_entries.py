@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import qpmhe
-from qpmhe.terms import forms
+from qpmhe.terms import entries
 
 LEAST = 12
 N, HORIZON, STEPS = 24, 4, 11
@@ -13,8 +13,8 @@ N, HORIZON, STEPS = 24, 4, 11
 @pytest.fixture(autouse=True)
 def few_states(monkeypatch):
     """Small models are sparse enough, too: the limits only save time."""
-    monkeypatch.setattr(forms, "_LEAST_STATES", LEAST)
-    monkeypatch.setattr(forms, "_MOST_FILLED", 0.6)
+    monkeypatch.setattr(entries, "_LEAST_STATES", LEAST)
+    monkeypatch.setattr(entries, "_MOST_FILLED", 0.6)
     monkeypatch.setattr("qpmhe_solvers.sparse_qp._GAIN", 16.0)
 
 
@@ -94,11 +94,11 @@ def both(monkeypatch, case, take=None, **options):
     """Estimates by entries, and of whole matrices."""
     runs = []
     for least, expected in ((LEAST, True), (10**9, False)):
-        monkeypatch.setattr(forms, "_LEAST_STATES", least)
+        monkeypatch.setattr(entries, "_LEAST_STATES", least)
         mhe = case.estimator(**options)
         assert is_by_entries(mhe) is expected
         runs.append(take(mhe) if take else [mhe.update(y) for y in case.Y])
-    monkeypatch.setattr(forms, "_LEAST_STATES", LEAST)
+    monkeypatch.setattr(entries, "_LEAST_STATES", LEAST)
     return runs
 
 
@@ -266,14 +266,14 @@ def test_snapshots(monkeypatch, from_whole, to_whole):
     """One of whole matrices continues by entries; not the other way round."""
     case, made = Case(5, "tree"), []
     for whole in (from_whole, to_whole):
-        monkeypatch.setattr(forms, "_LEAST_STATES", 10**9 if whole else LEAST)
+        monkeypatch.setattr(entries, "_LEAST_STATES", 10**9 if whole else LEAST)
         made.append(case.estimator(max_qps=2))
     first, second = made
     case.Y[3, 0] = np.nan
     for y in case.Y[:6]:
         first.update(y)
     state = first.state_dict()
-    monkeypatch.setattr(forms, "_LEAST_STATES", 10**9 if to_whole else LEAST)
+    monkeypatch.setattr(entries, "_LEAST_STATES", 10**9 if to_whole else LEAST)
     if to_whole and not from_whole:
         with pytest.raises(qpmhe.errors.InvalidInputError):
             second.load_state_dict(state)

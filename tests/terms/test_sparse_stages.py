@@ -106,7 +106,7 @@ def test_estimates_are_the_same(monkeypatch):
             engine="python",
         )
         runs.append([mhe.update(y) for y in Y])
-        monkeypatch.setattr("qpmhe.terms.sparse_stages._LEAST_STATES", 10 * N)
+        monkeypatch.setattr("qpmhe.terms.entries._LEAST_STATES", 10 * N)
     for sparse, dense in zip(*runs, strict=True):
         assert sparse.cost == pytest.approx(dense.cost, rel=1e-12)
         assert sparse.trajectory == pytest.approx(dense.trajectory, rel=1e-11)
