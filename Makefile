@@ -71,6 +71,7 @@ benchmarks: $(VENV)/.test
 	$(BIN)/pip install --quiet --disable-pip-version-check -r examples/benchmarks/requirements.txt
 	$(BIN)/python examples/benchmarks/compare_peers.py $(QUICK) --out results/benchmarks
 	$(BIN)/python examples/benchmarks/scaling.py $(QUICK) --out results/benchmarks
+	$(BIN)/python examples/benchmarks/large.py $(QUICK) --out results/benchmarks
 	$(BIN)/python examples/benchmarks/nonlinear.py
 	$(BIN)/python examples/benchmarks/constrained.py --out results/benchmarks
 	$(BIN)/python examples/benchmarks/algebraic.py --out results/benchmarks

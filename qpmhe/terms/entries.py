@@ -19,7 +19,7 @@ Index = NDArray[np.intp]
 
 
 # Below so many states, and above this share of entries, BLAS multiplies whole matrices faster.
-_LEAST_STATES = 150
+_LEAST_STATES = 80
 _MOST_FILLED = 0.05
 
 
