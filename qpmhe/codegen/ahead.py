@@ -9,7 +9,7 @@ from typing import Any
 
 from ..costs import Cost
 from ..errors import InvalidInputError, QpmheError
-from ..estimation.engines import python_only
+from ..estimation.engines import python_only, reason_for_python
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.start import with_scaled_constraints
 from ..model.system import System
@@ -127,6 +127,8 @@ def engine_choice(estimator: MovingHorizonEstimator) -> tuple[str, str]:
         return "python", "it names a QP solver, which only the Python step uses."
     if settings.engine == "auto" and python_only():
         return "python", "the environment variable QPMHE_ENGINE asks for it."
+    if settings.engine == "auto" and (reason := reason_for_python(estimator._engine)):
+        return "python", f"{reason}."
     try:
         reason = uncovered(system, observer, cost, settings)
         if reason:

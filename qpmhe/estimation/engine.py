@@ -173,6 +173,11 @@ class PythonEngine:
         )
 
     @property
+    def outpaces_c(self) -> bool:
+        """Whether this step is faster than the one in C."""
+        return self._tools.form.is_narrow
+
+    @property
     def usual(self) -> Conditions:
         """The conditions of a sample that brings none."""
         return self._tools.usual

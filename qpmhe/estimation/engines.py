@@ -21,6 +21,7 @@ from ..errors import (
 )
 from ..model.system import System
 from ..observers import Observer
+from ..terms.entries import has_enough_states
 from .conditions import Conditions
 from .engine import PythonEngine
 from .estimate import Estimate
@@ -155,10 +156,22 @@ def _at_hand(
     parts = system, observer, cost, settings, initial_state
     make = _ENGINES.get("compiled")
     if make is not None and not settings.needs_python and not python_only():
+        if has_enough_states(system.n) and (found := PythonEngine(*parts)).outpaces_c:
+            return found
         # Nobody asked for this engine; what is wrong with the arguments, the other reports.
         with suppress(Exception):
             return make(*parts)
     return PythonEngine(*parts)
+
+
+def reason_for_python(engine: Engine) -> str:
+    """Why ``engine="auto"`` stays with this engine, whatever is compiled; blank where it does not.
+
+    The step in C factorises whole blocks.
+    """
+    if isinstance(engine, PythonEngine) and engine.outpaces_c:
+        return "its Jacobians are sparse, for which the Python step is the faster one"
+    return ""
 
 
 def engine_for_record(
@@ -174,6 +187,8 @@ def engine_for_record(
     is_free = settings.engine == "auto" and engine.name == "python" and not engine.time
     if prepare is None or not is_free or settings.needs_python or python_only():
         return engine, ""
+    if reason := reason_for_python(engine):
+        return engine, reason
     system = system.evaluated_like(engine.system)
     is_ready, reason = prepare(system, observer, cost, settings, samples)
     if is_ready:

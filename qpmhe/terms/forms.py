@@ -53,9 +53,12 @@ class WholeForm:
         -G where the model has no Jacobians, as `StageTerms.slopes`.
     by_entries : bool
         Whether Jacobians are those of `Model.entries`.
+    is_narrow : bool
+        Whether the band of a QP is so narrow that the C step, which takes whole blocks, is slower.
     """
 
     by_entries = False
+    is_narrow = False
     shapes: Mapping[str, tuple[int, ...]] = {}
 
     def __init__(self, n: int, p: int) -> None:
@@ -250,10 +253,12 @@ class SparseForm(WholeForm):
         if StageProducts.work(slopes, weights) > n * q:
             return None
         products = StageProducts(n, slopes, weights, cost.initial_weight(None))
-        pattern = products.pattern
-        if not is_sparse(pattern.places.size, (n, 2 * n)) or pattern.order(stages) is None:
+        order = products.pattern.order(stages)
+        if order is None or not is_sparse(products.pattern.places.size, (n, 2 * n)):
             return None
-        return cls(n, p, products)
+        found = cls(n, p, products)
+        found.is_narrow = order.width < n
+        return found
 
     # Arrays
 

@@ -203,3 +203,23 @@ def test_a_failure_is_forgotten_once_compiling_succeeds(script, cache):
     qpmhe.compile(estimator())
     assert not list(cache.glob("*.failed"))
     assert estimator().run(RECORD).engine == "compiled"
+
+
+def test_sparse_jacobians_of_many_states_stay_with_the_python_step(script):
+    """Its band is narrower than the blocks of the step in C."""
+    n = 84
+
+    def f(x):
+        return x + 0.1 * (np.append(x[:1], x[:-1]) - 2.0 * x + np.append(x[1:], x[-1:]))
+
+    system = qpmhe.System(f, lambda x: x[::4], n=n, p=n // 4)
+    gain = 0.3 * np.eye(n)[:, ::4]
+    cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=np.eye(n // 4))
+    mhe = qpmhe.MovingHorizonEstimator(
+        system, qpmhe.Luenberger(gain), cost, horizon=4, initial_state=np.zeros(n), max_qps=1
+    )
+    run = mhe.run(np.zeros((ENOUGH, n // 4)))
+    assert run.engine == "python"
+    assert "Jacobians are sparse" in run.engine_reason
+    assert qpmhe.codegen.engine_choice(mhe) == ("python", f"{run.engine_reason}.")
+    assert not script.calls
