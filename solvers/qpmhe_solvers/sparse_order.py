@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .qp import QP, Array
-from .sparse_qp import Order, SparseQP, narrow, order_of
+from .sparse_qp import Order, SparseQP, narrow, order_of, places_of_states
 
 Index = NDArray[np.intp]
 
@@ -85,6 +85,7 @@ class SparseOrder:
             column, offset = np.divmod(source, 2 * qp.n)
             row = column + offset
             if source.size and row.max() < qp.size:  # else what is no entry of H
-                found = order_of(qp.stages, qp.n, row, column, source)
+                place = places_of_states(qp.n, row % qp.n, column % qp.n)
+                found = order_of(qp.stages, place, row, column, source)
                 self._known = found if found.width < narrow(qp.n) else None
         return self._known

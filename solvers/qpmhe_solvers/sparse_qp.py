@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -93,7 +94,11 @@ class Pattern:
         stage, entry = np.divmod(source, self.places.size)
         row, column = (stage * self.n + one[entry] for one in (self.rows, self.columns))
         there = row < stages * self.n
-        return order_of(stages, self.n, row[there], column[there], source[there])
+        return order_of(stages, self._place, row[there], column[there], source[there])
+
+    @cached_property
+    def _place(self) -> Index:
+        return places_of_states(self.n, self.rows % self.n, self.columns)
 
 
 class SparseQP(QP):
@@ -170,10 +175,8 @@ def narrow(n: int) -> float:
     return math.sqrt(_GAIN) * 2 * n
 
 
-def order_of(stages: int, n: int, row: Index, column: Index, source: Index) -> Order:
-    """The order of a pattern of H."""
-    place = np.empty(n, np.intp)
-    place[_order_of_states(n, row % n, column % n)] = np.arange(n)
+def order_of(stages: int, place: Index, row: Index, column: Index, source: Index) -> Order:
+    """The order of entries of H, with the states in these places (n,)."""
     at = (place * stages + np.arange(stages)[:, None]).ravel()
     row, column = at[row], at[column]
     low, high = np.minimum(row, column), np.maximum(row, column)
@@ -181,10 +184,12 @@ def order_of(stages: int, n: int, row: Index, column: Index, source: Index) -> O
     return Order(np.argsort(at), source, low * (width + 1) + high - low, width)
 
 
-def _order_of_states(n: int, i: Index, j: Index) -> Index:
-    """The reverse Cuthill-McKee order of a graph of the states."""
+def places_of_states(n: int, i: Index, j: Index) -> Index:
+    """The places (n,) of states in the reverse Cuthill-McKee order of a graph."""
     from scipy.sparse import csr_matrix  # late: as LAPACK
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     graph = csr_matrix((np.ones(2 * i.size), (np.append(i, j), np.append(j, i))), (n, n))
-    return np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), np.intp)
+    place = np.empty(n, np.intp)
+    place[reverse_cuthill_mckee(graph, symmetric_mode=True)] = np.arange(n)
+    return place
