@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -122,6 +123,8 @@ FIELDS = (
     Field("terms", "stage", kind="terms", engine="c"),
 )
 
+_ALIGNED = 64  # bytes
+
 _KINDS: dict[str, Any] = {
     "real": np.float64, "flag": np.bool_, "count": np.int64, "time": np.int64,
 }
@@ -192,13 +195,18 @@ class MemorySizes(NamedTuple):
         is_there = not field.when or field.when in self.features
         return np.zeros(self.shape(field)) if is_there and not field.may_be_missing else None
 
-    def arrays(self, engine: str, room: int) -> dict[str, Any]:
-        """The fields of a record in Python, with ``room`` stages."""
-        return {
-            one.name: np.zeros(
-                (room + (one.rows == "state"), *self.shape(one)), _KINDS[one.kind]
-            )
-            for one in self.fields(engine, "stage", "state")
+    def arrays(self, engine: str, room: int) -> tuple[Any, dict[str, Any]]:
+        """A block of memory, and the fields of a record in Python in it, with ``room`` stages."""
+        places, end = {}, 0
+        for one in self.fields(engine, "stage", "state"):
+            shape = room + (one.rows == "state"), *self.shape(one)
+            size = math.prod(shape) * np.dtype(_KINDS[one.kind]).itemsize
+            places[one.name] = slice(end, end + size), _KINDS[one.kind], shape
+            end += -(-size // _ALIGNED) * _ALIGNED
+        block = np.zeros(end, np.uint8)  # no structure: these end at 2 GiB
+        return block, {
+            name: block[place].view(kind).reshape(shape)
+            for name, (place, kind, shape) in places.items()
         }
 
     def c_fields(self, of_stage: bool) -> list[tuple[str, Field]]:

@@ -93,7 +93,8 @@ class MemoryRecord:
         self.horizon = horizon = sizes.dimensions["N"]
         self.room = room = horizon + max(horizon // 4, 32)
         self._usual_weight, self._step = usual_weight, step
-        self.rows: dict[str, Array] = sizes.arrays(self._engine, room)
+        self.rows: dict[str, Array]
+        self.block, self.rows = sizes.arrays(self._engine, room)
         self.covariance: Array | None
         self.rejections: NDArray[np.int64] | None
         self.root: Array | None

@@ -118,6 +118,15 @@ def test_its_fields_are_contiguous_arrays_of_one_aligned_block():
     assert record.block.nbytes >= sum(array.nbytes for array in record.rows.values())
 
 
+def test_fields_may_be_larger_together_than_a_structure_of_c():
+    """Of 1,500 states with whole matrices; nothing is written, so that the system gives none."""
+    sizes = MemorySizes.of(1500, 150, 0, 10)
+    block, rows = sizes.arrays("python", 42)
+    assert block.nbytes > 2**31
+    assert rows["linear"].shape == (42, 1650, 1501)
+    assert not rows["panel"][-1, -1].any()
+
+
 def test_a_row_of_another_shape_or_kind_is_refused_by_its_name():
     record = record_of(SIZES["all"])
     push(record, np.random.default_rng(1))
