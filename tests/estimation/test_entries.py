@@ -341,3 +341,23 @@ def test_what_needs_whole_matrices_has_them(what):
     mhe = case.estimator(**options)
     assert not is_by_entries(mhe)
     assert np.isfinite(mhe.update(case.Y[0]).cost)
+
+
+def test_a_function_that_has_changed_ends_it():
+    case, rate = Case(9), [0.1]
+
+    def f(x):
+        return x + rate[0] * (np.append(x[1:], x[-1:]) - x)
+
+    case.system = qpmhe.System(f=f, h=lambda x: x[case.seen], n=N, p=case.p)
+    mhe = case.estimator(max_qps=2)
+    for y in case.Y[:6]:
+        mhe.update(y)
+    assert is_by_entries(mhe)
+    rate[0] = 0.2
+    with pytest.warns(match="has changed since it was traced"):
+        mhe.verify()
+    assert not is_by_entries(mhe)
+    for y in case.Y[6:]:
+        estimate = mhe.update(y)
+        assert estimate.cost <= estimate.candidate_cost
