@@ -15,23 +15,23 @@ from qpmhe_solvers import Solver, create
 from qpmhe_solvers.solver import ContainedSolver
 
 from .._checks import check_problem
-from ..costs import Cost, QuadraticCost, lifted
+from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
 from ..memory.record import Mark, MemoryRecord
 from ..memory.snapshot import reading
 from ..model.captured import ComparisonTimes, Due
 from ..model.derivatives import Nearby
-from ..model.evaluation import Places
 from ..model.residuals import difference
 from ..model.system import System
 from ..model.traces import warn_of
 from ..observers import Observer
-from ..terms.forms import SparseForm, WholeForm
-from ..terms.sum import further_terms, root_of_first, weight_of_first
+from ..terms.forms import WholeForm
+from ..terms.sum import root_of_first, weight_of_first
 from .conditions import USUAL, ConditionReader, Conditions, usual_conditions
 from .covariance import window_covariances
 from .description import check_description, described
 from .estimate import Estimate, Status
+from .forms import form_for, have_form
 from .optimizer import Optimizer
 from .problem import Formulation, Solved
 from .settings import Settings
@@ -137,7 +137,7 @@ class PythonEngine:
         """What a step uses under these usual conditions, with matrices in a form that fits."""
         settings = self._settings
         system, cost = usual.applied(self._system, self._cost)
-        form = self._form_for(system, cost)
+        form = form_for(system, self._observer, cost, settings, self._solver)
         if not fits(form):
             form = WholeForm(system.n, system.p)
         formulation = Formulation(system, self._observer, cost, form)
@@ -148,21 +148,6 @@ class PythonEngine:
             usual, system, cost, form, formulation, subproblem,
             Optimizer(subproblem, self._solver, settings),
         )
-
-    def _form_for(self, system: System, cost: Cost) -> WholeForm:
-        """How matrices are held: by entries where all that reads them can."""
-        form, settings, observer = None, self._settings, self._observer
-        model, further = system.evaluation, further_terms(system, cost)
-        sets = system.states, system.disturbances, system.noises, system.constraints, cost.space
-        if (
-            settings.qp_limit and self._solver.takes_sparse and not (further or settings.restart)
-            and type(cost) is QuadraticCost and cost.observer_prior is None
-            and all(one is None for one in (*sets, observer.initial_covariance()))
-            and not observer.needs_jacobians and model.pattern is not None
-            and (not system.has_timed or _are_same(model.pattern, system.timed.evaluation.pattern))
-        ):
-            form = SparseForm.of(model.pattern, cost, settings.horizon + 1)
-        return form or WholeForm(system.n, system.p)
 
     def _fresh_window(self, initial_state: Array, tools: Tools) -> Window:
         settings = self._settings
@@ -215,7 +200,7 @@ class PythonEngine:
         """Take the sample y(t), u(t), and estimate x(t+1)."""
         if self._window.time >= self._times.next:
             self._check_trace(u)
-        if own is not None and not _fit(self._tools.form, own):
+        if own is not None and not have_form(self._tools.form, own):
             self._hold_whole(own)
         window, reinitialized = self._window, self._reinitialized
         if window.end == window.room:
@@ -277,7 +262,7 @@ class PythonEngine:
         """Hold matrices whole from now on: a sample brings weights of another pattern."""
         state = self.state_dict()
         state["window"] = self._tools.form.as_whole(state["window"])
-        self.replace(self._checked_memory(state, lambda form: _fit(form, own)))
+        self.replace(self._checked_memory(state, lambda form: have_form(form, own)))
 
     def _warn(self) -> None:
         watched = self._window.watched
@@ -442,7 +427,7 @@ class PythonEngine:
         try:
             with np.errstate(all="ignore"):
                 own = [one.without(changes) for one in before.window.own.values()]
-                tools = self._tools_for(usual, lambda form: _fit(form, *own))
+                tools = self._tools_for(usual, lambda form: have_form(form, *own))
                 window = self._fresh_window(before.window.initial_state, tools)
                 window.take_over(before.window, changes, parameters)
                 if self._reinitialized and window.length:
@@ -491,8 +476,8 @@ class PythonEngine:
         ``replay``, the observer runs through the window's samples again.
         """
         tools, own = self._tools, record.own.values()
-        if usual is not tools.usual or not _fit(tools.form, *own):
-            tools = self._tools_for(usual, lambda form: _fit(form, *own))
+        if usual is not tools.usual or not have_form(tools.form, *own):
+            tools = self._tools_for(usual, lambda form: have_form(form, *own))
         window = self._fresh_window(record.z[record.start], tools)
         if window.metric is not None and metric is not None:
             window.metric.state = metric
@@ -592,16 +577,6 @@ class PythonEngine:
             with np.errstate(all="ignore"):
                 window.restate()
         return Memory(self._system, tools, window)
-
-
-def _fit(form: WholeForm, *own: Conditions) -> bool:
-    """Whether the weights of samples have a form."""
-    return all(form.fits(one.noise_weight, one.disturbance_weight) for one in own)
-
-
-def _are_same(one: Places, other: Places | None) -> bool:
-    """Whether two patterns are the same."""
-    return other is not None and all(map(np.array_equal, one, other))
 
 
 def _nearby(system: System) -> tuple[Nearby, Nearby]:
