@@ -15,6 +15,8 @@ from .faults import LEAST_GAIN, MOST_PARTS, Evidence, Fault, with_factor
 _AROUND = (0.5, 1.0, 1.5, 2.5)
 # Places where a ramp may begin.
 _RAMPS = 12
+# By what share the evidence for ends must be larger.
+_AS_GOOD = 1e-9
 # Samples that are moved before products are taken.
 _TOGETHER = 256
 
@@ -185,10 +187,14 @@ def with_ends(bank: FilterBank, base: Hypothesis, null: Filtered, bias: Fault) -
             for end in sorted({min(last + d, total - 1) for d in (-step, 0, step)})
             if end - begin >= 2
         ]
-        against, own = moments(signatures, null)
-        sizes = against / own.diagonal()
-        k = int(np.argmax(sizes * against))
-        same = signatures[k].span == (first, last)
+        against, products = moments(signatures, null)
+        sizes = against / products.diagonal()
+        merits = sizes * against
+        k = int(np.argmax(merits))
+        # Ends beside missing samples are as good as others: rounding must not lead to and fro.
+        own = [i for i, one in enumerate(signatures) if one.span == (first, last)]
+        same = bool(own) and not merits[k] > (1.0 + _AS_GOOD) * merits[own[0]]
+        k = own[0] if same else k
         first, last = signatures[k].span or (first, last)
         if same and step == 1:
             break
