@@ -4,6 +4,7 @@ import re
 import sys
 from html import escape
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 import qpmhe
 from qpmhe.cli.app import app
-from qpmhe.diagnosis import observability
+from qpmhe.diagnosis import observability, signatures
 from qpmhe.diagnosis.bank import FilterBank, Hypothesis
 from qpmhe.diagnosis.faults import Fault
 from qpmhe.diagnosis.search import _disjoint
@@ -640,3 +641,24 @@ def test_a_step_that_is_too_long_comes_before_clocks_and_covariances(method, ste
     assert kinds(diagnosis) == expected, str(diagnosis)
     if expected:
         assert "The integration step is too long: one step of rk4" in str(diagnosis)
+
+
+def test_ends_that_rounding_alone_tells_apart_are_not_looked_for_to_and_fro(monkeypatch):
+    """As beside missing samples: then a bias may end here or there, and is as likely."""
+    best = [(20, 70)]
+
+    def alike(found, _):
+        """Rounding is in favour of others than the last ones."""
+        against = np.ones(len(found))
+        k = next(k for k, one in enumerate(found) if one.span != best[-1])
+        best.append(found[k].span)
+        assert len(best) < 100
+        against[k] += 1e-15
+        return against, np.eye(len(found))
+
+    monkeypatch.setattr(signatures, "moments", alike)
+    bank = SimpleNamespace(system=SimpleNamespace(p=1), run=lambda *_: 1 / 0)
+    bias = Fault("bias", 1.0, None, (0,), (20, 70))
+    monkeypatch.setattr(signatures, "removed", lambda *_: SimpleNamespace(hypothesis=None))
+    with pytest.raises(ZeroDivisionError):  # at the end, where the record is filtered with it
+        signatures.with_ends(bank, SimpleNamespace(measurements=np.zeros((100, 1))), None, bias)
