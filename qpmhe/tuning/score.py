@@ -44,8 +44,9 @@ class Score:
     ) -> None:
         self._data, self._make, self.kind = data, make, kind
         self._compiled = False
-        # The first estimator of each record: those of other weights are not checked again.
-        self._checked: dict[int, MovingHorizonEstimator] = {}
+        # The first estimator of each record and horizon: those of other weights are not checked
+        # again.
+        self._checked: dict[tuple[int, int], MovingHorizonEstimator] = {}
         #: A compiled step of the model: of states and of inputs with the step's length behind them.
         self.follow: Callable[[Array, Array], Array] | None = None
         #: Seconds that a step took, the median of the last run.
@@ -171,13 +172,14 @@ class Score:
         if problem.parameters.size:
             options["parameters"] = problem.parameters
         observer, cost = self.kind(problem), weights.cost()
-        known = self._checked.get(id(one))
+        place = id(one), weights.horizon
+        known = self._checked.get(place)
         if known is not None and known.system is system and "parameters" not in options:
             return reweighted(known, observer, cost)
         made = MovingHorizonEstimator(
             system, observer, cost, horizon=weights.horizon, initial_state=one.start, **options,
         )
-        self._checked[id(one)] = made
+        self._checked[place] = made
         return made
 
     def problem(
