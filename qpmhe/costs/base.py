@@ -393,7 +393,7 @@ class Cost(ABC):
     @property
     def stage_weight(self) -> Array:
         """The joint weight (r + p, r + p) of w and v."""
-        return self.joint_weight(None)
+        return self.joint_weight(self.noise)
 
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
         """The weight of (w, v), of ``disturbance`` and ``noise``; None is the usual weight."""

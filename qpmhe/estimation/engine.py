@@ -260,9 +260,7 @@ class PythonEngine:
 
     def _hold_whole(self, own: Conditions) -> None:
         """Hold matrices whole from now on: a sample brings weights of another pattern."""
-        state = self.state_dict()
-        state["window"] = self._tools.form.as_whole(state["window"])
-        self.replace(self._checked_memory(state, lambda form: have_form(form, own)))
+        self.replace(self._checked_memory(self.state_dict(), lambda form: have_form(form, own)))
 
     def _warn(self) -> None:
         watched = self._window.watched
@@ -520,6 +518,7 @@ class PythonEngine:
 
     def state_dict(self) -> dict[str, Any]:
         """The memory as plain arrays and numbers; a solver's warm start is not among them."""
+        places = self._tools.form.places
         return {
             "problem": self._size(),
             "engine": self.name,
@@ -527,7 +526,7 @@ class PythonEngine:
             "linearized": self._with_terms,
             "usual": self._tools.usual.state_dict(),
             "window": self._window.state_dict(),
-        }
+        } | ({"places": dict(places)} if places else {})
 
     def forget_warm_start(self) -> None:
         """Have the next QP start without what the solver has kept."""
@@ -559,16 +558,17 @@ class PythonEngine:
         self, state: dict[str, Any], fits: Callable[[WholeForm], bool] = _any
     ) -> Memory:
         """The memory in a state, with matrices in a form that fits."""
-        with_terms, rows = state["linearized"], state["window"]
+        with_terms, given, places = state["linearized"], state["window"], state.get("places", {})
         if not isinstance(with_terms, bool):
             raise TypeError(f"linearized is {with_terms!r}")
         tools = self._tools_for(
             self._reader.load(state["usual"], self._tools.usual),
-            lambda form: form.holds(rows) and fits(form),
+            lambda form: form.holds(form.readable(given, places)) and fits(form),
         )
         window = self._fresh_window(np.zeros(self._system.n), tools)
         window.load_state_dict(
-            tools.form.taken(rows), lambda own: self._reader.load(own, tools.usual),
+            tools.form.taken(tools.form.readable(given, places)),
+            lambda own: self._reader.load(own, tools.usual),
             may_be_irregular=self._system.has_timed, is_smoothed=self._smoothed,
             # A graduated loss may leave the trajectory of a widened one.
             ends_alike=self._cost.graduation == 1.0,

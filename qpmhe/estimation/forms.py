@@ -10,6 +10,7 @@ from ..costs import Cost, QuadraticCost
 from ..model.evaluation import Places
 from ..model.system import System
 from ..observers import Observer
+from ..terms.entries import has_enough_states
 from ..terms.forms import SparseForm, WholeForm
 from ..terms.sum import further_terms
 from .conditions import Conditions
@@ -23,8 +24,8 @@ def form_for(
     form, model = None, system.evaluation
     sets = system.states, system.disturbances, system.noises, system.constraints, cost.space
     if (
-        settings.qp_limit and solver.takes_sparse and not settings.restart
-        and not further_terms(system, cost)
+        has_enough_states(system.n) and settings.qp_limit and solver.takes_sparse
+        and not settings.restart and not further_terms(system, cost)
         and type(cost) is QuadraticCost and cost.observer_prior is None
         and all(one is None for one in (*sets, observer.initial_covariance()))
         and not observer.needs_jacobians and model.pattern is not None

@@ -14,7 +14,7 @@ from qpmhe_solvers.sparse_qp import SparseQP
 
 from ..costs import Cost
 from ..model.evaluation import Places
-from .entries import Entries, StageProducts, StageWeights, has_enough_states, is_sparse
+from .entries import Entries, StageProducts, StageWeights, is_sparse
 from .information import window_information
 from .linearization import SparseStageTerms, StageTerms
 
@@ -49,6 +49,8 @@ class WholeForm:
     ----------
     shapes : mapping
         Shapes of the fields of the memory that are others than there.
+    places : mapping
+        Where entries stand in their matrices, whose shape is made flat; empty of whole ones.
     minus_stand_in : array
         -G where the model has no Jacobians, as `StageTerms.slopes`.
     by_entries : bool
@@ -60,6 +62,7 @@ class WholeForm:
     by_entries = False
     is_narrow = False
     shapes: Mapping[str, tuple[int, ...]] = {}
+    places: Mapping[str, NDArray[np.intp]] = {}
 
     def __init__(self, n: int, p: int) -> None:
         self.n, self.p = n, p
@@ -79,16 +82,29 @@ class WholeForm:
         """Whether these weights of a sample, None for usual ones, have this form."""
         return True
 
+    def readable(
+        self, rows: Mapping[str, Any], places: Mapping[str, NDArray[np.intp]]
+    ) -> Mapping[str, Any]:
+        """The rows of a memory with entries in these places: in this form or whole."""
+        own = self.places
+        if not places or (own and all(np.array_equal(own[name], places[name]) for name in own)):
+            return rows
+        n, q = self.n, self.n + self.p
+        linear, found = np.asarray(rows["linear"]), dict(rows)
+        for name, shape in (("linear", (q, n)), ("weight", (q, q)), ("panel", (n, 2 * n))):
+            entries = linear[:, q:] if name == "linear" else np.asarray(rows[name])
+            whole = np.zeros((len(entries), shape[0] * shape[1]))
+            whole[:, places[name]] = entries
+            found[name] = whole.reshape(-1, *shape)
+        found["linear"] = np.concatenate((linear[:, :q, None], found["linear"]), axis=2)
+        return found
+
     def holds(self, rows: Mapping[str, Any]) -> bool:
         """Whether the rows of a memory, in this form or whole, have this form."""
         return True
 
     def taken(self, rows: Mapping[str, Any]) -> dict[str, Any]:
         """The rows of a memory, in this form or whole, in this form."""
-        return dict(rows)
-
-    def as_whole(self, rows: Mapping[str, Any]) -> dict[str, Any]:
-        """The rows of a memory of this form as whole ones."""
         return dict(rows)
 
     # Jacobians
@@ -236,6 +252,11 @@ class SparseForm(WholeForm):
             "linear": (n + p + slopes.size,), "weight": (products.weights.entries.size,),
             "panel": (self._pattern.places.size,),
         }
+        of = products.weights.entries
+        self.places = {
+            "linear": slopes.rows * n + slopes.columns, "weight": of.rows * (n + p) + of.columns,
+            "panel": self._pattern.places,
+        }
 
     @classmethod
     def of(cls, places: Places, cost: Cost, stages: int) -> SparseForm | None:
@@ -243,9 +264,7 @@ class SparseForm(WholeForm):
         n, p = len(cost.disturbance), len(cost.noise)
         q = n + p
         given = int(np.count_nonzero(cost.disturbance) + np.count_nonzero(cost.noise))
-        if not (
-            has_enough_states(n) and is_sparse(places[0].size, (q, n)) and is_sparse(given, (q, q))
-        ):
+        if not (is_sparse(places[0].size, (q, n)) and is_sparse(given, (q, q))):
             return None
         weights, slopes = StageWeights(cost.disturbance, cost.noise), Entries(*places, q)
         if not is_sparse(weights.entries.size, (q, q)):
@@ -298,18 +317,6 @@ class SparseForm(WholeForm):
             **rows, "linear": np.concatenate((linear[:, :, 0], entries), axis=1),
             "weight": weight[:, weights.rows, weights.columns],
             "panel": panel.reshape(len(panel), -1)[:, self._pattern.places],
-        }
-
-    def as_whole(self, rows: Mapping[str, Any]) -> dict[str, Any]:
-        """See `WholeForm.as_whole`."""
-        linear, panel, q = rows["linear"], rows["panel"], self.n + self.p
-        panels = np.zeros((len(panel), 2 * self.n * self.n))
-        panels[:, self._pattern.places] = panel
-        slopes = self.whole_slopes(linear[:, q:])
-        return {
-            **rows, "linear": np.concatenate((linear[:, :q, None], slopes), axis=2),
-            "weight": self.whole(rows["weight"]),
-            "panel": panels.reshape(-1, self.n, 2 * self.n),
         }
 
     # Jacobians

@@ -108,3 +108,13 @@ def test_wrong_costs_are_named():
             check(error, words, kind, **given | changes)
     check(InvalidInputError, ["noise is <", "expected a loss or a weight matrix"], RobustCost,
           **given | {"noise": ObserverPrior()})
+
+
+def test_the_usual_joint_weight_is_that_of_the_usual_noise():
+    """As a cost that overrides `joint_weight` may expect, which multiplies it, say."""
+    class Scaled(qpmhe.QuadraticCost):
+        def joint_weight(self, noise, disturbance=None):
+            return super().joint_weight(3.0 * noise, disturbance)
+
+    cost = Scaled(prior=np.eye(2), disturbance=np.eye(2), noise=2.0 * np.eye(1))
+    assert cost.stage_weight[2, 2] == 6.0

@@ -263,7 +263,7 @@ def test_covariances_and_sensitivities(monkeypatch):
 @pytest.mark.parametrize("to_whole", [False, True])
 @pytest.mark.parametrize("from_whole", [False, True])
 def test_snapshots(monkeypatch, from_whole, to_whole):
-    """One of whole matrices continues by entries; not the other way round."""
+    """One of whole matrices continues by entries, and the other way round."""
     case, made = Case(5, "tree"), []
     for whole in (from_whole, to_whole):
         monkeypatch.setattr(entries, "_LEAST_STATES", 10**9 if whole else LEAST)
@@ -274,10 +274,6 @@ def test_snapshots(monkeypatch, from_whole, to_whole):
         first.update(y)
     state = first.state_dict()
     monkeypatch.setattr(entries, "_LEAST_STATES", 10**9 if to_whole else LEAST)
-    if to_whole and not from_whole:
-        with pytest.raises(qpmhe.errors.InvalidInputError):
-            second.load_state_dict(state)
-        return
     second.load_state_dict(state)
     assert is_by_entries(second) is not to_whole
     runs = [[mhe.update(y) for y in case.Y[6:]] for mhe in (second, first)]
@@ -361,3 +357,39 @@ def test_a_function_that_has_changed_ends_it():
     for y in case.Y[6:]:
         estimate = mhe.update(y)
         assert estimate.cost <= estimate.candidate_cost
+
+
+def test_a_snapshot_continues_where_the_function_has_no_trace():
+    case = Case(10)
+    case.system = qpmhe.System(f=lambda x: 0.5 * x, h=lambda x: x[case.seen], n=N, p=case.p)
+    traced = case.estimator(max_qps=2)
+    case.system = qpmhe.System(
+        f=lambda x: np.asarray([0.5 * float(one) for one in x]), h=lambda x: x[case.seen],
+        n=N, p=case.p,
+    )
+    untraced = case.estimator(max_qps=2)
+    for y in case.Y[:6]:
+        traced.update(y)
+    untraced.load_state_dict(traced.state_dict())
+    assert (is_by_entries(traced), is_by_entries(untraced)) == (True, False)
+    assert_same(case, [[mhe.update(y) for y in case.Y[6:]] for mhe in (traced, untraced)], 1e-6)
+
+
+@pytest.mark.parametrize("is_larger", [False, True])
+def test_a_snapshot_continues_with_another_pattern(is_larger):
+    """Of a model with entries that are lost in rounding."""
+    case, runs, patterns = Case(11), [], []
+    for factor in (0.0, 1e-300) if is_larger else (1e-300, 0.0):
+        def f(x, factor=factor):
+            return 0.5 * x + factor * np.append(x[2:], x[:2]) if factor else 0.5 * x
+
+        case.system = qpmhe.System(f=f, h=lambda x: x[case.seen], n=N, p=case.p)
+        runs.append(case.estimator(max_qps=2))
+        patterns.append(runs[-1]._engine._tools.form.places["linear"].size)
+    first, second = runs
+    assert (patterns[0] < patterns[1]) is is_larger
+    for y in case.Y[:6]:
+        first.update(y)
+    second.load_state_dict(first.state_dict())
+    assert is_by_entries(second) is is_larger
+    assert_same(case, [[mhe.update(y) for y in case.Y[6:]] for mhe in runs])
