@@ -208,6 +208,8 @@ class Cost(ABC):
     #: Smaller eigenvalues of the correlations in an observer's covariance count as this.
     least_correlation: float = SINGULAR
 
+    _own_joint: Array | None = None  # the stage weight that a subclass has set
+
     def __init__(
         self, prior: Array | ObserverPrior | None, disturbance: Array, noise: Array,
         discount: float,
@@ -392,8 +394,12 @@ class Cost(ABC):
 
     @property
     def stage_weight(self) -> Array:
-        """The joint weight (r + p, r + p) of w and v."""
-        return self.joint_weight(self.noise)
+        """The joint weight (r + p, r + p) of w and v; a subclass may set another one."""
+        return self.joint_weight(self.noise) if self._own_joint is None else self._own_joint
+
+    @stage_weight.setter
+    def stage_weight(self, weight: Array) -> None:
+        self._own_joint = weight
 
     def joint_weight(self, noise: Array | None, disturbance: Array | None = None) -> Array:
         """The weight of (w, v), of ``disturbance`` and ``noise``; None is the usual weight."""
@@ -410,6 +416,7 @@ class Cost(ABC):
             other.noise = noise
         if disturbance is not None:
             other.disturbance = disturbance
+        other._own_joint = None
         other._partial = OrderedDict()
         return other
 

@@ -118,3 +118,15 @@ def test_the_usual_joint_weight_is_that_of_the_usual_noise():
 
     cost = Scaled(prior=np.eye(2), disturbance=np.eye(2), noise=2.0 * np.eye(1))
     assert cost.stage_weight[2, 2] == 6.0
+
+
+def test_a_subclass_may_set_the_joint_weight():
+    class Own(qpmhe.QuadraticCost):
+        def __init__(self, **weights):
+            super().__init__(**weights)
+            self.stage_weight = 2.0 * self.stage_weight
+
+    cost = Own(prior=np.eye(2), disturbance=np.eye(2), noise=3.0 * np.eye(1))
+    np.testing.assert_array_equal(cost.stage_weight, np.diag([2.0, 2.0, 6.0]))
+    other = cost.with_weights(5.0 * np.eye(1), None)
+    np.testing.assert_array_equal(other.stage_weight, np.diag([1.0, 1.0, 5.0]))
