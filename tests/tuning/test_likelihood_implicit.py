@@ -1,5 +1,7 @@
 """The likelihood in C of models with implicit steps: NumPy's, and its slope that of differences."""
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -172,3 +174,25 @@ def test_wrong_code_is_found(monkeypatch):
     likelihood.compile(always=True)
     assert "slope" in likelihood.not_compiled
     assert likelihood.value(plan.start) == expected
+
+
+@pytest.mark.slow
+def test_the_adjoint_of_many_substeps_needs_no_large_stack(monkeypatch):
+    # NumPy's filter would take long.
+    monkeypatch.setattr("qpmhe.tuning.likelihood._Filter._compared_with_numpy", lambda *_: "")
+    n, steps = 8, 1000  # which have a megabyte of Jacobians
+    system = qpmhe.System.from_ode(
+        lambda x: np.roll(x, 1, axis=-1) - 2.0 * x, lambda x: x[..., :1], dt=0.1, n=n, p=1,
+        method="radau", steps=steps)
+    given = qpmhe.tuning.TuningRecord(np.ones((2, 1)), initial_state=np.zeros(n))
+    likelihood, plan = problem(
+        system, given, (np.eye(n), 0.01 * np.eye(n), np.eye(1)), "scalar")
+    likelihood.compile(always=True)
+    assert not likelihood.not_compiled
+    size = threading.stack_size(2**19)
+    try:
+        thread = threading.Thread(target=check_slope, args=(likelihood, plan.start, 2))
+        thread.start()
+        thread.join()
+    finally:
+        threading.stack_size(size)

@@ -1,5 +1,7 @@
 /* The adjoint of an implicit step and of its derivative. */
 
+#include <stdlib.h>
+
 /* Derivatives by x of by_next' next + <by_A, A>, with the step next(x, u) and its derivative A by x;
  * those by u are added. For T_i = d(x + Z_i)/dx and M = I - h (A_ij J_j), M T = (1, ..., 1), so that
  *
@@ -54,16 +56,21 @@ static void mhe_step_back(const real *x, const real *u, real h, const real *by_n
     }
 }
 
-/* Derivatives by z and u, from those by f, A, h and C, which lie behind z. */
+/* Derivatives by z and u, from those by f, A, h and C, which lie behind z. What it keeps of many
+ * substeps of many states is more than a stack holds. */
 static void mhe_call_back(const real *given, const real *u, real *by_z, real *by_u)
 {
     enum { STEPS = $steps };
     const real *by_A = given + 2 * NX, *by_h = by_A + NX * NX, *by_C = by_h + NY, dt = u[NU] / STEPS;
     /* Before each substep: the state, and its derivative by z. Then the substep's own. */
-    real at[(STEPS + 1) * NX], reached[(STEPS + 1) * NX * NX], slopes[STEPS * NX * NX];
+    real *at = malloc(sizeof(real) * ((STEPS + 1) * (NX + NX * NX) + STEPS * NX * NX));
+    real *reached = at + (STEPS + 1) * NX, *slopes = reached + (STEPS + 1) * NX * NX;
     real ahead[NX], held[NX * NX], own[NX * NX], moved[NX], inputs[NU + 1], w[NW];
     const real nothing[NX * NX] = {0};
     mhe_reduced r;
+    for (int k = 0; k <= NU; k++) by_u[k] = 0;
+    for (int j = 0; j < NX; j++) by_z[j] = NAN;
+    if (!at) return;
     memcpy(at, given, sizeof(real) * NX);
     for (int i = 0; i < NX * NX; i++) reached[i] = i / NX == i % NX;
     for (int k = 0; k < STEPS; k++) {
@@ -71,7 +78,6 @@ static void mhe_call_back(const real *given, const real *u, real *by_z, real *by
         $slope(at + k * NX, u, dt, at + (k + 1) * NX, slope);
         mhe_multiply(NX, NX, NX, slope, before, before + NX * NX);
     }
-    for (int k = 0; k <= NU; k++) by_u[k] = 0;
     memcpy(ahead, given + NX, sizeof ahead);
     memcpy(held, by_A, sizeof held);
     for (int k = STEPS - 1; k >= 0; k--) {
@@ -82,6 +88,7 @@ static void mhe_call_back(const real *given, const real *u, real *by_z, real *by
         mhe_add_product(NX, NX, NX, slopes + k * NX * NX, held, own);
         memcpy(held, own, sizeof held);
     }
+    free(at);
     for (int j = 0; j < NX; j++) moved[j] = NAN;
     for (int k = 0; k < NU; k++) inputs[k] = NAN;
     if (mhe_complete(given, u, w, &r) && mhe_reduce(w, u, &r))
