@@ -235,13 +235,13 @@ def label_list(labels: Sequence[str], n: int | None = None) -> list[str]:
     given = list(labels) if np.iterable(labels) and not isinstance(labels, str) else None
     if given is None or not all(isinstance(label, str) for label in given):
         raise InvalidInputError(
-            f"labels are {labels!r}; expected a sequence of strings, one per state."
+            f"labels are {shown(labels)}; expected a sequence of strings, one per state."
         )
     if len(given) != n if n is not None else not given:
         raise ShapeError(
             f"labels are {given}; expected {'at least 1' if n is None else n}, one per state."
         )
-    return given
+    return list(map(str, given))
 
 
 def need(module: str, purpose: str, extra: str = "studies") -> ModuleType:

@@ -281,7 +281,15 @@ class Run:
         return [f"{one.name} ({one.unit})" if one.unit else one.name for one in signals.states]
 
     def keep_times(self, index: pandas.Index, time_unit: Any) -> None:
-        """Take the times of x(0), ..., x(T), where there is no source that knows the unit."""
+        """Take the times of x(0), ..., x(T), where there is no source that knows the unit.
+
+        Parameters
+        ----------
+        index : pandas.Index
+            The times.
+        time_unit : str or pandas.Timedelta
+            The model's unit of time.
+        """
         self.index, self._time_unit = index, unit_name(time_unit)
         self._elapsed = elapsed_times(index, time_unit)
 

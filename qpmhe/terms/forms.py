@@ -178,7 +178,7 @@ class WholeForm:
     def times(self, residuals: Array, weights: Array) -> Array:
         """W r of residuals (K, q)."""
         if weights.ndim == 2:
-            weighted: Array = residuals.dot(weights)
+            weighted: Array = residuals @ weights
             return weighted
         return np.asarray(np.matmul(residuals[:, None, :], weights)[:, 0])
 
@@ -218,7 +218,7 @@ class WholeForm:
 
     def square(self, symmetric: Any, vector: Array) -> float:
         """The form s'Ws of a vector s (n,) and what `symmetric` has made of W."""
-        return float(vector.dot(symmetric).dot(vector))
+        return float(vector @ symmetric @ vector)
 
     def matrix(self, symmetric: Any) -> Array:
         """What `symmetric` has made, as a matrix (n, n)."""

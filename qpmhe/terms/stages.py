@@ -138,7 +138,7 @@ class Stages(Term):
             model.first_gradient[...] = span.gradient_first
             np.add(span.gradient_rest, span.next_gradient_rest, model.inner_gradient)
             model.last_gradient[...] = span.next_gradient_last
-        if form.is_single(weights) or self._usual:
+        if self._usual or form.is_single(weights):
             last = self._rule.band
             np.add(span.panel, self._rule.earlier_bands[len(span.panel)], model.earlier_band)
         else:

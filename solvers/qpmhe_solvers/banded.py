@@ -79,7 +79,7 @@ class BandedSolver(Solver):
             band, flat = found
             if self._solves(band, flat, band[0]):  # else rounding may have decided: see once more
                 return self._sparse.step(flat).reshape(qp.stages, qp.n)
-        if isinstance(qp, SparseQP):
+        if type(qp) is SparseQP:
             return None
         work = self._work
         if work is None or self._size != (qp.stages, qp.n):

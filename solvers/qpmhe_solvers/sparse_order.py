@@ -42,6 +42,8 @@ class SparseOrder:
 
     def band(self, qp: QP, unit: float) -> tuple[Array, Array] | None:
         """``unit`` H as LAPACK's lower band and -``unit`` g in this order; None if of no use."""
+        if type(qp) is QP and qp.n < _LEAST:
+            return None
         flat = qp.band.reshape(-1)
         order = qp.order if isinstance(qp, SparseQP) else self._found(qp, flat)
         if order is None:
@@ -63,8 +65,6 @@ class SparseOrder:
 
     def _found(self, qp: QP, flat: Array) -> Order | None:
         """The order of a QP whose band may have any entry."""
-        if qp.n < _LEAST:
-            return None
         if self._sizes != qp.sizes:
             self._sizes, self._growths, self._known = qp.sizes, 0, None
         order = self._known
