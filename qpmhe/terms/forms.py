@@ -178,7 +178,7 @@ class WholeForm:
     def times(self, residuals: Array, weights: Array) -> Array:
         """W r of residuals (K, q)."""
         if weights.ndim == 2:
-            weighted: Array = residuals @ weights
+            weighted: Array = residuals.dot(weights)
             return weighted
         return np.asarray(np.matmul(residuals[:, None, :], weights)[:, 0])
 
@@ -215,10 +215,6 @@ class WholeForm:
     def symmetric(self, matrix: Array) -> Any:
         """A constant symmetric matrix (n, n), of which there are products."""
         return matrix
-
-    def square(self, symmetric: Any, vector: Array) -> float:
-        """The form s'Ws of a vector s (n,) and what `symmetric` has made of W."""
-        return float(vector @ symmetric @ vector)
 
     def matrix(self, symmetric: Any) -> Array:
         """What `symmetric` has made, as a matrix (n, n)."""
@@ -417,10 +413,6 @@ class SparseForm(WholeForm):
         from scipy.sparse import csr_array  # late: few models need it
 
         return csr_array(matrix)
-
-    def square(self, symmetric: Any, vector: Array) -> float:
-        """See `WholeForm.square`."""
-        return float(symmetric.dot(vector).dot(vector))
 
     def matrix(self, symmetric: Any) -> Array:
         """See `WholeForm.matrix`."""

@@ -133,7 +133,7 @@ class StageTerms:
 
     def linearise(self, model: Model, states: Array, inputs: Array, first: int = 0) -> Array:
         """Set the slopes of successive stages to those of a model; return them, a view."""
-        slopes = self.slopes[first : first + len(states)]
+        slopes = self.slopes[first : first + states.shape[0]]
         a, c = model.linear(states, inputs)
         np.negative(a, slopes[:, : self.n])
         np.negative(c, slopes[:, self.n :])

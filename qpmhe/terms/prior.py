@@ -246,7 +246,7 @@ class Prior(FirstStateTerm):
         """The squared distance of two states, in deviations of the prior."""
         initial = self._initial
         if initial.distance_root is None:
-            return self._rule.form.square(initial.distance, offset)
+            return float(initial.distance.dot(offset).dot(offset))
         seen = initial.distance_root.dot(offset)
         return float(seen.dot(seen))
 
@@ -275,7 +275,7 @@ class Prior(FirstStateTerm):
         rule, root, evaluate = self._rule, self._initial.root, self._rule.evaluate
         if root is None:
             if rule.form.by_entries:  # of a quadratic cost alone
-                return rule.form.square(self.weight, offset)
+                return float(self.weight.dot(offset).dot(offset))
             return float(evaluate(offset, self.weight))
         return float(evaluate(root.dot(offset), np.eye(len(root))))
 
@@ -309,7 +309,7 @@ class Prior(FirstStateTerm):
         rule = self._rule
         offset = trial.trajectory[0] - self.mean if rule.residual is None else self.offset(trial)
         if rule.quadratic and self._initial.root is None:
-            return self.factor * rule.form.square(self.weight, offset)
+            return self.factor * float(self.weight.dot(offset).dot(offset))
         return float(self.factor * self._lost(offset))
 
     def cost_of_candidate(self, candidate: Trial) -> float:

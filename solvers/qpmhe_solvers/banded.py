@@ -12,7 +12,7 @@ from .options import SolverOptions
 from .qp import QP, Array, Places, hessian_entries, rows_entries
 from .solution import Residuals, Solution, SolveStatus
 from .solver import Solver
-from .sparse_order import SparseOrder
+from .sparse_order import LEAST, SparseOrder
 from .sparse_qp import SparseQP
 
 Index = NDArray[np.intp]
@@ -74,12 +74,14 @@ class BandedSolver(Solver):
     def _cholesky(self, qp: QP) -> Array | None:
         # A root is exact for powers of four alone: an odd unit of the cost goes before.
         unit = _COST_UNITS[math.frexp(qp.band.item(0))[1] % 2]
-        found = self._sparse.band(qp, unit)
-        if found is not None:
-            band, flat = found
-            if self._solves(band, flat, band[0]):  # else rounding may have decided: see once more
-                return self._sparse.step(flat).reshape(qp.stages, qp.n)
-        if type(qp) is SparseQP:
+        is_sparse = type(qp) is SparseQP
+        if is_sparse or qp.n >= LEAST:
+            found = self._sparse.band(qp, unit)
+            if found is not None:
+                band, flat = found
+                if self._solves(band, flat, band[0]):  # else rounding may have decided: once more
+                    return self._sparse.step(flat).reshape(qp.stages, qp.n)
+        if is_sparse:
             return None
         work = self._work
         if work is None or self._size != (qp.stages, qp.n):

@@ -10,8 +10,8 @@ from .sparse_qp import Order, SparseQP, narrow, order_of, places_of_states
 
 Index = NDArray[np.intp]
 
-# Below so many unknowns a stage, the order by stages is factorised faster than zeros are counted.
-_LEAST = 40
+#: Below so many unknowns a stage, the order by stages is factorised faster than zeros are counted.
+LEAST = 40
 # A pattern that has grown so often is not searched for again.
 _MOST_GROWTHS = 8
 
@@ -42,8 +42,6 @@ class SparseOrder:
 
     def band(self, qp: QP, unit: float) -> tuple[Array, Array] | None:
         """``unit`` H as LAPACK's lower band and -``unit`` g in this order; None if of no use."""
-        if type(qp) is QP and qp.n < _LEAST:
-            return None
         flat = qp.band.reshape(-1)
         order = qp.order if isinstance(qp, SparseQP) else self._found(qp, flat)
         if order is None:
