@@ -157,13 +157,16 @@ class Examination:
         self.clipped[~np.isfinite(source.measurements).any(axis=0)] = 0.0
         self.base = base = replace(base, measurements=y[part])
         self.null = null = self.bank.run([base])
-        found = finer(self.bank, base, null, steps, self.names)
+        own, found = self.bank, finer(self.bank, base, null, steps, self.names)
         if found is not None:
             self.system, self.bank, self.null = found.system, found.bank, found.filtered
             self.coarse, null = [found.finding], self.null
         self.normalised = null.normalised
         bank, base, null, begin = self._searched()
-        self.faults, self.best, self.unexplained = self._verified(bank, base, null)
+        self.faults, self.best, self.unexplained, corrected = self._verified(bank, base, null)
+        if self.coarse and self.faults and not begin and finer(
+            own, corrected, own.run([corrected]), steps, self.names) is None:
+            self.coarse = []  # only the faults led to states where the steps are too long
         if not self.is_judged and not all(one.is_wrong_unit for one in self.faults):
             self.faults, self.best, self.unexplained = [], null, []
         whole = 0, len(base.measurements) - 1
@@ -188,11 +191,11 @@ class Examination:
 
     def _verified(
         self, bank: FilterBank, base: Hypothesis, null: Filtered
-    ) -> tuple[list[Fault], Filtered, list[tuple[int, int, float, str]]]:
+    ) -> tuple[list[Fault], Filtered, list[tuple[int, int, float, str]], Hypothesis]:
         """Faults; factors of R and Q only if they explain the record.
 
-        Also the filter with them, and what correlation it leaves: sensor, lag, size, and what that
-        tells.
+        Also the filter with them, what correlation it leaves: sensor, lag, size, and what that
+        tells; and the record without them.
         """
         evidence = Evidence(
             bank, base, null, self._starts(), len(self.source.settings.parameters or ())
@@ -208,10 +211,10 @@ class Examination:
                 rest = before[-1].hypothesis if before else base
                 if rest.noise.ndim == base.noise.ndim:
                     rest = replace(rest, noise=base.noise, disturbance=base.disturbance)
-                faults, best = before, bank.run([rest])
+                faults, best, corrected = before, bank.run([rest]), rest
         return faults, best, [
             (*one, why) for one in sorted(coloured, key=lambda one: -abs(one[2]))
-        ]
+        ], corrected
 
     def _searched(self) -> tuple[FilterBank, Hypothesis, Filtered, int]:
         """What is searched for faults, from which sample on: all that has to be, or can be."""
