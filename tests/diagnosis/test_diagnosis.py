@@ -662,3 +662,12 @@ def test_ends_that_rounding_alone_tells_apart_are_not_looked_for_to_and_fro(monk
     monkeypatch.setattr(signatures, "removed", lambda *_: SimpleNamespace(hypothesis=None))
     with pytest.raises(ZeroDivisionError):  # at the end, where the record is filtered with it
         signatures.with_ends(bank, SimpleNamespace(measurements=np.zeros((100, 1))), None, bias)
+
+
+@pytest.mark.slow
+def test_a_wrong_sign_that_leads_to_long_steps_comes_before_them():
+    """With the wrong sign, tanks fill where one step of rk4 is off; with the right one, none is."""
+    _, plant, _ = planted.FAULTS["wrong sign of an input"]
+    case = plant("tanks", 1)
+    first = diagnosed(case).findings[0]
+    assert first.kind == "sign", first.text
