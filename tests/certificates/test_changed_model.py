@@ -126,7 +126,6 @@ def test_no_true_state_is_outside_of_a_box_after_the_change():
     assert outside > 40
 
 
-@pytest.mark.slow
 def test_parts_and_copies_are_for_the_certified_values():
     plant = Plant()
     system, region = plant.system, box(-2.0, 2.0)

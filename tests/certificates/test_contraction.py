@@ -186,7 +186,6 @@ def test_what_raises_or_is_not_finite_is_named_with_the_state():
             question(lost, box(-10.0, 5.001))
 
 
-@pytest.mark.slow
 def test_what_jumps_is_not_certified_from_its_derivatives():
     def compared(place):
         return lambda x: np.array([0.5 * float(x[0]) + (5.0 if x[0] > place else 0.0)])
@@ -289,7 +288,6 @@ def test_proofs_end_with_the_time(monkeypatch):
             question(linear(0.5, 1.0), unit_box(1), seconds=0.5)
 
 
-@pytest.mark.slow
 def test_no_search_is_begun_in_vain():
     with pytest.raises(certificates.OutOfTimeError, match=r"40 states takes about .* s were left"):
         certify_detectability(linear(0.9 * np.eye(40), np.ones((1, 40))), unit_box(40))

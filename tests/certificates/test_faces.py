@@ -180,7 +180,6 @@ def test_no_adversary_leaves_the_bounds_of_a_projected_observer(projected, kind,
         assert (largest > 0.4 * bound.settled.box).all()
 
 
-@pytest.mark.slow
 def test_the_box_counts_in_advance_where_projections_act(projected):
     bound, tubes = projected
     faces = bound.rowwise.faces
@@ -251,7 +250,6 @@ def test_a_monitor_continues_beside_other_directions():
         same.load_state_dict(state | {"oblique": -state["oblique"] - 1.0})
 
 
-@pytest.mark.slow
 def test_a_bound_that_a_larger_ball_reaches_counts_until_the_bounds_have_settled():
     """X begins a little beyond the limit's reach, and within that of 1.05 limits."""
     def bound(X):

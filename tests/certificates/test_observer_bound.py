@@ -122,7 +122,6 @@ def plain(vectors, weight):
     return np.sqrt(np.einsum("...i,ij,...j->...", vectors, weight, vectors))
 
 
-@pytest.mark.slow
 def test_sizes_may_be_lengths_sets_or_vectors(four):
     (four, _), rng, ones = four, np.random.default_rng(1), np.ones((3, 4))
     P, Q, R, V = four.metric, four.stability.Q, four.stability.R, four.stability.V
@@ -175,7 +174,6 @@ def test_no_point_of_the_set_is_farther(n):
         assert float(bound.farthest(b, np.zeros(n))) == pytest.approx(reach, rel=1e-5)
 
 
-@pytest.mark.slow
 def test_what_is_beyond_the_region_does_not_count(four):
     four, z = four[0], np.array([0.4, -0.4, 0.0, 0.0])
     np.testing.assert_array_equal(four.around(1e6, z), (-0.5 * np.ones(4), 0.5 * np.ones(4)))
@@ -252,7 +250,6 @@ def test_a_run_of_another_model_with_the_same_gain_is_refused():
             bound.along(run_of(other), initial_error=0.1)
 
 
-@pytest.mark.slow
 def test_where_the_bound_ends_the_model_need_not_be_defined():
     """The observer leaves the domain of the root, in a run of the certified model."""
     system = qpmhe.System(lambda x: 0.5 * np.sqrt(x) + 0.3, lambda x: 1.0 * x, n=1, p=1)

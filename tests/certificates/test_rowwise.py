@@ -368,7 +368,6 @@ def test_files_and_pickles_keep_the_components(tmp_path):
     np.testing.assert_array_equal(tube.box, other.box)
 
 
-@pytest.mark.slow
 def test_the_monitor_has_the_box_that_the_run_has():
     system, gain, region, w, v, _ = fitzhugh_nagumo()
     bound = bound_of(system, gain, region, w, v)

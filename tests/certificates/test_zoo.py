@@ -62,7 +62,6 @@ def test_an_implicit_step_rests_on_samples_and_says_so(method):
     assert "guarded" not in bound.headline
 
 
-@pytest.mark.slow
 def test_a_chain_with_a_spring_without_length_is_refused():
     """Two masses may be at the same point of the box: f has no value there."""
     chain = qpmhe.models.chain_of_masses(masses=2).system

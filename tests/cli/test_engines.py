@@ -127,7 +127,6 @@ def test_the_command_says_which_engine_ran_and_compile_what_it_made(here):
         assert float(one["cost"]) == pytest.approx(float(two["cost"]), rel=1e-9)
 
 
-@pytest.mark.slow
 @needed
 def test_doctor_says_what_there_is_and_what_each_model_runs(here, monkeypatch):
     models = [f"model.py:{name}" for name in ("make", "asks_for_python", "with_a_branch")]

@@ -157,7 +157,6 @@ def test_the_estimate_of_what_pays_grows_with_the_work():
     assert needed(40, horizon=40) < needed(40)
 
 
-@pytest.mark.slow
 def test_a_long_record_is_compiled_first_and_what_ran_is_pinned(script, cache):
     def prepared(**options):
         mhe = estimator(**options)
@@ -194,7 +193,6 @@ def test_a_long_record_is_compiled_first_and_what_ran_is_pinned(script, cache):
     assert late.engine == "compiled"
 
 
-@pytest.mark.slow
 def test_a_failure_is_forgotten_once_compiling_succeeds(script, cache):
     script.does("exit 1")
     assert estimator().run(RECORD).engine == "python"

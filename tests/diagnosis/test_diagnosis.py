@@ -421,7 +421,6 @@ def test_rows_that_are_missing_or_twice_and_noise_that_changes_against_the_whole
     assert found[0].corrected == pytest.approx(found[1].corrected, rel=1e-8)
 
 
-@pytest.mark.slow
 def test_a_rounded_sensor_that_rests_is_no_fault_and_what_a_gate_rejected_is_noted():
     system = qpmhe.System(lambda x: 0.8 * x, lambda x: x, n=1, p=1)
     y = 0.5 * np.round(3.0 * 0.8 ** np.arange(100) / 0.5)
@@ -485,7 +484,6 @@ def test_what_the_prior_carries_and_claims():
     assert any("The prior says that the observer is off by" in one.text for one in notes)
 
 
-@pytest.mark.slow
 def test_changed_weights_and_compiled_runs_are_judged(monkeypatch):
     monkeypatch.delenv("QPMHE_ENGINE", raising=False)
     case, told = planted.healthy("batch_reactor", 0), []

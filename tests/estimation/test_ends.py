@@ -83,7 +83,6 @@ def test_osqp_at_its_end():
     assert ended
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["python", "compiled"])
 def test_a_kink_that_hundred_qps_do_not_resolve_is_told(engine):
     """Losses of power 1: converged, or said not to be; never silent."""

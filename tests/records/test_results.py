@@ -178,7 +178,6 @@ def test_standard_output_is_the_default_and_files_are_resumed_or_replaced(here):
     assert (piped.stdout_bytes, piped.stderr) == (whole, "")
 
 
-@pytest.mark.slow
 def test_a_kept_run_has_the_dates_of_its_record(here):
     """Those that `run` has of a frame, gaps included; a resumed one, too."""
     index = pd.date_range("2026-05-04 12:00", periods=40, freq="100ms", tz="UTC")

@@ -82,7 +82,6 @@ def test_a_crash_is_a_failed_qp_and_the_next_one_is_solved():
     assert copied._child._process.pid != solver._child._process.pid
 
 
-@pytest.mark.slow
 def test_the_time_limit_ends_a_solver_that_hangs():
     solver = isolated(Hanging, SolverOptions(time_limit=1.0))
     began = time.monotonic()

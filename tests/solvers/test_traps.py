@@ -204,7 +204,6 @@ def test_a_trap_is_named(made, trap, words, capfd):
     assert {name: found[name] for name in others if found[name]} == {}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("flag", ["iteration_cap", "warm_start", "time_limit", "iterate_at_cap"])
 def test_an_option_that_does_not_arrive_has_its_reason(flag):
     with registered(Backend("boasting", Quadprog, "-", **{flag: True})):

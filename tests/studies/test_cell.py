@@ -137,7 +137,6 @@ def test_only_what_was_asked_for_is_measured():
                 assert getattr(row, f"time_{name}") == pytest.approx(quantile, rel=1e-5)
 
 
-@pytest.mark.slow
 def test_whatever_is_raised_becomes_a_row_unless_it_is_the_user(monkeypatch):
     for model, timeout, words in (
         (f"{ODD}:raises", 60.0, "ZeroDivisionError: division by zero"),

@@ -44,7 +44,6 @@ def texts(rows):
     return {answer.question: answer.text for answer in case.answers()}, case
 
 
-@pytest.mark.slow
 def test_fastest_near_the_best_the_observer_and_failures():
     found, case = texts(frame())
     rows = [row for _, row in case.summary.iterrows()]

@@ -257,7 +257,6 @@ def test_outliers_tune_little_where_a_threshold_or_the_observer_doubts_them(rule
     assert isinstance(tuning.cost(), qpmhe.RobustCost) == (rule == "threshold")
 
 
-@pytest.mark.slow
 def test_innovations_that_are_not_white_or_outlying_are_told():
     (y, u), generator = simulated(5, 400), np.random.default_rng(6)
     plain = tuned([(y, u)], structure="scalar")
