@@ -43,7 +43,6 @@ def test_results_are_double_and_the_precision_of_the_process_is_left_alone(doubl
         assert jnp.ones(1).dtype == (np.float32 if double else np.float64)
 
 
-@pytest.mark.slow
 def test_a_large_model_over_a_long_window():
     weights = np.random.default_rng(1).standard_normal((24, 30)) / 5.0
 
@@ -284,7 +283,6 @@ def test_steps_that_jax_does_not_compute_are_those_of_the_rate(options):
             )
 
 
-@pytest.mark.slow
 def test_an_implicit_step_of_a_rate_without_an_expression():
     """Values and derivatives by JAX's programs alone, through an estimator and a copy."""
     def rate(x):

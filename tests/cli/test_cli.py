@@ -131,7 +131,6 @@ def test_our_warnings_are_one_line_and_those_of_others_have_their_place(
     assert printed.index(early) < printed.index("30 samples")
 
 
-@pytest.mark.slow
 def test_compare_report_export_and_a_study_with_an_unknown_key(tmp_path):
     pytest.importorskip("jinja2")
     pytest.importorskip("joblib")

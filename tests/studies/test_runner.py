@@ -69,7 +69,6 @@ def test_a_study_runs_once_and_more_cells_are_added(path, handed):
     assert list(more["finished"])[:4] == list(frame["finished"])
 
 
-@pytest.mark.slow
 def test_a_full_disk_is_reported_and_the_same_call_goes_on(path, monkeypatch):
     plain = store_module._create
 

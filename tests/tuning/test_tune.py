@@ -344,7 +344,6 @@ def test_the_estimators_search_ends_without_a_gradient_that_changes_nothing(seed
     assert found[0][3] == found[1][3]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("errors", [1.5, 3.0])
 def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors, monkeypatch):
     """The second search's weights are less likely, and better by so many standard errors."""
@@ -386,7 +385,6 @@ def test_the_start_stays_where_it_is_better_by_what_matters(share, truth, stays)
     assert not stays or f"is {100.0 * (share - 1.0) / share:.2g} % smaller with these" in text
 
 
-@pytest.mark.slow
 def test_what_was_found_makes_an_estimator_and_compares_horizons():
     y, u = simulated(steps=300)
     tuning = tuned([(y, u)], horizon=6)
@@ -517,7 +515,6 @@ def test_the_initial_state_is_the_records_or_the_systems_where_none_is_given():
     assert alone == qpmhe.tune(system, [record], **given).values
 
 
-@pytest.mark.slow
 def test_a_search_that_was_stopped_resumes(tmp_path, monkeypatch):
     path, real, calls = tmp_path / "search.json", search.search_likelihood, []
 
