@@ -3,6 +3,7 @@
 `make test` runs the first case of every test, and in the folders of `DEEP`, which concern all
 rooms, up to `CASES` of each. They are taken one by one: each is the first of those that have most
 values of parameters which no case before it has; once every value is there, no more are taken.
+Of tests that are marked `whole`, whose cases take less than a second together, all are taken.
 Tests that are marked `slow` are left out. ``--all`` runs everything; ``--rest`` runs everything
 that `make test` does not, and once more, at full length, the tests that are marked `shortened`,
 which do less without ``--all``. C is compiled without optimisation, which takes a third of the
@@ -95,8 +96,9 @@ def chosen(items):
         if item.get_closest_marker("slow") is None:
             tests[item.nodeid.partition("[")[0]].append(item)
     return {
-        item for cases in tests.values()
-        for item in (some(cases) if hasattr(cases[0], "callspec") else cases)
+        item for cases in tests.values() for item in (
+            some(cases) if hasattr(cases[0], "callspec")
+            and cases[0].get_closest_marker("whole") is None else cases)
     }
 
 

@@ -32,7 +32,13 @@ def test_slow():
 @pytest.mark.shortened
 def test_short():
     pass
+
+@pytest.mark.whole
+@pytest.mark.parametrize("word", "pqr")
+def test_whole(word):
+    pass
 """
+WHOLE = {f"test_whole[{word}]" for word in "pqr"}
 
 
 def test_some_cases_of_every_test_run_and_the_rest_is_what_is_left_out(pytester):
@@ -42,28 +48,28 @@ def test_some_cases_of_every_test_run_and_the_rest_is_what_is_left_out(pytester)
         return {one or other for one, other in ran}, output
 
     pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text(encoding="utf-8"))
-    pytester.makeini("[pytest]\nmarkers = slow\n shortened")
+    pytester.makeini("[pytest]\nmarkers = slow\n shortened\n whole")
     (pytester.path / "oracles").mkdir()
     for name in ("test_cases.py", "oracles/test_same_cases.py"):
         (pytester.path / name).write_text(CASES)
     ran, output = run()
     few = {name.rpartition("::")[2] for name in ran if name.startswith("test_cases.py")}
     assert few == {
-        "test_product[u-0]", "test_seeds[0]", "test_one", "test_short",
+        "test_product[u-0]", "test_seeds[0]", "test_one", "test_short", *WHOLE,
     }
     # Oracles have more, each with other values.
     assert {name.rpartition("::")[2] for name in ran if "same_cases.py" in name} == {
         *(f"test_product[{b}-{a}]" for a, b in enumerate("uv")), "test_one", "test_short",
-        *(f"test_seeds[{seed}]" for seed in range(2)),
+        *(f"test_seeds[{seed}]" for seed in range(2)), *WHOLE,
     }
-    assert f"cases: {len(ran)} of 178" in output
+    assert f"cases: {len(ran)} of 184" in output
     assert run("-n", "2")[0] == ran  # processes agree
     every, output = run("--all")
-    assert len(every) == 178
-    assert "cases: 178 of 178" in output
+    assert len(every) == 184
+    assert "cases: 184 of 184" in output
     rest, output = run("--rest")
     assert rest == every - {name for name in ran if "test_short" not in name}
-    assert f"cases: {len(rest)} of 178" in output
+    assert f"cases: {len(rest)} of 184" in output
     # A case that is named runs.
     named = [f"test_cases.py::test_product[{b}-{a}]" for a in range(6) for b in "uvwxyz"]
     named.append("test_cases.py::test_slow")

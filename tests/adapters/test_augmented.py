@@ -58,6 +58,7 @@ def augmented(*functions, **options):
     return qpmhe.augment_parameters(*(functions or (PLANT,)), **{"nominal": [1.0], **options})
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [

@@ -95,6 +95,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("functions", "options", "error", "text"), WRONG)
 def test_wrong_input_and_nan_fail_at_construction(functions, options, error, text):
     with pytest.raises(error, match=text):
@@ -195,6 +196,7 @@ def solver_within(kind):
     return ca.Function("f", [x], [solver(x, x)])
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("kind", ["cvodes", "idas", "collocation", "newton", "kinsol"])
 def test_a_solver_without_c_code_is_refused_by_name_before_casadi_prints(kind, nested, capfd):

@@ -21,6 +21,7 @@ VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
 
 
 @VERSIONS
+@pytest.mark.whole
 @pytest.mark.parametrize("directional", [True, False])
 @pytest.mark.parametrize("how", [
     {}, {"method": "euler", "steps": 2}, {"method": "radau"},
@@ -245,6 +246,7 @@ CHANGED = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", CHANGED)
 def test_fmus_that_are_refused(name):
     changes, text = CHANGED[name]

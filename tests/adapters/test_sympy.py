@@ -30,6 +30,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("f", "h", "x", "words"), WRONG)
 def test_what_does_not_fit_is_refused(f, h, x, words):
     with pytest.raises(ModelError, match=words):

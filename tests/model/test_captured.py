@@ -137,6 +137,7 @@ KINDS = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_changed_value_is_seen(kind):
     f, change = KINDS[kind]()

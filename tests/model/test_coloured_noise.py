@@ -260,6 +260,7 @@ def noisy(system=None, outputs=(0,), **options):
     return qpmhe.augment_noise(base() if system is None else system, outputs, **usual | options)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [

@@ -759,6 +759,7 @@ def made(algebraic=force, k=1, guess=(0.0,), **options):
     )
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("arguments", "error", "words"), [
     ({"guess": [0.0, 1.0]}, ShapeError, r"algebraic_guess has shape \(2,\); expected \(1,\)"),
     ({"guess": [np.nan]}, qpmhe.errors.InvalidInputError, "algebraic_guess"),

@@ -40,6 +40,7 @@ def test_the_corpus_has_fifty_forms_and_almost_all_are_traced():
     assert len(idioms.TRACED) >= 0.9 * count
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("way", idioms.TRACED)
 def test_an_idiom_is_traced_with_the_same_values_and_derivatives(way):
     import casadi
@@ -73,6 +74,7 @@ def test_an_idiom_is_traced_with_the_same_values_and_derivatives(way):
         np.testing.assert_allclose(np.array(slopes(x, u)), differences, 0.0, 1e-7 * scale)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("way", idioms.TRACED)
 def test_a_system_calls_an_idiom_on_one_state_and_on_many_with_the_same_values(way):
     function = idioms.TRACED[way]

@@ -51,6 +51,7 @@ def by_complex_steps(f, x):
     return np.array([np.imag(f(x + 1e-30j * one)).ravel() / 1e-30 for one in np.eye(x.size)]).T
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", FORMS)
 def test_forms_of_a_product_give_the_numbers_of_numpy(name):
     f = FORMS[name]
@@ -157,6 +158,7 @@ GRAPHS = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("name", GRAPHS)
 def test_products_of_casadi_are_one_operation(name, nested):

@@ -19,6 +19,7 @@ B = np.array([[0.5, 0.3], [-0.4, 1.0]])
 BUFFER = np.zeros(2)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("way", PENDULUMS)
 def test_every_way_of_writing_f_gives_equal_values(way):
     f, is_traced = PENDULUMS[way]

@@ -137,6 +137,7 @@ def test_numpy_is_itself_after_a_trace():
 # Models
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", ZOO)
 def test_models_of_the_zoo_are_traced_and_are_the_same(name):
     """At states of a simulation."""

@@ -112,6 +112,7 @@ OPTIONS = [
 ]  # fmt: skip
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("changes", "error", "words"), OPTIONS)
 def test_what_cannot_be_simulated_is_refused(changes, error, words):
     changes = dict(changes)
