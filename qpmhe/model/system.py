@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from inspect import signature
@@ -309,7 +310,10 @@ class System(ContinuousTime):
         try:
             model = self.evaluation.at(x, u)
         except ModelError as error:
-            reason = unsolved_step(self.origin, x, u)
+            reason = ""
+            with suppress(Exception), np.errstate(all="ignore"):  # of the user's functions
+                if not np.isfinite(self.f(x, u)).all():
+                    reason = unsolved_step(self.origin, x, u)
             if not reason:
                 raise
             raise ModelError(reason) from error

@@ -12,20 +12,21 @@ Array = NDArray[np.float64]
 
 # Newton's method of SciPy stops after so many evaluations; what is left then names the equation.
 _EVALUATIONS = 100
+# Where no equation is farther off than this share of its terms, there are stages.
+_SOLVED = 1e-6
 
 
 def unsolved_step(origin: Origin, x: Array, u: Array) -> str:
-    """Why the step of a discretised model has no value at a state (n,) and input (m,).
+    """Why the step of a discretised model is not finite at a state (n,) and input (m,).
 
-    Blank where no step by Newton's method is to blame.
+    Blank where no step by Newton's method is to blame. What the user's functions raise goes on.
     """
     how, rate, dt = origin.how, origin.rate, origin.dt
     if how is None or rate is None or dt is None or not how.is_implicit:
         return ""
     n, equations, method = x.size, origin.equations, how.collocation
     w = x if equations is None else equations.solver.complete(x[None], u[None])[0]
-    with np.errstate(all="ignore"):
-        first = rate(w, u)
+    first = rate(w, u)
     where = f"at the initial state {x.tolist()}"
     if not np.isfinite(first).all():
         return (
@@ -55,14 +56,17 @@ def unsolved_step(origin: Origin, x: Array, u: Array) -> str:
 
     start = np.zeros((stages, w.size))
     start[:, n:] = w[n:] / sizes[n:]
-    with np.errstate(all="ignore"):
-        left = least_squares(residual, start.ravel(), max_nfev=_EVALUATIONS).fun
-    worst = int(np.abs(left.reshape(stages, -1)).max(axis=0).argmax())
+    left = np.abs(least_squares(residual, start.ravel(), max_nfev=_EVALUATIONS).fun)
+    worst = int(left.reshape(stages, -1).max(axis=0).argmax())
     name = f"the rate of x[{worst}]" if worst < n else f"algebraic equation {worst - n}"
+    blame = (
+        f"{name} is the farthest from being satisfied" if left.max() > _SOLVED
+        else "another method finds some, so the start is too far from them"
+    )
     remedies = "take a shorter step (steps=) or another initial state"
     if equations is not None:
         remedies += "; z may have no value within the step (a fold), which no step passes"
     return (
-        f"Newton's method finds no stages of {how.words} in dt = {dt:g} {where}: {name} is the "
-        f"farthest from being satisfied. To help, {remedies}."
+        f"Newton's method finds no stages of {how.words} in dt = {dt:g} {where}: {blame}. "
+        f"To help, {remedies}."
     )

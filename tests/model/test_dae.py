@@ -903,6 +903,24 @@ def test_steps_without_stages_are_named_at_construction(make, words, start):
                 initial_state=start)
 
 
+def raising(x):
+    if float(x[0]) < 0.45:
+        raise ZeroDivisionError("no rate there")
+    return -x
+
+
+@pytest.mark.parametrize(("rate", "h", "words"), [
+    (lambda x: -x, lambda x: np.log(x - 3.0), r"h is \[nan\] at the initial state"),
+    (raising, lambda x: x, "f raised ZeroDivisionError: no rate there"),
+], ids=["output", "rate"])
+def test_newtons_method_is_not_to_blame_for_other_functions(rate, h, words):
+    system = System.from_ode(rate, h, dt=1.0, n=1, p=1, method="radau")
+    cost = QuadraticCost(prior=[[1.0]], disturbance=[[1.0]], noise=[[1.0]])
+    with np.errstate(invalid="ignore"), pytest.raises(ModelError, match=words):
+        MovingHorizonEstimator(
+            system, qpmhe.Luenberger([[0.0]]), cost, horizon=3, initial_state=[0.5])
+
+
 def test_equations_that_raise_are_named_at_construction():
     system = qpmhe.System.from_dae(
         lambda x, z: z - x, lambda x, z: 1 / 0, lambda x, z: x, dt=0.1, n=1, k=1, p=1,
