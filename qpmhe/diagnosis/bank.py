@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -345,15 +343,9 @@ class FilterBank:
         first = _results(total, len(hypotheses), n, p)
         there = np.array([np.isfinite(one.measurements) for one in hypotheses])
         left_out, failed = np.zeros((len(hypotheses), p)), []
-
-        def filtered(k: int) -> tuple[Array, NDArray[np.int64]] | None:
-            results = [] if k else list(vars(first).values())[1:]
-            return library.run(self._in_c(hypotheses[k], unit), results)
-
-        # A call of C lets other threads run; each has its own results.
-        with ThreadPoolExecutor(_threads()) as pool:
-            filters = list(pool.map(filtered, range(len(hypotheses))))
-        for k, found in enumerate(filters):
+        for k, one in enumerate(hypotheses):
+            found = library.run(
+                self._in_c(one, unit), [] if k else list(vars(first).values())[1:])
             if found is None:
                 failed.append(k)
             else:
@@ -454,14 +446,6 @@ class FilterBank:
         # What leaves out most of a sensor does not explain it.
         explains = (left_out <= _MOST_OUTLIERS * there.sum(axis=1)).all(axis=1)
         logs[:, ~explains | ~np.isfinite(logs).all(axis=0)] = -np.inf
-
-
-def _threads() -> int:
-    """As many as there are processors, or as OMP_NUM_THREADS allows."""
-    usable = getattr(os, "sched_getaffinity", None)
-    count = len(usable(0)) if usable else os.cpu_count() or 1
-    allowed = os.environ.get("OMP_NUM_THREADS", "")
-    return min(count, int(allowed)) if allowed.isdecimal() and int(allowed) else count
 
 
 def _results(total: int, count: int, n: int, p: int) -> Filtered:
