@@ -36,9 +36,9 @@ static real mhe_form(int n, const real *M, const real *a)
 /* Whether all are finite, of numbers whose squares may overflow. */
 static int mhe_each_finite(int n, const real *a)
 {
-    real sum = 0;
-    for (int i = 0; i < n; i++) sum += 0 * a[i];
-    return sum == 0;
+    int others = 0; /* in no order, unlike a sum */
+    for (int i = 0; i < n; i++) others |= !(0 * a[i] == 0);
+    return !others;
 }
 
 /* out = A B for A (m, k) and B (k, n). */

@@ -1,8 +1,6 @@
 /* A record under a hypothesis: the extended Kalman filter of qpmhe/diagnosis/bank.py, which is
  * linearised behind its measurement update for the step, in units of the usual noise. */
 
-#include <float.h>
-
 /* A hypothesis: the record as it has it, and the filter's numbers. */
 typedef struct {
     const real *start, *prior, *disturbance, *noise; /* R in units: one, or one of each sample */
@@ -81,39 +79,6 @@ static void mhe_correct_covariance(const real *C, const real *restrict seen,
     mhe_symmetrise(NX, P);
 }
 
-/* B := S^-1 B and e := S^-1 e for B (NY, NX), as `mhe_solve_for`, which does not know the sizes. */
-static void mhe_solve_gain(const real *S, real *restrict B, real *restrict e)
-{
-    for (int r = 1; r < NY; r++) {
-        real row[NX];
-        for (int c = 0; c < NX; c++) row[c] = B[r * NX + c];
-        for (int j = 0; j < r; j++) {
-            const real factor = S[j * NY + r] / S[j * NY + j];
-            for (int c = 0; c < NX; c++) row[c] -= factor * B[j * NX + c];
-            e[r] -= factor * e[j];
-        }
-        for (int c = 0; c < NX; c++) B[r * NX + c] = row[c];
-    }
-    for (int j = NY - 1; j >= 0; j--) {
-        real row[NX];
-        for (int c = 0; c < NX; c++) row[c] = B[j * NX + c];
-        for (int r = j + 1; r < NY; r++) {
-            for (int c = 0; c < NX; c++) row[c] -= S[j * NY + r] * B[r * NX + c];
-            e[j] -= S[j * NY + r] * e[r];
-        }
-        for (int c = 0; c < NX; c++) B[j * NX + c] = row[c] / S[j * NY + j];
-        e[j] /= S[j * NY + j];
-    }
-}
-
-/* Whether all are finite: in no order, unlike a sum. */
-static int mhe_finite(int n, const real *a)
-{
-    int infinite = 0;
-    for (int i = 0; i < n; i++) infinite |= !(fabs(a[i]) <= DBL_MAX);
-    return !infinite;
-}
-
 /* Correct x and P by a sample, and add to its log likelihood; 0 where that fails. */
 static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *P, real *log_,
                                  int64_t *left_out, const mhe_filtered *out)
@@ -164,8 +129,8 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
         }
         solved[i] = e[i];
     }
-    if (!mhe_all_finite(NX, x) || !mhe_all_finite(NY, e) || !mhe_finite(NY * NY, S) ||
-        !mhe_finite(NY * NX, C))
+    if (!mhe_all_finite(NX, x) || !mhe_all_finite(NY, e) || !mhe_each_finite(NY * NY, S) ||
+        !mhe_each_finite(NY * NX, C))
         return 0;
     if (out) {
         memcpy(out->states + (size_t)t * NX, x, sizeof(real) * NX);
@@ -178,7 +143,8 @@ static int mhe_hypothesis_update(const mhe_hypothesis *r, int t, real *x, real *
         if (!mhe_invert(NY, copy, out->weights + (size_t)t * NY * NY)) return 0;
     }
     if (!mhe_decompose(NY, S)) return 0;
-    mhe_solve_gain(S, K, solved);
+    mhe_solve_for(NY, S, NX, K);
+    mhe_solve_for(NY, S, 1, solved);
     real cost = 0;
     for (int i = 0; i < NY; i++) {
         cost += (real)0.5 * (e[i] * solved[i] + log(S[i * NY + i]));
