@@ -58,8 +58,8 @@ class Directions:
     def terms_of(self, system: System, cost: Cost) -> tuple[TermForm, ...]:
         """The terms of J that not every estimator has."""
         prior = PriorCost(system, self.observer, cost)
-        basis = Constraints(system, cost, prior).basis
-        forms, rows = CostSum(system, cost, prior, basis).c_forms, self.rows_of(system, cost)
+        constraints, rows = Constraints(system, cost, prior), self.rows_of(system, cost)
+        forms = CostSum(system, cost, prior, lambda: constraints.basis).c_forms
         return forms if cost.space is None else tuple(
             one._replace(data=self._on_d(one.data, rows)) if one.name == SOFT else one
             for one in forms

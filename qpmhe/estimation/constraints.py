@@ -78,9 +78,9 @@ class Constraints:
 
     @property
     def basis(self) -> Array:
-        """The directions (n, n - k) in which there are disturbances."""
+        """The directions (n, n - k) in which there are disturbances; made when first asked for."""
         if self._basis is None:
-            return np.delete(np.eye(self._n), self.noise_free, axis=1)
+            self._basis = np.delete(np.eye(self._n), self.noise_free, axis=1)
         return self._basis
 
     def _lift(self, system: System, space: Subspace, spread: Array) -> None:

@@ -63,12 +63,6 @@ class Memory(NamedTuple):
     window: Window
 
 
-def _any(form: WholeForm) -> bool:
-    """Whether a form fits, where all do."""
-    del form
-    return True
-
-
 class PythonEngine:
     """The step in Python: window, problem, optimizer, estimate.
 
@@ -132,7 +126,7 @@ class PythonEngine:
         self._nearby = _nearby(system)
 
     def _tools_for(
-        self, usual: Conditions, fits: Callable[[WholeForm], bool] = _any, /
+        self, usual: Conditions, fits: Callable[[WholeForm], bool] = lambda _: True, /
     ) -> Tools:
         """What a step uses under these usual conditions, with matrices in a form that fits."""
         settings = self._settings
@@ -555,7 +549,7 @@ class PythonEngine:
         self.replace(memory)
 
     def _checked_memory(
-        self, state: dict[str, Any], fits: Callable[[WholeForm], bool] = _any
+        self, state: dict[str, Any], fits: Callable[[WholeForm], bool] = lambda _: True
     ) -> Memory:
         """The memory in a state, with matrices in a form that fits."""
         with_terms, given, places = state["linearized"], state["window"], state.get("places", {})

@@ -156,11 +156,14 @@ def _at_hand(
     parts = system, observer, cost, settings, initial_state
     make = _ENGINES.get("compiled")
     if make is not None and not settings.needs_python and not python_only():
-        if has_enough_states(system.n) and (found := PythonEngine(*parts)).outpaces_c:
+        found = PythonEngine(*parts) if has_enough_states(system.n) else None
+        if found is not None and found.outpaces_c:
             return found
         # Nobody asked for this engine; what is wrong with the arguments, the other reports.
         with suppress(Exception):
             return make(*parts)
+        if found is not None:
+            return found
     return PythonEngine(*parts)
 
 

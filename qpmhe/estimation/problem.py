@@ -48,7 +48,9 @@ class Formulation:
         self.constraints = Constraints(system, cost, prior)
         self.constrained = bool(self.constraints)
         #: J.
-        self.sum = CostSum(system, cost, prior, self.constraints.basis, self.form)
+        self.sum = CostSum(
+            system, cost, prior, lambda: self.constraints.basis, self.form
+        )
 
     def problem(self, window: Window) -> Problem:
         """The problem of the present window."""

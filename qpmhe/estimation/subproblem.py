@@ -158,7 +158,7 @@ class Subproblem:
     def metric(self, problem: Problem, trial: Trial) -> Metric:
         """The metric of the damping of the QP that is around a trial."""
         form, slopes, weights = self._form, self._minus_jacobian, trial.weights
-        freed = form.freed(slopes, weights, problem.constraints.basis)
+        freed = form.freed(slopes, weights, lambda: problem.constraints.basis)
         information = diagonal_of_first(problem.terms, trial)
         found = information + freed.information
         if np.isfinite(found).all():

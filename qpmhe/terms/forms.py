@@ -127,15 +127,15 @@ class WholeForm:
         found: Array = np.matmul(forces[..., None, :], slopes[..., : self.n, :])[..., 0, :]
         return found
 
-    def freed(self, slopes: Array, weights: Array, basis: Array) -> Freed:
-        """What is free where the disturbances are, in the directions ``basis``."""
-        n, count = self.n, len(slopes)
+    def freed(self, slopes: Array, weights: Array, basis: Callable[[], Array]) -> Freed:
+        """What is free where the disturbances are, in the directions that ``basis`` makes."""
+        n, count, free = self.n, len(slopes), basis()
         weights = np.broadcast_to(weights, (count, *weights.shape[-2:]))
         a, c, q = -slopes[:, :n], slopes[:, n:], weights[:, :n, :n]
         spread, information = np.full((count, n, n), np.nan), np.full(n, np.nan)
         with suppress(np.linalg.LinAlgError):
-            eyes = np.broadcast_to(basis.T, (count, *basis.T.shape))
-            spread = basis @ np.linalg.solve(basis.T @ q @ basis, eyes)
+            eyes = np.broadcast_to(free.T, (count, *free.T.shape))
+            spread = free @ np.linalg.solve(free.T @ q @ free, eyes)
             seen = c.transpose(0, 2, 1) @ weights[:, n:, n:] @ c
             information = window_information(a, seen, spread).diagonal()
         return Freed(lambda i, force: np.asarray(spread[i] @ force), information)
@@ -147,7 +147,7 @@ class WholeForm:
         return cost.stage_weight
 
     def weight(self, cost: Cost, noise: Array | None, disturbance: Array | None) -> Array:
-        """That of a sample with weights of its own, None for a usual one."""
+        """The weight of (w, v) at a sample that brings its own; None stands for a usual one."""
         return cost.joint_weight(noise, disturbance)
 
     def partial_weight(
@@ -338,7 +338,7 @@ class SparseForm(WholeForm):
         """See `WholeForm.minus_a_transposed`."""
         return self._products.minus_a_transposed(slopes, forces)
 
-    def freed(self, slopes: Array, weights: Array, basis: Array) -> Freed:
+    def freed(self, slopes: Array, weights: Array, basis: Callable[[], Array]) -> Freed:
         """See `WholeForm.freed`; all directions are free."""
         information = np.full(self.n, np.nan)
         with suppress(np.linalg.LinAlgError):

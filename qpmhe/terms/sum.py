@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -84,14 +84,14 @@ class CostSum:
         Those of the estimator.
     prior : PriorCost
         The prior of its windows.
-    basis : (n, r) array
-        The directions in which there are disturbances.
+    basis : callable
+        Makes the directions (n, r) in which there are disturbances, where a term asks for them.
     form : WholeForm, optional
         How matrices are held.
     """
 
     def __init__(
-        self, system: System, cost: Cost, prior: PriorCost, basis: Array,
+        self, system: System, cost: Cost, prior: PriorCost, basis: Callable[[], Array],
         form: WholeForm | None = None,
     ) -> None:
         form = form or WholeForm(system.n, system.p)
@@ -99,7 +99,7 @@ class CostSum:
         #: The terms that not every estimator has, in the order of the sum.
         self._further: list[TermRule] = [
             one for kind in KINDS if kind.belongs(system, cost)
-            if (one := kind.of(system, cost, prior.covariance, basis)) is not None
+            if (one := kind.of(system, cost, prior.covariance, basis())) is not None
         ]
         #: The soft sets and soft constraints; None without any.
         self.penalties: Penalties | None = next(

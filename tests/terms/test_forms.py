@@ -120,8 +120,8 @@ def test_so_is_what_is_free_where_disturbances_are(seed):
         for form in (both.sparse, both.whole)
     )
     eye = np.eye(both.n)
-    found = both.sparse.freed(both.entries, mine, eye)
-    expected = both.whole.freed(both.slopes, theirs, eye)
+    found = both.sparse.freed(both.entries, mine, lambda: eye)
+    expected = both.whole.freed(both.slopes, theirs, lambda: eye)
     # What the data say is a difference of the Hessian's block and what later states take of it.
     size = np.abs(both.slopes).max() ** 2 * np.abs(theirs).max() * (both.n + both.p)
     assert found.information == pytest.approx(expected.information, rel=1e-10, abs=1e-13 * size)
