@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
+from contextlib import suppress
 from timeit import repeat
 from typing import Annotated
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -24,13 +24,12 @@ from ..costs import QuadraticCost
 from ..errors import QpmheError
 from ..estimation.estimator import MovingHorizonEstimator
 from ..estimation.step_length import step_errors
-from ..model.system import System
+from ..model.discretize import Discretization
 from ..models import catalogue
 from ..observers import Luenberger
 from ..records.record_model import load_record_model
 from ..studies.environment import environment
 
-Array = NDArray[np.float64]
 # Steps that are timed; the least time counts.
 _TRIALS = 20
 _GOOD, _BAD = "[green]ok[/]", "[yellow]--[/]"
@@ -101,22 +100,26 @@ def _steps(estimator: MovingHorizonEstimator) -> list[tuple[str, ...]]:
         rows.append((
             how.method, str(how.steps), f"[{color}]{error.deviations:.2g}[/]",
             f"at most {error.most:g}",
-            _time(system if own else system.discretized(*how), estimator.initial_state),
+            _time(estimator, None if own else how),
         ))
     return rows or [(
-        f"{system.method}", f"{system.steps}", "unknown", "",
-        _time(system, estimator.initial_state),
+        f"{system.method}", f"{system.steps}", "unknown", "", _time(estimator, None)
     )]
 
 
-def _time(system: System | None, x: Array) -> str:
-    """How long one step takes, as an estimator evaluates it."""
-    if system is None:
-        return ""
-    made, u = system.evaluated_by(system.model()), np.zeros(system.m)
-    with np.errstate(all="ignore"):
+def _time(estimator: MovingHorizonEstimator, how: Discretization | None) -> str:
+    """How long one step takes by another discretisation, or its own; blank where it fails."""
+    with suppress(Exception), np.errstate(all="ignore"):
+        own = estimator.system
+        system = own if how is None else own.discretized(*how)
+        if system is None:
+            return ""
+        made, x = system.evaluated_by(system.model()), estimator.initial_state
+        u = np.zeros(system.m)
+        u[estimator.inputs :] = estimator.settings.parameters
         best = min(repeat(lambda: made.f(x, u), number=1, repeat=_TRIALS))
-    return f"{1e6 * best:.3g} us"
+        return f"{1e6 * best:.3g} us"
+    return ""
 
 
 def _machine() -> Table:
