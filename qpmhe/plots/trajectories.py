@@ -187,7 +187,7 @@ def _checked_covariances(values: ArrayLike, length: int, n: int) -> Array:
     if found.shape not in ((length, n, n), (length - 1, n, n)):
         raise ShapeError(
             f"covariances have shape {found.shape}; expected ({length}, {n}, {n}), one for each "
-            "time, or one less, without that of the first."
+            f"time, or ({length - 1}, {n}, {n}), none for the first time."
         )
     return found
 

@@ -151,7 +151,7 @@ class StageWeights:
         return found
 
     def fit(self, disturbance: Array | None, noise: Array | None) -> bool:
-        """Whether all of these weights, if they are given, is in the pattern."""
+        """Whether these weights, where they are given, have no entry outside of the pattern."""
         first = self._of_w
         for one, part, start in (
             (disturbance, slice(first), 0), (noise, slice(first, None), self.n)
@@ -199,7 +199,7 @@ class StageProducts:
     weights : StageWeights
         The weights.
     prior : array
-        The prior's weight (n, n), whose pattern is added to that of the panels.
+        The prior's weight (n, n): the panels have its entries, too.
     """
 
     def __init__(self, n: int, slopes: Entries, weights: StageWeights, prior: Array) -> None:

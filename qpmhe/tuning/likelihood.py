@@ -250,7 +250,7 @@ class _Filter:
         return bool(running > _PAYS * (_LIBRARY + within * _COMPILING))
 
     def compile(self, weights: Weights, one: Data) -> None:
-        """Compile the filter, compared with the one that there is on a record's first samples."""
+        """Compile the filter, and compare it with the present one on a record's first samples."""
         first = one.first(_COMPARED)
         chosen = np.ones(len(first), np.bool_)
         compared = self._compared_with_numpy if self._step is None else self._compared_with_casadi

@@ -111,7 +111,7 @@ class SparseQP(QP):
     pattern : Pattern
         Which entries of each stage's panel may be other than 0.
     order : Order
-        That of the pattern for so many stages.
+        The order of the pattern for this number of stages.
 
     Attributes
     ----------
