@@ -3,7 +3,9 @@
 N stages with the states x(i) and the disturbances w(i) as controls,
     x(i+1) = f(x(i), u(i)) + w(i),
 with the linear outputs C x as a linear least-squares cost of v, w and, at the first stage, of
-x(0) - prior. u(i) are acados' parameters. The matrices are column-major. */
+x(0) - prior. u(i) are acados' parameters. The matrices are column-major. Bounds of states and
+functions g(x) <= 0 are hard, or have slacks with the cost linear s + quadratic s^2; acados
+minimises half of J. */
 
 #include <stdlib.h>
 #include <string.h>
@@ -11,12 +13,16 @@ x(0) - prior. u(i) are acados' parameters. The matrices are column-major. */
 #include "acados_c/ocp_nlp_interface.h"
 
 /* CasADi's functions, which stand above: window_step of (x, w, u) to f(x, u) + w, and
-window_step_jac, which also has the transposed Jacobian by (w, x). */
+window_step_jac, which also has the transposed Jacobian by (w, x). Likewise window_rows of
+(x, w, z, u) to g(x), where z is empty, and window_rows_jac. */
 
 typedef struct {
     int stages, n, p, m;
     int bounded, controls;  /* bounded states and disturbances a stage */
     int bounded_last;       /* bounded states of the last stage */
+    int rows;               /* functions a stage */
+    int soft;               /* whether bounds of states and functions have slacks */
+    double linear, quadratic;
     int capped;             /* one QP, or converged */
     double smallest;        /* a step that is taken for convergence */
 } Sizes;
@@ -37,51 +43,111 @@ typedef struct {
     ocp_nlp_out *out;
     void *options;
     ocp_nlp_solver *solver;
-    external_function_external_param_casadi *steps, *slopes;
+    external_function_external_param_casadi *steps, *slopes, *rows, *row_slopes;
     double *reference;
     const double **arguments;
     double **results, *work;
     int *counts;
 } Window;
 
+static int bounded(const Sizes *s, int i)
+{
+    return i < s->stages ? s->bounded : s->bounded_last;
+}
+
 static void dimensions(Window *one)
 {
     const Sizes *s = &one->sizes;
     int N = s->stages, last = N + 1, zero = 0;
     int *all = calloc((size_t)5 * last, sizeof(int));
-    int *nx = all, *nu = nx + last, *none = nu + last, *np = none + last;
+    int *nx = all, *nu = nx + last, *none = nu + last, *np = none + last, *ns = np + last;
     for (int i = 0; i <= N; i++) {
         nx[i] = s->n;
+        ns[i] = s->soft ? bounded(s, i) + s->rows : 0;
         nu[i] = i < N ? s->n : 0;
         np[i] = s->m;
     }
     ocp_nlp_dims_set_opt_vars(one->config, one->dims, "nx", nx);
     ocp_nlp_dims_set_opt_vars(one->config, one->dims, "nu", nu);
     ocp_nlp_dims_set_opt_vars(one->config, one->dims, "nz", none);
-    ocp_nlp_dims_set_opt_vars(one->config, one->dims, "ns", none);
+    ocp_nlp_dims_set_opt_vars(one->config, one->dims, "ns", ns);
     ocp_nlp_dims_set_opt_vars(one->config, one->dims, "np", np);
     ocp_nlp_dims_set_global(one->config, one->dims, "np_global", 0);
     ocp_nlp_dims_set_global(one->config, one->dims, "n_global_data", 0);
     for (int i = 0; i <= N; i++) {
         int ny = i == N ? 0 : i ? s->p + s->n : s->p + 2 * s->n;
-        int nbx = i < N ? s->bounded : s->bounded_last, nbu = i < N ? s->controls : 0;
+        int nbx = bounded(s, i), nbu = i < N ? s->controls : 0, nh = s->rows;
         ocp_nlp_dims_set_constraints(one->config, one->dims, i, "nbx", &nbx);
         ocp_nlp_dims_set_constraints(one->config, one->dims, i, "nbu", &nbu);
         ocp_nlp_dims_set_constraints(one->config, one->dims, i, "ng", &zero);
-        ocp_nlp_dims_set_constraints(one->config, one->dims, i, "nh", &zero);
+        ocp_nlp_dims_set_constraints(one->config, one->dims, i, "nh", &nh);
+        if (s->soft) {
+            ocp_nlp_dims_set_constraints(one->config, one->dims, i, "nsbx", &nbx);
+            ocp_nlp_dims_set_constraints(one->config, one->dims, i, "nsh", &nh);
+        }
         ocp_nlp_dims_set_cost(one->config, one->dims, i, "ny", &ny);
     }
     free(all);
 }
 
-/* The last stage has no cost: no measurement follows it. */
+/* g(x) <= 0 at all stages, and the costs of slacks. */
+static void inequalities(Window *one)
+{
+    const Sizes *s = &one->sizes;
+    int many = s->rows + (s->bounded > s->bounded_last ? s->bounded : s->bounded_last);
+    double *low = calloc(many, sizeof *low), *high = calloc(many, sizeof *high);
+    double *linear = calloc(many, sizeof *linear), *quadratic = calloc(many, sizeof *quadratic);
+    int *which = calloc(many, sizeof *which);
+    external_function_opts options;
+    external_function_opts_set_to_default(&options);
+    options.external_workspace = true;
+    for (int k = 0; k < many; k++) {
+        low[k] = -ACADOS_INFTY;
+        linear[k] = 0.5 * s->linear;
+        quadratic[k] = s->quadratic;
+        which[k] = k;
+    }
+    one->rows = calloc(s->stages + 1, sizeof *one->rows);
+    one->row_slopes = calloc(s->stages + 1, sizeof *one->row_slopes);
+    for (int i = 0; i <= s->stages; i++) {
+        if (s->rows) {
+            TAKE(one->rows + i, window_rows, external_param_casadi, &options);
+            TAKE(one->row_slopes + i, window_rows_jac, external_param_casadi, &options);
+            ocp_nlp_constraints_model_set_external_param_fun(
+                one->config, one->dims, one->in, i, "nl_constr_h_fun", one->rows + i);
+            ocp_nlp_constraints_model_set_external_param_fun(
+                one->config, one->dims, one->in, i, "nl_constr_h_fun_jac", one->row_slopes + i);
+            ocp_nlp_constraints_model_set(
+                one->config, one->dims, one->in, one->out, i, "lh", low);
+            ocp_nlp_constraints_model_set(
+                one->config, one->dims, one->in, one->out, i, "uh", high);
+        }
+        if (s->soft) {
+            ocp_nlp_constraints_model_set(
+                one->config, one->dims, one->in, one->out, i, "idxsbx", which);
+            ocp_nlp_constraints_model_set(
+                one->config, one->dims, one->in, one->out, i, "idxsh", which);
+            ocp_nlp_cost_model_set(one->config, one->dims, one->in, i, "zl", linear);
+            ocp_nlp_cost_model_set(one->config, one->dims, one->in, i, "zu", linear);
+            ocp_nlp_cost_model_set(one->config, one->dims, one->in, i, "Zl", quadratic);
+            ocp_nlp_cost_model_set(one->config, one->dims, one->in, i, "Zu", quadratic);
+        }
+    }
+    free(low);
+    free(high);
+    free(linear);
+    free(quadratic);
+    free(which);
+}
+
+/* The last stage has no cost of v and w: no measurement follows it. */
 static void cost(Window *one, const double *const *first, const double *const *other)
 {
     static const char *names[] = {"Vx", "Vu", "W"};
-    for (int i = 0; i < one->sizes.stages; i++) {
+    for (int i = 0; i <= one->sizes.stages; i++) {
         double scaling = 1.0;
         ocp_nlp_cost_model_set(one->config, one->dims, one->in, i, "scaling", &scaling);
-        for (int k = 0; k < 3; k++)
+        for (int k = 0; k < 3 && i < one->sizes.stages; k++)
             ocp_nlp_cost_model_set(
                 one->config, one->dims, one->in, i, names[k], (void *)(i ? other : first)[k]);
     }
@@ -114,7 +180,7 @@ static void model(Window *one)
 static void set_bounds(Window *one)
 {
     const Sizes *s = &one->sizes;
-    for (int i = 0; i <= s->stages && (i < s->stages ? s->bounded : s->bounded_last); i++) {
+    for (int i = 0; i <= s->stages && bounded(s, i); i++) {
         ocp_nlp_constraints_model_set(one->config, one->dims, one->in, one->out, i, "lbx",
                                       one->arrays.lower + i * s->bounded);
         ocp_nlp_constraints_model_set(one->config, one->dims, one->in, one->out, i, "ubx",
@@ -153,7 +219,7 @@ void *window_make(const Sizes *sizes, const Arrays *arrays, const double *const 
     model(one);
     cost(one, first, other);
     for (int i = 0; i <= N; i++) {
-        if (i < N ? sizes->bounded : sizes->bounded_last)
+        if (bounded(sizes, i))
             ocp_nlp_constraints_model_set(
                 one->config, one->dims, one->in, one->out, i, "idxbx", (void *)states);
         if (i < N && sizes->controls) {
@@ -166,14 +232,17 @@ void *window_make(const Sizes *sizes, const Arrays *arrays, const double *const 
         }
     }
     set_bounds(one);
+    inequalities(one);
     one->options = ocp_nlp_solver_opts_create(one->config, one->dims);
     /* The fastest of HPIPM's modes leaves the multipliers of the dynamics undetermined, so that no
-       residual tells when SQP has converged; the step does. */
-    int most = 100, hot = 2;
+       residual tells when SQP has converged; the step does. With hard nonlinear rows, SQP does not
+       end in one window of a benchmark if its QPs start at all of the solution before; without its
+       slacks and multipliers they take as long. */
+    int most = 100, warm = sizes->rows ? 1 : 2;
     double complementarity = 1e-6;
     ocp_nlp_solver_opts_set(one->config, one->options, "qp_hpipm_mode", (void *)"SPEED_ABS");
     ocp_nlp_solver_opts_set(one->config, one->options, "qp_cond_N", &N);
-    ocp_nlp_solver_opts_set(one->config, one->options, "qp_warm_start", &hot);
+    ocp_nlp_solver_opts_set(one->config, one->options, "qp_warm_start", &warm);
     ocp_nlp_solver_opts_set(one->config, one->options, "qp_tol_comp", &complementarity);
     if (!sizes->capped) {
         double smallest = sizes->smallest;
@@ -233,6 +302,10 @@ void window_free(Window *one)
         external_function_external_param_casadi_free(one->steps + i);
         external_function_external_param_casadi_free(one->slopes + i);
     }
+    for (int i = 0; one->sizes.rows && i <= one->sizes.stages; i++) {
+        external_function_external_param_casadi_free(one->rows + i);
+        external_function_external_param_casadi_free(one->row_slopes + i);
+    }
     ocp_nlp_solver_destroy(one->solver);
     ocp_nlp_solver_opts_destroy(one->options);
     ocp_nlp_in_destroy(one->in);
@@ -242,6 +315,8 @@ void window_free(Window *one)
     ocp_nlp_plan_destroy(one->plan);
     free(one->steps);
     free(one->slopes);
+    free(one->rows);
+    free(one->row_slopes);
     free(one->reference);
     free(one->arguments);
     free(one->results);

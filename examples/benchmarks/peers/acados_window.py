@@ -18,8 +18,9 @@ __all__ = ["Acados", "Bounds"]
 class _Sizes(ctypes.Structure):
     _fields_: ClassVar = [
         *((name, ctypes.c_int) for name in (
-            "stages", "n", "p", "m", "bounded", "controls", "bounded_last", "capped",
+            "stages", "n", "p", "m", "bounded", "controls", "bounded_last", "rows", "soft",
         )),
+        ("linear", ctypes.c_double), ("quadratic", ctypes.c_double), ("capped", ctypes.c_int),
         ("smallest", ctypes.c_double),
     ]
 
@@ -88,12 +89,17 @@ class Acados(Peer):
 
     def build(
         self, step: Any, output: Any, cost: Any, sizes: tuple[int, int, int, int],
-        bounds: Bounds | None = None,
+        bounds: Bounds | None = None, rows: Any = None,
+        penalty: tuple[float, float] | None = None,
     ) -> None:
-        """The same of functions of CasADi columns, a quadratic cost and N, n, p and m."""
+        """The same of functions of CasADi columns, a quadratic cost and N, n, p and m.
+
+        ``rows`` is a function of x whose values are at most 0. With a penalty, linear and
+        quadratic, these rows and the bounds of states are soft.
+        """
         count, n, p, m = sizes
         slope, self._offset = _linear(output, n)
-        library = _library(step, n, m)
+        library, functions = _library(step, rows, n, m)
         bounds = bounds or Bounds((), np.zeros((count + 1, 0)), np.zeros((count + 1, 0)))
         self._states = np.zeros((count + 1, n))
         self._disturbances = np.zeros((count, n))
@@ -120,7 +126,8 @@ class Acados(Peer):
             limited = limited[:0]
         made = _Sizes(
             count, n, p, m, len(bounds.states), len(limited),
-            len(bounds.states) if bounds.last else 0, self.capped, self.smallest,
+            len(bounds.states) if bounds.last else 0, functions, penalty is not None,
+            *(penalty or (0.0, 0.0)), self.capped, self.smallest,
         )
         library.window_make.restype = ctypes.c_void_p
         matrices = [_pointers([np.asfortranarray(a) for a in three]) for three in (first, other)]
@@ -172,17 +179,20 @@ def _linear(output: Any, n: int) -> tuple[Array, Array]:
     return at[1].full(), at[0].full().ravel()
 
 
-def _library(step: Any, n: int, m: int) -> ctypes.CDLL:
-    """The model's functions and the calls of acados, compiled together."""
+def _library(step: Any, rows: Any, n: int, m: int) -> tuple[ctypes.CDLL, int]:
+    """The model's functions and the calls of acados, compiled together, and the number of rows."""
     import casadi as ca
 
-    x, w, u = ca.SX.sym("x", n), ca.SX.sym("w", n), ca.SX.sym("u", m)
+    x, w, u, z = ca.SX.sym("x", n), ca.SX.sym("w", n), ca.SX.sym("u", m), ca.SX.sym("z", 0)
     moved = step(x, u) + w
-    slope = ca.densify(ca.jacobian(moved, ca.vertcat(w, x)).T)
+    row = ca.SX.zeros(1) if rows is None else ca.vertcat(rows(x))
+    slopes = [ca.densify(ca.jacobian(one, ca.vertcat(w, x)).T) for one in (moved, row)]
     return acados_library([
         ca.Function("window_step", [x, w, u], [moved]),
-        ca.Function("window_step_jac", [x, w, u], [moved, slope]),
-    ], "acados_window.c")
+        ca.Function("window_step_jac", [x, w, u], [moved, slopes[0]]),
+        ca.Function("window_rows", [x, w, z, u], [row]),
+        ca.Function("window_rows_jac", [x, w, z, u], [row, slopes[1], ca.SX.zeros(0, row.numel())]),
+    ], "acados_window.c"), 0 if rows is None else row.numel()
 
 
 def _diagonal(*blocks: Array) -> Array:
