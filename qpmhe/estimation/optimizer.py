@@ -561,17 +561,23 @@ class Optimizer:
     def _softened_solution(self, qp: QP, outcome: Outcome) -> Solution | None:
         """The solution of a QP with its soft rows, if there are any; None if no time is left.
 
-        Where the solution without them violates none, it is the solution with them, too.
+        Where the solution without them violates none, it is the solution with them, too. Where no
+        backend was named, the rows that are active are found without slack variables first.
         """
-        solution = self._solve(qp, outcome)
+        solution, subproblem = self._solve(qp, outcome), self._subproblem
         if solution is None:
             return None
-        softened = self._subproblem.softened(qp, solution)
-        if softened is None:
-            self._subproblem.note(qp, solution)
+        if not subproblem.misses(solution):
+            subproblem.note(qp, solution)
             return solution
-        solution = self._solve(softened, outcome)
-        return None if solution is None else self._subproblem.lowered(qp, solution)
+        if self._solver.chooses:
+            began = perf_counter()
+            found = subproblem.directly(qp)
+            outcome.count(0 if found is None else found.iterations, perf_counter() - began)
+            if found is not None:
+                return found
+        solution = self._solve(subproblem.softened(qp), outcome)
+        return None if solution is None else subproblem.lowered(qp, solution)
 
     def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
         """Solve a QP within the time left; None if no time is left.

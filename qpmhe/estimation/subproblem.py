@@ -17,7 +17,7 @@ from ..terms.base import QuadraticModel, Term, Trial
 from ..terms.forms import WholeForm
 from ..terms.linearization import Span
 from ..terms.rows import Rows
-from ..terms.soft import BEYOND, Penalties
+from ..terms.soft import BEYOND, Penalties, Softened
 from ..terms.sum import diagonal_of_first, rows_of_first
 from .constraints import Constraints
 from .elimination import SINGULAR, Around, Eliminated, Elimination
@@ -254,31 +254,48 @@ class Subproblem:
         bent[:, self._g_rows] = change[:, self._g_rows] - qp.rows_times(step)[:, self._g]
         return np.where(np.isfinite(bent), bent, 0.0)
 
-    def softened(self, qp: QP, solution: Solution) -> QP | None:
-        """The QP with slack variables; None where the solution without violates no soft row."""
-        soft = self._softened
-        if soft is None or solution.d is None or not soft.misses(solution.d).any():
-            return None
-        if self._eliminated is None:
-            return soft.lifted(qp)
-        return soft.along(self._eliminated.step, self._eliminated.along).lifted(self._eliminated.qp)
+    def misses(self, solution: Solution) -> bool:
+        """Whether a solution without the soft rows misses one of them."""
+        soft, d = self._softened, solution.d
+        return soft is not None and d is not None and bool(soft.misses(d).any())
+
+    def directly(self, qp: QP) -> Solution | None:
+        """The solution with the soft rows, without slack variables; None where it is not found."""
+        base, soft = self._with_soft_rows(qp)
+        found = soft.directly(base)
+        return None if found is None else self._restored(qp, base, soft, found)
+
+    def softened(self, qp: QP) -> QP:
+        """The QP with slack variables."""
+        base, soft = self._with_soft_rows(qp)
+        return soft.lifted(base)
 
     def lowered(self, qp: QP, solution: Solution) -> Solution:
         """A solution of the QP with slack variables, as one of the QP without."""
-        base, soft, eliminated = qp, self._softened, self._eliminated
-        if eliminated is not None and soft is not None:
-            base, soft = eliminated.qp, soft.stacked
+        base, soft = self._with_soft_rows(qp)
+        return self._restored(qp, base, soft, soft.lowered(base, solution))
+
+    def _with_soft_rows(self, qp: QP) -> tuple[QP, Softened]:
+        """The QP that the soft rows join, and these, after noise-free directions have left."""
+        soft, eliminated = self._softened, self._eliminated
         assert soft is not None
-        found = soft.lowered(base, solution)
+        if eliminated is None:
+            return qp, soft
+        return eliminated.qp, soft.along(eliminated.step, eliminated.along)
+
+    def _restored(self, qp: QP, base: QP, soft: Softened, found: Solution) -> Solution:
+        """A solution with the soft rows in all unknowns, whose multipliers are kept."""
         forces = soft.forces(base, found)
-        if eliminated is not None:
-            found = eliminated.restored(found)
+        if self._eliminated is not None:
+            found = self._eliminated.restored(found)
         self._note(qp, found, forces)
         return found
 
     def start(self) -> None:
         """Start a new sequence of QPs, with unknown multipliers."""
         self._forces = None
+        if self._softened is not None:
+            self._softened.start()
 
     def note(self, qp: QP, solution: Solution) -> None:
         """Take a solution's multipliers: the next QP has the curvature of active constraints."""

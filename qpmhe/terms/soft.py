@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from qpmhe_solvers import QP, Solution, SolveStatus
 
-from .._linalg import inverse, solve, unit_diagonal
+from .._linalg import inverse
 from ..costs import Cost
 from ..model.system import System
+from .active_rows import Inequalities, minimised
 from .base import (
     QuadraticModel,
     SoftRows,
@@ -35,18 +36,6 @@ SOFT = "soft"
 
 #: A second-order correction is lengthened by this share of itself, to end inside the set.
 BEYOND = 0.1
-
-# As in the banded solver: a root is exact for powers of four alone.
-_COST_UNITS = 0.5, 1.0
-
-# Rounding of a row, as a share of its terms, and how many times that a solved one may be off.
-_ROUNDING, _ACCURACY = 16.0 * float(np.finfo(np.float64).eps), 2.0**20
-
-# Most Newton steps on the optimality conditions: each may change which rows are active.
-_NEWTON_STEPS = 10
-
-# Most solves of each for the forces of its rows.
-_ROUNDS = 5
 
 # Curvature that a slack has at least, as a share of its linear penalty per scale of its row. It
 # holds the slack near its present value, so that it vanishes where the sequence converges.
@@ -283,12 +272,10 @@ class Softened:
     """
 
     def __init__(self, penalties: Penalties, n: int) -> None:
-        from scipy.linalg.lapack import dpbtrf, dpbtrs  # late: most estimators have nothing soft
-
-        self._dpbtrf, self._dpbtrs = dpbtrf, dpbtrs
         self._n, self._penalties, self._size = n, penalties, penalties.size
         self._scale = penalties.scale
         self._qp: QP | None = None
+        self._last: Array | None = None  # forces in the sequence's last QP
         #: The same in other unknowns, see `along`.
         self.stacked: Softened | None = None
         #: Values of the rows at d = 0, (K + 1, R), and their derivatives, as in `Penalties`.
@@ -328,7 +315,8 @@ class Softened:
         stacked, size = self.stacked, directions.shape[-1]
         if stacked is None or stacked._n != size or stacked._size != self.values.size:
             self.stacked = stacked = copy(self)
-            stacked._n, stacked._size, stacked._qp = size, self.values.size, None
+            stacked._n, stacked._size = size, self.values.size
+            stacked._qp = stacked._last = None
             stacked._scale = np.tile(self._scale, len(step))
         own = self._own @ directions
         own[:-1] += self._following[:-1] @ directions[1:]
@@ -441,141 +429,113 @@ class Softened:
                 forces[:, rows.components] = np.maximum(upper[:, place], 0.0)
         return forces
 
+    def start(self) -> None:
+        """Start a new sequence of QPs, whose first one has unknown forces."""
+        self._last = None
+        if self.stacked is not None:
+            self.stacked._last = None
+
+    def directly(self, base: QP) -> Solution | None:
+        """The solution with the soft rows and without slack variables; None where it is not found.
+
+        The search begins with the rows that were active in the last QP of the sequence.
+        """
+        shape = 2, base.stages, self._size + base.rows + (self._n if base.bounded else 0)
+        last = self._last
+        found = self._exact(
+            base, None, np.zeros(shape) if last is None or last.shape != shape else last
+        )
+        if found is None:
+            return None
+        d, self._last, steps = found
+        return Solution(d, SolveStatus.SOLVED, steps, row_duals=self._duals(base, self._last))
+
     def lowered(self, base: QP, solution: Solution) -> Solution:
         """A solution of the lifted QP without its slack variables; exact where that succeeds.
 
         It has the multipliers of all of that QP's rows.
+
+        What a solver misses a soft row by costs its linear penalty times as much, which may be
+        more than J itself. So its solution only says which rows are active, or violated.
         """
         status, duals = solution.status, solution.row_duals
         d = None if solution.d is None else solution.d[:, : self._n].copy()
         if d is not None and status in (SolveStatus.SOLVED, SolveStatus.INACCURATE):
-            exact = self._exact(base, d, solution)
+            forces = self._forces_of(base, solution)
+            exact = None if forces is None else self._exact(base, d, forces)
             if exact is not None:
-                (d, duals), status = exact, SolveStatus.SOLVED
+                d, self._last, _ = exact
+                status, duals = SolveStatus.SOLVED, self._duals(base, self._last)
         return Solution(
             d, status, solution.iterations, row_duals=duals, message=solution.message
         )
 
-    def _exact(self, base: QP, d: Array, solution: Solution) -> tuple[Array, Array] | None:
-        """The minimiser on the rows that a solution says are active, and the multipliers of rows.
+    def _exact(
+        self, base: QP, d: Array | None, forces: Array
+    ) -> tuple[Array, Array, int] | None:
+        """The minimiser, its forces, and the search's steps; None where the search fails.
 
-        None if they are not.
-
-        What a solver misses a soft row by costs its linear penalty times as much, which may be
-        more than J itself. So its solution only says which rows are active, or violated; a few
-        Newton steps on the optimality conditions then give the exact one.
+        The forces (2, K + 1, rows) are those of upper and of lower sides, of the soft rows, of the
+        hard ones and of the bounds of each stage; they and d say which rows are active at first.
         """
+        inequalities, which, uppers = self._sides(base, forces.shape[2])
+        found = minimised(
+            base, inequalities, None if d is None else d.ravel(),
+            np.append(forces[0].ravel()[which[:uppers]], forces[1].ravel()[which[uppers:]]),
+        )
+        if found is None:
+            return None
+        step, held, steps = found
+        forces = np.zeros(forces.shape)
+        forces[0].reshape(-1)[which[:uppers]] = held[:uppers]
+        forces[1].reshape(-1)[which[uppers:]] = held[uppers:]
+        return step.reshape(base.stages, self._n), forces, steps
+
+    def _forces_of(self, base: QP, solution: Solution) -> Array | None:
+        """The forces in a solution of the lifted QP, as `_exact` takes them."""
         if solution.bound_duals is None or solution.row_duals is None:
             return None
-        rows, sides, most, curvature, forces, which, uppers = self._sides(
-            base, solution.bound_duals.reshape(base.stages, -1),
-            solution.row_duals.reshape(base.stages, -1),
-        )
-        # A power of two, so that the root in a Cholesky factor is exact for units that are, too.
-        unit = _COST_UNITS[math.frexp(base.band.item(0))[1] % 2]
-        factor, info = self._dpbtrf(unit * base.lapack_band, lower=1)
-        if info != 0:
-            return None
-        free = -self._dpbtrs(factor, unit * base.gradient.reshape(-1, 1), lower=1)[0][:, 0]
-        # H^-1 of the rows that have been active at some time, and how stiff H is against each row:
-        # its diagonal will do, and an interior point has a force on rows that are not active.
-        known, moved = np.zeros(len(rows), np.bool_), np.zeros(rows.shape[::-1], order="F")
-        stiff, soft = 1.0 / (rows**2 @ (1.0 / base.band[:, :, 0].ravel())), np.zeros(len(rows))
-        np.divide(1.0, curvature, out=soft, where=curvature > 0.0)
-        step: Array = d.ravel()
-        gap, before, magnitudes = rows @ step - sides, None, np.abs(rows)
-        for _ in range(_NEWTON_STEPS):
-            held = forces + stiff * gap
-            active, violated = held > 0.0, held > most
-            if before is not None and all(map(np.array_equal, before, (active, violated))):
-                return np.reshape(step, d.shape), self._duals(base, forces, which, uppers)
-            before, new = (active, violated), active & ~known
-            if new.any():
-                moved[:, new] = self._dpbtrs(factor, unit * rows[new].T, lower=1)[0]
-                known |= new
-            pushed = violated & (curvature == 0.0)
-            solved = active & ~pushed
-            forces = np.where(pushed, most, 0.0)
-            step = free - moved[:, pushed] @ most[pushed]
-            held_back, moves = rows[solved], moved[:, solved]
-            bent, beyond = np.where(violated, (soft, most), 0.0)[:, solved]
-            reaction = held_back @ moves + np.diag(bent)
-            for _ in range(_ROUNDS):  # after the first, for the rounding of the one before
-                # Solved rows are met, or missed by what their force says.
-                off = held_back @ step - sides[solved] - bent * (forces[solved] - beyond)
-                # The step is a difference of these, and may vanish.
-                terms = np.abs(free) + np.abs(step)
-                rounding = _ROUNDING * (magnitudes @ terms + np.abs(sides))
-                if (np.abs(off) <= rounding[solved]).all():
-                    break
-                if not (np.isfinite(off).all() and np.isfinite(reaction).all()):
-                    return None
-                change = _least_squares(reaction, off)
-                forces[solved] += change
-                step = step - moves @ change
-            if not (np.isfinite(step).all() and np.isfinite(forces).all()):
-                return None
-            if (np.abs(off) > _ACCURACY * rounding[solved]).any():
-                return None
-            gap = rows @ step - sides
-            gap[solved | (np.abs(gap) <= rounding)] = 0.0
-        return None
+        hard, size = base.rows, self._size
+        rows = solution.row_duals.reshape(base.stages, -1)
+        held = [rows[:, :hard]]
+        if base.bounded:
+            held.append(solution.bound_duals.reshape(base.stages, -1)[:, : self._n])
+        upper, lower = rows[:, hard + size :], -rows[:, hard : hard + size]
+        return np.maximum([np.hstack((upper, *held)), -np.hstack((-lower, *held))], 0.0)
 
-    def _duals(
-        self, base: QP, forces: Array, which: NDArray[np.intp], uppers: int
-    ) -> Array:
-        """Multipliers of the lifted QP's rows, from the forces of the inequalities of `_sides`."""
-        size, rows = self._size, base.rows
-        found = np.zeros((2, base.stages * (size + rows + (self._n if base.bounded else 0))))
-        found[0, which[:uppers]], found[1, which[uppers:]] = forces[:uppers], forces[uppers:]
-        upper, lower = found.reshape(2, base.stages, -1)
-        hard = (upper - lower)[:, size : size + rows]
+    def _duals(self, base: QP, forces: Array) -> Array:
+        """Multipliers of the lifted QP's rows, from the forces of `_exact`."""
+        size, (upper, lower) = self._size, forces
+        hard = (upper - lower)[:, size : size + base.rows]
         return np.hstack((hard, -lower[:, :size], upper[:, :size])).ravel()
 
-    def _sides(
-        self, base: QP, bound_duals: Array, row_duals: Array
-    ) -> tuple[Array, Array, Array, Array, Array, NDArray[np.intp], int]:
+    def _sides(self, base: QP, places: int) -> tuple[Inequalities, NDArray[np.intp], int]:
         """All inequalities as ``rows d <= sides``, where some side is finite.
 
-        With, for each, the largest force of an active row that is not violated, the curvature of
-        the penalty beyond, the force that a solver found, and its place among all, soft and hard
-        ones of each stage; and how many are upper sides, which come first.
+        With the place of each among all, soft and hard ones of each stage; and how many are upper
+        sides, which come first.
         """
-        n, hard, window, size = self._n, base.rows, self._window, self._size
-        count = hard + (n if base.bounded else 0)  # of hard inequalities at each stage
-        duals = np.hstack((row_duals[:, :hard], bound_duals[:, : count - hard]))
-        eye = np.broadcast_to(np.eye(n)[: count - hard], (base.stages, count - hard, n))
-        bounds = base.lower[:, : count - hard], base.upper[:, : count - hard]
+        n, window = self._n, self._window
+        count = places - self._size  # of hard inequalities at each stage
+        bounds = count - base.rows
+        eye = np.broadcast_to(np.eye(n)[:bounds], (base.stages, bounds, n))
         parts = (
             self._usable(), (base.row_own, base.row_next, base.row_lower, base.row_upper),
-            (eye, 0.0 * eye, *bounds),
+            (eye, 0.0 * eye, base.lower[:, :bounds], base.upper[:, :bounds]),
         )
         own, following, lower, upper = (
             np.concatenate(one, axis=1) for one in zip(*parts, strict=True)
         )
         free = np.zeros((base.stages, count))
-        most, curvature, below, above = (np.hstack(one).ravel() for one in (
+        most, curvature = (np.hstack(one).ravel() for one in (
             (0.5 * window.linear, free + np.inf), (window.quadratic, free),
-            (row_duals[:, hard : hard + size], duals), (row_duals[:, hard + size :], duals),
         ))
         uppers, lowers = (np.flatnonzero(np.isfinite(one)) for one in (upper, lower))
         which, matrix = np.append(uppers, lowers), _dense(own, following)
-        return (
+        return Inequalities(
             np.vstack((matrix[uppers], -matrix[lowers])),
-            np.append(upper.ravel()[uppers], -lower.ravel()[lowers]), most[which],
-            curvature[which], np.maximum(np.append(above[uppers], -below[lowers]), 0.0),
-            which, len(uppers),
-        )
-
-
-def _least_squares(matrix: Array, side: Array) -> Array:
-    """The solution of ``matrix x = side``, the least one where rows depend on each other."""
-    try:
-        return solve(matrix, side[:, None])[:, 0]
-    except np.linalg.LinAlgError:
-        scaled, units, whole = unit_diagonal(matrix)
-        found = np.linalg.lstsq(scaled, np.ldexp(side, -whole - units), rcond=1e-10)[0]
-        return np.asarray(np.ldexp(found, -units))
+            np.append(upper.ravel()[uppers], -lower.ravel()[lowers]), most[which], curvature[which],
+        ), which, len(uppers)
 
 
 def _dense(own: Array, following: Array) -> Array:

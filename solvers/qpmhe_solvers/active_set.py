@@ -17,6 +17,7 @@ from .solver import Solver
 Index = NDArray[np.intp]
 Flags = NDArray[np.bool_]
 Sides = NDArray[np.int8]
+Sizes = tuple[int, int, int]
 
 _NOTHING = np.zeros(0, np.intp)
 
@@ -25,6 +26,8 @@ _ROUNDING = 1e-12
 # The part of a constraint's column, squared, that must be independent of the active ones.
 _DEPENDENT = 1e-10
 _DEPENDENT_ROOT = math.sqrt(_DEPENDENT)
+# Sizes of QPs whose last active set is kept: with and without slack variables.
+_KEPT = 2
 # Exchanges in blocks that do not lower the number of wrong constraints, before single steps.
 _PATIENCE = 2
 # Exchanges without a cap. Most QPs take less than ten.
@@ -77,8 +80,7 @@ class ActiveSetSolver(Solver):
         super().__init__(options)
         self._lapack = _Lapack(dpbtrf, dtbtrs, dpotrf, dpotrs)
         self._most = options.max_iterations or most_exchanges
-        self._sizes = (0, 0, 0)
-        self._last: Sides = np.zeros(0, np.int8)
+        self._last: dict[Sizes, Sides] = {}  # QPs with slack variables have sizes of their own
         self._columns: _Columns | None = None
 
     def __reduce__(self) -> tuple[type[ActiveSetSolver], tuple[SolverOptions]]:
@@ -86,15 +88,15 @@ class ActiveSetSolver(Solver):
 
     def shift(self) -> None:
         """Move the last active set by one stage; see `Solver.shift`."""
-        stages, n, rows = self._sizes
-        for part, width in ((self._last[: stages * n], n), (self._last[stages * n :], rows)):
-            part[: part.size - width] = part[width:].copy()
-            part[part.size - width :] = 0
+        for (stages, n, rows), last in self._last.items():
+            for part, width in ((last[: stages * n], n), (last[stages * n :], rows)):
+                part[: part.size - width] = part[width:].copy()
+                part[part.size - width :] = 0
 
     def forget(self) -> None:
         """Forget the last active set; see `Solver.forget`."""
         super().forget()
-        self._sizes, self._last, self._columns = (0, 0, 0), np.zeros(0, np.int8), None
+        self._last, self._columns = {}, None
 
     def _solve(self, qp: QP, start: Array | None) -> RawSolution:
         until = None if self.time_limit is None else perf_counter() + self.time_limit
@@ -103,12 +105,15 @@ class ActiveSetSolver(Solver):
             columns = self._columns = _Columns(self._lapack, qp)
         if not columns.regular:
             return RawSolution(None, False, 0, message="H is not positive definite")
-        if self._sizes != qp.sizes or not self.options.warm_start:
-            self._sizes, self._last = qp.sizes, np.zeros(qp.all_lower.size, np.int8)
+        last = self._last.get(qp.sizes) if self.options.warm_start else None
+        if last is None:
+            last = np.zeros(qp.all_lower.size, np.int8)
         search = _Search(qp, columns, self._most, until)
-        message, duals = search.go(self._last), search.duals
+        message, duals = search.go(last), search.duals
         if not message:
-            self._last = search.sides
+            if len(self._last) >= _KEPT:
+                del self._last[next(iter(self._last))]
+            self._last[qp.sizes] = search.sides
         return RawSolution(
             search.step, not message, search.exchanges, duals[: qp.size], duals[qp.size :], message
         )

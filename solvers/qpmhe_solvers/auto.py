@@ -37,6 +37,7 @@ class AutoSolver(Solver):
         self._exact = None if options.max_iterations else ContainedSolver(
             ActiveSetSolver(options, most_exchanges=_EXCHANGES)
         )
+        self._chooses = self._exact is not None
         self._active = False  # whether constraints were active at its last solution
         self._others: dict[bool, list[ContainedSolver]] = {}
         self._shifts = 0  # of which the others do not know yet

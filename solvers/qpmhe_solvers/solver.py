@@ -60,6 +60,8 @@ class Solver(ABC):
     _judges: ClassVar[bool] = False
     # Whether `_solve` takes a `SparseQP`, too: for solvers of this package alone.
     _takes_sparse: ClassVar[bool] = False
+    # Whether another exact method may take its place: where no backend was named.
+    _chooses: bool = False
     # What the last solve wrote into of what it was lent.
     _wrote: tuple[str, ...] = ()
     # The `ContainedSolver` that used it last.
@@ -332,6 +334,11 @@ class ContainedSolver:
     def takes_sparse(self) -> bool:
         """Whether it solves a `SparseQP` as such."""
         return self._is_trusted and self.solver._takes_sparse
+
+    @property
+    def chooses(self) -> bool:
+        """Whether another exact method may take its place, as no backend was named."""
+        return self._is_trusted and self.solver._chooses
 
     def shift(self) -> None:
         """Report that the trajectory moved by one stage; see `Solver.shift`."""

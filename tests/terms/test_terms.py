@@ -10,7 +10,9 @@ from qpmhe.terms.base import Derivatives, QuadraticModel
 from qpmhe.terms.linearization import Span, StageTerms
 from qpmhe.terms.soft import Softened
 from qpmhe.terms.sum import weight_of_first
-from qpmhe_solvers import QP
+from qpmhe_solvers import QP, SolverOptions, SolveStatus
+from qpmhe_solvers.backend import make_solver
+from qpmhe_solvers.native import NATIVE
 from qpmhe_solvers.qp import band_of
 from tests.codegen.cases import case
 
@@ -212,21 +214,52 @@ def test_each_correction_shifts_soft_rows_to_their_true_values(name):
     "soft states, hard noises", "soft noises, hard states", "constraints and soft sets",
     "soft states, narrow noises",
 ])
-def test_soft_rows_are_solved_exactly_beside_active_hard_ones(monkeypatch, name):
+@pytest.mark.parametrize("backend", [None, "piqp"])
+def test_soft_rows_are_solved_exactly_beside_active_hard_ones(monkeypatch, name, backend):
+    """Without a named backend from no forces, otherwise from those in its answer."""
     exact, beside = Softened._exact, []
 
-    def watched(self, base, d, solution):
-        found = exact(self, base, d, solution)
-        hard = solution.row_duals.reshape(base.stages, -1)[:, : base.rows]
-        active = np.abs(hard).max(initial=0.0) + np.abs(solution.bound_duals).max(initial=0.0)
-        beside.append((active > 1e-3, found is not None))
+    def watched(self, base, d, forces):
+        found = exact(self, base, d, forces)
+        hard = (forces if d is not None or found is None else found[1])[:, :, self._size :]
+        beside.append((hard.max(initial=0.0) > 1e-3, found is not None))
         return found
 
     monkeypatch.setattr(Softened, "_exact", watched)
     one = case(name)
-    mhe = one.estimator("python")
+    mhe = one.estimator("python", **({} if backend is None else {"backend": backend}))
     for sample in one.samples:
         mhe.update(**sample)
     solved = [is_exact for is_active, is_exact in beside if is_active]
     assert len(solved) > 2
     assert all(solved)
+
+
+@pytest.mark.parametrize("name", [
+    "soft states, hard noises", "soft noises, hard states", "constraints and soft sets",
+    "soft states, narrow noises", "soft disturbances and noises", "soft constraints",
+])
+def test_solutions_found_directly_are_those_with_slack_variables(monkeypatch, name):
+    directly, found = Softened.directly, []
+    solver, largest = make_solver(NATIVE["piqp"], SolverOptions()), 0.0
+
+    def watched(self, base):
+        nonlocal largest
+        one = directly(self, base)
+        other = self.lowered(base, solver.solve(self.lifted(base)))
+        assert other.status is SolveStatus.SOLVED
+        largest = max(largest, np.abs(other.d).max())  # steps of later QPs vanish
+        if one is not None:
+            assert np.abs(one.d - other.d).max() <= 1e-9 * largest
+            forces = np.abs(other.row_duals).max()
+            assert np.abs(one.row_duals - other.row_duals).max() <= 1e-6 * forces
+        found.append(one is not None)
+        return one
+
+    monkeypatch.setattr(Softened, "directly", watched)
+    one = case(name)
+    mhe = one.estimator("python")
+    for sample in one.samples:
+        mhe.update(**sample)
+    assert len(found) > 5
+    assert np.mean(found) > 0.9

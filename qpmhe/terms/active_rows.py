@@ -1,0 +1,132 @@
+"""The exact minimiser of a QP with inequalities that may be missed for a penalty."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qpmhe_solvers import QP
+
+from .._linalg import solve, unit_diagonal
+
+Array = NDArray[np.float64]
+
+# As in the banded solver: a root is exact for powers of four alone.
+_COST_UNITS = 0.5, 1.0
+
+# Rounding of a row, as a share of its terms, and how many times that a solved one may be off.
+_ROUNDING, _ACCURACY = 16.0 * float(np.finfo(np.float64).eps), 2.0**20
+
+# Most Newton steps on the optimality conditions: each may change which rows are active, all at once
+# until that has not made fewer wrong so many times.
+_NEWTON_STEPS = 40
+_PATIENCE = 3
+
+# Most solves of each for the forces of its rows.
+_ROUNDS = 5
+
+
+class Inequalities(NamedTuple):
+    """Inequalities ``rows d <= sides`` of one QP, hard or with penalties.
+
+    ``most`` is the largest force of an active one that is not violated, infinite for hard ones,
+    and ``curvature`` by how much it grows beyond per unit of the violation.
+    """
+
+    rows: Array  # (R, unknowns)
+    sides: Array
+    most: Array
+    curvature: Array
+
+
+def minimised(
+    base: QP, inequalities: Inequalities, start: Array | None, forces: Array
+) -> tuple[Array, Array, int] | None:
+    """The minimiser, its forces, and the Newton steps on the optimality conditions.
+
+    The forces and the start say which rows are active at first; without a start it is the
+    minimiser with these forces. Each step changes all rows that are wrong, until that has not made
+    fewer wrong for some steps; then one row at a time, by one place: inactive, active, violated.
+    None where this does not tell which rows are active.
+    """
+    from scipy.linalg.lapack import dpbtrf, dpbtrs  # late, as in `Subproblem`
+
+    rows, sides, most, curvature = inequalities
+    # A power of two, so that the root in a Cholesky factor is exact for units that are, too.
+    unit = _COST_UNITS[math.frexp(base.band.item(0))[1] % 2]
+    factor, info = dpbtrf(unit * base.lapack_band, lower=1)
+    if info != 0:
+        return None
+    free = -dpbtrs(factor, unit * base.gradient.reshape(-1, 1), lower=1)[0][:, 0]
+    # H^-1 of the rows that have been active at some time, and how stiff H is against each row: for
+    # the others, its diagonal will do.
+    known, moved = np.zeros(len(rows), np.bool_), np.zeros(rows.shape[::-1], order="F")
+    stiff, soft = 1.0 / (rows**2 @ (1.0 / base.band[:, :, 0].ravel())), np.zeros(len(rows))
+    np.divide(1.0, curvature, out=soft, where=curvature > 0.0)
+    step: Array = free if start is None else start
+    held = forces > 0.0
+    if start is None and held.any():
+        moved[:, held], known = dpbtrs(factor, unit * rows[held].T, lower=1)[0], held
+        step = free - moved[:, held] @ forces[held]
+    gap, magnitudes = rows @ step - sides, np.abs(rows)
+    place, fewest, patience = held + 1 * (forces >= most), len(rows) + 1, _PATIENCE
+    for steps in range(_NEWTON_STEPS):
+        reach = forces + stiff * gap
+        new = (reach > 0.0) & ~known
+        if new.any():
+            moved[:, new] = dpbtrs(factor, unit * rows[new].T, lower=1)[0]
+            known |= new
+            stiff[new] = 1.0 / np.einsum("ij,ji->i", rows[new], moved[:, new])
+            reach = forces + stiff * gap
+        due = (reach > 0.0) + (reach > most).astype(np.intp)
+        if patience <= 0:
+            due = np.clip(due, place - 1, place + 1)
+        wrong = np.flatnonzero(due != place)
+        if not wrong.size and steps:
+            return step, forces, steps
+        patience = _PATIENCE if wrong.size < fewest else patience - 1
+        fewest = min(wrong.size, fewest)
+        if patience <= 0:  # one at a time does not come back to where it was
+            wrong = wrong[-1:]
+        place[wrong] = due[wrong]
+        active, violated = place > 0, place > 1
+        pushed = violated & (curvature == 0.0)
+        solved = active & ~pushed
+        forces = np.where(pushed, most, 0.0)
+        step = free - moved[:, pushed] @ most[pushed]
+        held_back, moves = rows[solved], moved[:, solved]
+        bent, beyond = np.where(violated, (soft, most), 0.0)[:, solved]
+        reaction = held_back @ moves + np.diag(bent)
+        for _ in range(_ROUNDS):  # after the first, for the rounding of the one before
+            # Solved rows are met, or missed by what their force says.
+            off = held_back @ step - sides[solved] - bent * (forces[solved] - beyond)
+            # The step is a difference of these, and may vanish.
+            terms = np.abs(free) + np.abs(step)
+            rounding = _ROUNDING * (magnitudes @ terms + np.abs(sides))
+            if (np.abs(off) <= rounding[solved]).all():
+                break
+            if not (np.isfinite(off).all() and np.isfinite(reaction).all()):
+                return None
+            change = _least_squares(reaction, off)
+            forces[solved] += change
+            step = step - moves @ change
+        if not (np.isfinite(step).all() and np.isfinite(forces).all()):
+            return None
+        if (np.abs(off) > _ACCURACY * rounding[solved]).any():
+            return None
+        gap = rows @ step - sides
+        gap[solved | (np.abs(gap) <= rounding)] = 0.0
+    return None
+
+
+def _least_squares(matrix: Array, side: Array) -> Array:
+    """The solution of ``matrix x = side``, the least one where rows depend on each other."""
+    try:
+        return solve(matrix, side[:, None])[:, 0]
+    except np.linalg.LinAlgError:
+        scaled, units, whole = unit_diagonal(matrix)
+        found = np.linalg.lstsq(scaled, np.ldexp(side, -whole - units), rcond=1e-10)[0]
+        return np.asarray(np.ldexp(found, -units))
