@@ -71,7 +71,10 @@ def changed(one, mhe, time):
     if "weights" in one.has and rng.random() < 0.7:
         given["noise_weight"] = usual.noise * rng.uniform(0.3, 3.0)
     if "weights" in one.has and one.how != "covariance" and rng.random() < 0.7:
-        given["disturbance_weight"] = 30.0 * spd(rng, one.G.shape[1])
+        weight = 30.0 * spd(rng, one.G.shape[1])
+        if one.each and "disturbance" in one.robust:  # a loss per component takes no other
+            weight = np.diag(np.diag(weight))
+        given["disturbance_weight"] = weight
     if one.k and rng.random() < 0.5:
         given["parameters"] = rng.standard_normal(one.k)
     if "bounds" in one.has and (other := one.moved()):
