@@ -130,8 +130,8 @@ class SmoothModel:
     """f and h of a system as one expression graph, to be enclosed over cells of states and inputs.
 
     It encloses f and h as expressions in real arithmetic, with their constants in double precision.
-    Functions in NumPy are traced, under watch (`qpmhe.model.tracing`). At samples of the region,
-    the functions' values must lie where the expressions' values do.
+    Functions in NumPy are traced (`qpmhe.model.tracing`). At samples of the region, their values
+    must lie where the expressions' values do; `agrees` compares them in each cell of a proof.
 
     States and inputs that the region fixes, such as known parameters, are numbers in the graph:
     Jacobians are of the other states, those in ``free``. ``moved`` are the states that the region

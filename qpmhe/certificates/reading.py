@@ -20,7 +20,7 @@ def expression_of(system: System, name: str) -> Traced:
         return Traced(None, f"it has algebraic states, {SOLVES}")
     tracing, model = system.tracing, system.symbolic if system.tracing is None else None
     if tracing is not None:
-        found = tracing.watched(name)
+        found = tracing.scalar(name)
         if found.function is None:
             return found
         model = CasadiModel(

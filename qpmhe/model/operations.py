@@ -42,11 +42,9 @@ _NUMBERS_ONLY = {"bitwise_and", "bitwise_or", "bitwise_xor", "invert"}
 class ExpressionRecord(MakingRecord):
     """Symbols carry scalar expressions (casadi.SX)."""
 
-    def __init__(
-        self, casadi: Any, watched: bool = False, products: Products | None = None
-    ) -> None:
+    def __init__(self, casadi: Any, products: Products | None = None) -> None:
         super().__init__()
-        self.casadi, self.watched = casadi, watched
+        self.casadi = casadi
         self._product = casadi.mtimes if products is None else products.of
 
     @without_symbols

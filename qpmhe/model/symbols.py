@@ -58,8 +58,6 @@ class TraceRecord(ABC):
 
     #: A function that does more with single symbols than this is not traced any further.
     most_operations = 50_000
-    #: Whether nothing may differ from a call with numbers: see `qpmhe.model.tracing.watched`.
-    watched = False
 
     def __init__(self) -> None:
         #: Why it was refused, the first time; blank if never. Whatever the function catches.
@@ -335,6 +333,7 @@ class SymbolArray(np.ndarray[Any, Any]):
     def _refuse(self, *_: Any) -> Any:
         raise self.record.refuse("the bytes of an array of symbols")
 
+    __bytes__: Any = _refuse
     tobytes: Any = _refuse
     tofile: Any = _refuse
     __reduce__: Any = _refuse
@@ -435,9 +434,8 @@ def run(
     refused, or writes into an argument.
     """
     before = [plain(one).copy() for one in arguments]
-    # Numbers could be written to; what is done to symbols is seen below.
     for one in arguments:
-        one.flags.writeable = record.watched
+        one.flags.writeable = False
     try:
         with np.errstate(all="ignore"):
             value = function(*arguments)

@@ -129,14 +129,12 @@ class ModelTrace:
         """The model, if both functions are traced and still agree with their traces."""
         return self.confirm(None).model
 
-    def watched(self, name: str) -> Traced:
-        """The trace of a function that is watched meanwhile: see `qpmhe.model.tracing`.
+    def scalar(self, name: str) -> Traced:
+        """The trace of a function in scalar operations alone, not compared with the function."""
+        return expressed(self._source(name), (self._width, self._m), name)
 
-        A source is no code of the user's, but what is evaluated itself, as a program for JAX is.
-        """
-        if self._sources is not None:
-            return expressed(self._sources[name], (self._n, self._m), name)
-        return expressed(self._functions[name], (self._width, self._m), name, watched=True)
+    def _source(self, name: str) -> Callable[[Array, Array], Any]:
+        return self._functions[name] if self._sources is None else self._sources[name]
 
     def _points(self, magnitudes: Sequence[Magnitude], scales: Array | float = 1.0) -> Points:
         """Where traces and functions are compared."""
@@ -152,9 +150,7 @@ class ModelTrace:
         self._now = Pinned(found, self._n, self._p, self._m, self.dt, self.how, guess)
 
     def _traced(self, name: str, where: Points) -> Traced:
-        function = self._functions[name]
-        source = function if self._sources is None else self._sources[name]
-        found = expressed(source, (self._width, self._m), name, products=True)
+        found = expressed(self._source(name), (self._width, self._m), name, products=True)
         if found.function is None:
             return found
         fault = self._difference(name, found, where)

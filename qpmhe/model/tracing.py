@@ -1,21 +1,15 @@
 """Traces of users' functions: the expressions that they compute, in CasADi.
 
-A trace that estimators rely on is compared with its function again and again. A proof cannot rest
-on comparisons, so there a trace is watched: it is refused where the function could notice that it
-is not called with numbers, whatever it then does. Symbols refuse whatever asks for a value. Beyond
-that, no exception may occur in the user's code, be it caught, and this code may not look at types,
-identities or memory.
+Symbols refuse whatever asks for a value, even where the function catches the exception. A function
+that tells symbols from numbers in another way, and then computes something else, is found by
+comparison: estimators compare a trace with its function again and again, and certificates do so in
+each cell of a proof.
 """
 
 from __future__ import annotations
 
-import contextlib
-import dis
-import functools
-import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,15 +22,7 @@ from .points import ALL
 from .points import arguments as arguments_at
 from .products import MOST_OF_EACH, Products
 from .stand_ins import numpy_on_symbols
-from .symbols import (
-    _MACHINERY,
-    INSTEAD,
-    NotTraceableError,
-    TraceRecord,
-    place,
-    plain,
-    run,
-)
+from .symbols import INSTEAD, NotTraceableError, place, plain, run
 
 Array = NDArray[np.float64]
 
@@ -127,7 +113,7 @@ def traced(
 
 def expressed(
     function: Callable[..., Any], sizes: Sequence[int], name: str = "traced",
-    watched: bool = False, products: bool = False,
+    products: bool = False,
 ) -> Traced:
     """The expression that a function computes from symbols, not compared with the function yet.
 
@@ -138,10 +124,9 @@ def expressed(
     columns = [casadi.SX.sym(f"a{k}", size) for k, size in enumerate(sizes)]
     for deeper in (False, True):  # a model that needs no more is traced without
         made = Products()
-        record = ExpressionRecord(casadi, watched, made if products else None)
+        record = ExpressionRecord(casadi, made if products else None)
         record.most_operations = max(record.most_operations, MOST_OF_EACH * sizes[0])
-        watch = _watch(record) if watched else contextlib.nullcontext()
-        with numpy_on_symbols(record, deeper), watch:
+        with numpy_on_symbols(record, deeper):
             value, error = run(record, function, [record.symbols(one) for one in columns])
         if error is None and not record.refused:
             break
@@ -164,70 +149,6 @@ def expressed(
     if record.refused:
         return Traced(None, record.reason)
     return Traced(made.function(name, columns, column), "", values.shape)
-
-
-# Functions and attributes by which code tells symbols from numbers, without their knowledge.
-_TELLING = frozenset(("type", "id", "memoryview", "bytes", "bytearray"))
-_TELLING_ATTRIBUTES = frozenset((
-    "__class__", "is_", "is_not", "shares_memory", "may_share_memory", "_getframe", "gettrace",
-    "currentframe", "getrefcount",
-))
-
-
-def _is_trusted(name: str) -> bool:
-    """Whether code works on symbols as on numbers: that of this module's like, and libraries."""
-    return name.startswith((*_MACHINERY, "<frozen")) or "/casadi/" in name or (
-        name.startswith(_STANDARD) and "site-packages" not in name
-    )
-
-
-_STANDARD = str(Path(dis.__file__).parent)
-
-
-@contextlib.contextmanager
-def _watch(record: TraceRecord) -> Iterator[None]:
-    """Refuse, meanwhile, exceptions in the user's code, and looks at types and identities."""
-
-    def within(_: Any, event: str, argument: Any) -> Any:
-        if event == "exception" and not issubclass(argument[0], (StopIteration, GeneratorExit)):
-            record.refuse(f"an exception on symbols, {argument[0].__name__}")
-        return within
-
-    def called(frame: Any, *_: Any) -> Any:
-        if _is_trusted(frame.f_code.co_filename):
-            return None
-        frame.f_trace_lines = False
-        telling = _telling(frame.f_code)
-        if telling:
-            record.refuse(telling)
-        return within
-
-    before = sys.gettrace()
-    sys.settrace(called)
-    try:
-        yield
-    finally:
-        sys.settrace(before)
-
-
-@functools.lru_cache(maxsize=1000)
-def _telling(code: Any) -> str:
-    """What in some code could distinguish symbols from numbers; blank if nothing."""
-    before = None
-    instructions = list(dis.get_instructions(code))
-    for one, after in zip(instructions, [*instructions[1:], None], strict=True):
-        names = _TELLING if one.opname == "LOAD_GLOBAL" else (
-            _TELLING_ATTRIBUTES if one.opname in ("LOAD_ATTR", "LOAD_METHOD") else ()
-        )
-        if one.argval in names and not (
-            # The type of the object that a method belongs to.
-            one.argval == "type" and after is not None and after.argval in ("self", "cls")
-        ):
-            return f"{one.argval}, which distinguishes symbols from numbers"
-        if one.opname == "IS_OP" and not (before and before.opname == "LOAD_CONST"):
-            return "whether two objects are the same"
-        before = one
-    return ""
 
 
 def _failure(error: BaseException) -> str:
