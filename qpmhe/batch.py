@@ -341,7 +341,7 @@ class _Looped:
                 engine.reset(state)
         except BaseException:  # an interrupt: all members or none
             for engine, memory in zip(self.engines, before, strict=True):
-                engine.replace(memory)
+                engine.replace(*memory)
             raise
 
     def step(self, y: Array, u: Array) -> BatchEstimate:

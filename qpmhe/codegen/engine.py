@@ -28,11 +28,18 @@ from ..model.captured import Due
 from ..model.system import System
 from ..observers import Observer
 from .estimate import WATCHED, CompiledEstimate, CompiledWatch
-from .exchange import empty_record, hand_over, own_fields, record_of, write
+from .exchange import (
+    empty_record,
+    hand_over,
+    own_fields,
+    record_of,
+    sample_arrays,
+    write,
+    write_sample,
+)
 from .failure import FAILED, Failure
 from .layout import CHANGES
 from .library import EstimatorLibrary
-from .sample import SampleRecord
 from .watched import WatchedFunctions
 
 Array = NDArray[np.float64]
@@ -84,13 +91,13 @@ class CompiledEngine:
         self._numbers = self._out.view(np.int32)[2 * reals + 2 : 2 * reals + 8]
         self._before = np.empty_like(self._memory)  # before the last step
         # A sample as usual, and one with something of its own.
-        self._plain, self._own = (
-            SampleRecord(library.layout, directions, self._y, self._u) for _ in range(2)
-        )
+        self._samples = np.zeros(2, library.sample_type)
+        self._samples["y"], self._samples["u"] = self._y.ctypes.data, self._u.ctypes.data
+        self._own = self._samples[1], sample_arrays(library.layout)
         memory, before, workspace, usual, special, out = (
             ctypes.c_void_p(array.ctypes.data)
             for array in (
-                self._memory, self._before, self._workspace, self._plain.record, self._own.record,
+                self._memory, self._before, self._workspace, self._samples[:1], self._samples[1:],
                 self._out,
             )
         )
@@ -213,7 +220,7 @@ class CompiledEngine:
             if dt is None and own is None:
                 self._call(*self._usual)
             else:
-                self._own.fill(dt, own)
+                write_sample(*self._own, self._directions, dt, own)
                 self._call(*self._special)
             estimate = self._collect(time)
             if self._numbers[1] & FAILED or self._trial_failed[0]:

@@ -125,6 +125,35 @@ def _plain(value: Any) -> NDArray[Any]:
     return clean.view(np.uint8).reshape(len(array), array.dtype.itemsize)
 
 
+def sample_arrays(layout: Layout) -> dict[str, tuple[NDArray[Any], int]]:
+    """Arrays for what a sample may come with, and their addresses, by their names in C."""
+    n, p = layout.nx, layout.ny
+    arrays: dict[str, NDArray[Any]] = {
+        "noise_weight": np.zeros((p, p)), "disturbance_weight": np.zeros((n, n)),
+        "sampled": np.zeros(p, np.uint8),
+        **{name: np.zeros(1, layout.set_type(name)) for name in SET_NAMES},
+    }
+    return {name: (array, array.ctypes.data) for name, array in arrays.items()}
+
+
+def write_sample(
+    sample: Any, arrays: dict[str, tuple[NDArray[Any], int]], directions: Directions,
+    dt: float | None, own: Conditions | None,
+) -> None:
+    """Write a sample's step length and conditions into an ``mhe_sample`` and these arrays."""
+    sample["step"] = dt or 0.0
+    for name, (array, address) in arrays.items():
+        value = None if own is None else getattr(own, name)
+        if value is None:
+            sample[name] = 0
+            continue
+        if isinstance(value, ConvexSet):
+            directions.write_sides(name, array[0], value)
+        else:
+            array[...] = directions.weight_of_d(value) if name == "disturbance_weight" else value
+        sample[name] = address
+
+
 def hand_over(
     memory: Any, layout: Layout, directions: Directions, usual: Conditions, engine: PythonEngine,
     replay: bool,

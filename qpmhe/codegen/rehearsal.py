@@ -278,7 +278,7 @@ class _Nudged:
 
         Where states are nearly dependent, a covariance has few digits of what distinguishes them.
         """
-        window = self._step.memory.window
+        _, window = self._step.memory
         k, P, roots = window.end, window.covariance, window.root
         if P is None:
             return
@@ -410,7 +410,7 @@ class _Rehearsal:
         A root, in units of its deviations, is rounded to shares of its least singular value. So is
         the inverse of a covariance, which may be the prior's weight, of its least eigenvalue.
         """
-        window = self._python.memory.window
+        _, window = self._python.memory
         here = slice(window.start, window.end + 1)
         if window.root is None:
             if window.covariance is not None and self._arguments[2].observer_prior is not None:
@@ -435,7 +435,7 @@ class _Rehearsal:
         Or its numbers have run away, so that they soon will.
         """
         largest = max(abs(expected.candidate).max(), abs(expected.observer_state).max())
-        window = self._python.memory.window
+        _, window = self._python.memory
         if window.covariance is not None and self._first is not None:
             # A candidate that is re-initialised goes through all stages of the window again.
             stages = window.covariance[window.start : window.end + 1]
@@ -470,7 +470,7 @@ class _Rehearsal:
         if not found.cost <= limit:
             return f"J of the estimate, {found.cost:.6g}, is above {limit:.6g}, that of {whose}"
         states = abs(np.vstack((expected.candidate, expected.trajectory))).max(axis=0)
-        window = self._python.memory.window
+        _, window = self._python.memory
         if window.projects and window.covariance is not None:
             # A projection moves by deviations of the observer, and rounds to a share of these.
             variances = window.covariance[window.start : window.end + 1].diagonal(0, 1, 2)

@@ -17,7 +17,7 @@ from qpmhe_solvers.solver import ContainedSolver
 from .._checks import check_problem
 from ..costs import Cost, lifted
 from ..errors import InvalidInputError, ObserverWarning
-from ..memory.record import Mark, MemoryRecord
+from ..memory.record import MemoryRecord
 from ..memory.snapshot import reading
 from ..model.captured import ComparisonTimes, Due
 from ..model.derivatives import Nearby
@@ -44,8 +44,14 @@ Array = NDArray[np.float64]
 
 
 class Tools(NamedTuple):
-    """The objects that a step uses; rebuilt if the usual conditions change."""
+    """The objects that a step uses; rebuilt if the usual conditions change.
 
+    ``given`` is the system without these, ``system`` the one with them; both are evaluated by a
+    model of this engine's own, which notes what is taken ``nearby``.
+    """
+
+    given: System
+    nearby: tuple[Nearby, Nearby]
     usual: Conditions
     system: System
     cost: Cost
@@ -55,14 +61,6 @@ class Tools(NamedTuple):
     optimizer: Optimizer
 
 
-class Memory(NamedTuple):
-    """All that an estimator remembers, and how it goes on from there."""
-
-    system: System
-    tools: Tools
-    window: Window
-
-
 class PythonEngine:
     """The step in Python: window, problem, optimizer, estimate.
 
@@ -70,7 +68,6 @@ class PythonEngine:
     """
 
     name = "python"
-    _system: System
 
     def __init__(
         self,
@@ -87,8 +84,7 @@ class PythonEngine:
             # A trace saves little here, and the observer is the user's to the last bit. The metric
             # of a projection that settles needs exact Jacobians.
             system = system.as_written()
-        self._use_system(system)
-        system = self._system
+        system = _with_own_model(system)
         self._observer, self._given_cost = observer, cost
         self._cost = cost = lifted(cost, system.disturbance_matrix, observer.initial_covariance())
         self._to_disturbances = None if cost.space is None else cost.space.to_disturbances
@@ -103,10 +99,9 @@ class PythonEngine:
             solver.prepare((settings.horizon + 1) * system.n)
         if system.constraints is not None and not system.constraints.is_scaled:
             system = with_scaled_constraints(system, observer, self._given_cost, initial_state)
-            self._system = system
         self._reader = ConditionReader(system, self._given_cost)
-        self._tools = self._tools_for(usual_conditions(settings))
-        self._system.evaluation.prepare(settings.horizon, self._tools.form.by_entries)
+        self._tools = self._tools_for(usual_conditions(settings), system)
+        system.evaluation.prepare(settings.horizon, self._tools.form.by_entries)
         penalties = self._tools.formulation.sum.penalties
         if settings.qp_limit and penalties is not None:
             solver.prepare((settings.horizon + 1) * (system.n + penalties.size))
@@ -118,19 +113,14 @@ class PythonEngine:
         self._watch = ObserverWatch(settings.horizon)
         # When the traces are compared with the functions that they stand for.
         self._times = ComparisonTimes(system.traced_functions, settings.time_budget is None)
-        self._undo_point: Mark
-
-    def _use_system(self, system: System) -> None:
-        """Take a system, with a model of this engine's own, which notes what is taken nearby."""
-        self._system = system = system.evaluated_by(system.evaluation.copy())
-        self._nearby = _nearby(system)
+        self._undo: Callable[[], None]
 
     def _tools_for(
-        self, usual: Conditions, fits: Callable[[WholeForm], bool] = lambda _: True, /
+        self, usual: Conditions, given: System, fits: Callable[[WholeForm], bool] = lambda _: True
     ) -> Tools:
         """What a step uses under these usual conditions, with matrices in a form that fits."""
         settings = self._settings
-        system, cost = usual.applied(self._system, self._cost)
+        system, cost = usual.applied(given, self._cost)
         form = form_for(system, self._observer, cost, settings, self._solver)
         if not fits(form):
             form = WholeForm(system.n, system.p)
@@ -139,7 +129,7 @@ class PythonEngine:
             system, formulation.constraints, settings.horizon, formulation.sum.penalties, form
         )
         return Tools(
-            usual, system, cost, form, formulation, subproblem,
+            given, _nearby(given), usual, system, cost, form, formulation, subproblem,
             Optimizer(subproblem, self._solver, settings),
         )
 
@@ -231,7 +221,7 @@ class PythonEngine:
 
     def verify(self, u: Array, everywhere: bool = True, level: int = 4) -> bool:
         """Compare traces and functions at z(t); take the functions for good where they differ."""
-        window, system = self._window, self._system
+        window, system = self._window, self._tools.given
         where = [(window.candidate[-1], u), *(system.usual_points() if everywhere else ())]
         fault = system.fault(where)
         if not fault:
@@ -243,18 +233,12 @@ class PythonEngine:
 
     def leave_trace(self) -> None:
         """Evaluate the original functions, along the window and from now on."""
-        before = self.memory
-        try:
-            self._use_system(self._system.as_written())
-            self.set(USUAL, None)
-        except BaseException:  # an interrupt: the trace is still there, and compared again
-            self.replace(before)
-            raise
+        self._change(USUAL, None, _with_own_model(self._tools.given.as_written()))
         self._times.end()
 
     def _hold_whole(self, own: Conditions) -> None:
         """Hold matrices whole from now on: a sample brings weights of another pattern."""
-        self.replace(self._checked_memory(self.state_dict(), lambda form: have_form(form, own)))
+        self.replace(*self._checked_memory(self.state_dict(), lambda form: have_form(form, own)))
 
     def _warn(self) -> None:
         watched = self._window.watched
@@ -280,7 +264,7 @@ class PythonEngine:
             status |= outcome.events
         if window.events:
             status |= Status(window.events)
-        one, other = self._nearby
+        one, other = tools.nearby
         if one.used or other.used:
             status |= Status.DERIVATIVE_NEARBY
         if window.failure:
@@ -302,7 +286,7 @@ class PythonEngine:
             offset = trajectory[-1] - candidate.trajectory[-1]
             if problem.wraps:
                 offset = difference(
-                    self._system.state_residual, trajectory[-1], candidate.trajectory[-1]
+                    tools.given.state_residual, trajectory[-1], candidate.trajectory[-1]
                 )
             window.watched = self._watch.counted(
                 window.watched, problem.prior.distance(offset), bool(outcome.dropped)
@@ -315,9 +299,9 @@ class PythonEngine:
             trajectory, residuals = trajectory.copy(), residuals.copy()
             filtered = window.filtered()
         if problem.observed is not None:
-            residuals[:, self._system.n :][~problem.observed] = np.nan
+            residuals[:, tools.given.n :][~problem.observed] = np.nan
         if self._to_disturbances is not None:
-            n = self._system.n
+            n = tools.given.n
             residuals = np.hstack((residuals[:, :n] @ self._to_disturbances.T, residuals[:, n:]))
         estimate = Estimate(
             window.time - 1,
@@ -384,44 +368,45 @@ class PythonEngine:
 
     def _set_undo_point(self, whole: bool) -> None:
         """Save what `undo` needs; all stages where some will be rewritten."""
-        one, other = self._nearby
+        one, other = self._tools.nearby
         one.used = other.used = False
-        self._undo_point = self._window.mark(whole)
+        self._undo = self._window.undo_point(whole)
 
     def undo(self) -> None:
         """Undo the last step; the solver loses its warm start."""
-        self._window.roll_back(self._undo_point)
+        self._undo()
         self._tools.subproblem.forget()
         self._solver.forget()
 
     def reset(self, initial_state: Array, system: System | None = None) -> None:
         """Forget all measurements and start at this state."""
         self._solver.forget()
-        before, tools = self.memory, self._tools
-        try:
-            if system is not None and system.evaluation is not self._system.evaluation:
-                self._use_system(self._system.evaluated_like(system))
-                tools = self._tools_for(tools.usual)
-            window = self._fresh_window(initial_state, tools)
-            self.replace(Memory(self._system, tools, window))
-        except BaseException:
-            self.replace(before)
-            raise
+        tools = self._tools
+        if system is not None and system.evaluation is not tools.given.evaluation:
+            given = _with_own_model(tools.given.evaluated_like(system))
+            tools = self._tools_for(tools.usual, given)
+        self.replace(tools, self._fresh_window(initial_state, tools))
 
     def set(self, changes: Conditions, parameters: Array | None) -> Estimate | None:
         """Change the conditions of all samples in the window and of later ones."""
-        began, before = perf_counter(), self.memory
-        for one in self._nearby:
+        return self._change(changes, parameters, self._tools.given)
+
+    def _change(
+        self, changes: Conditions, parameters: Array | None, given: System
+    ) -> Estimate | None:
+        """Change the conditions, and the system without them."""
+        began, before, window_before = perf_counter(), self._tools, self._window
+        for one in before.nearby:
             one.used = False
-        usual = changes.over(before.tools.usual)
+        usual = changes.over(before.usual)
         if parameters is not None:
             usual = usual._replace(parameters=parameters)
         try:
             with np.errstate(all="ignore"):
-                own = [one.without(changes) for one in before.window.own.values()]
-                tools = self._tools_for(usual, lambda form: have_form(form, *own))
-                window = self._fresh_window(before.window.initial_state, tools)
-                window.take_over(before.window, changes, parameters)
+                own = [one.without(changes) for one in window_before.own.values()]
+                tools = self._tools_for(usual, given, lambda form: have_form(form, *own))
+                window = self._fresh_window(window_before.initial_state, tools)
+                window.take_over(window_before, changes, parameters)
                 if self._reinitialized and window.length:
                     estimates = window.history[: window.end].copy()
                     estimates[0] = window.z[0]  # in the new X
@@ -430,31 +415,30 @@ class PythonEngine:
                 self._tools, self._window = tools, window
                 estimate = self._estimate(began) if window.length else None
                 window.history[window.end] = window.z[0] if estimate is None else estimate.state
-                window.watched = before.window.watched  # no sample more
+                window.watched = window_before.watched  # no sample more
             return estimate
         except BaseException:
-            self.replace(before)
+            self.replace(before, window_before)
             raise
 
     @property
-    def memory(self) -> Memory:
+    def memory(self) -> tuple[Tools, Window]:
         """What `replace` restores."""
-        return Memory(self._system, self._tools, self._window)
+        return self._tools, self._window
 
-    def replace(self, memory: Memory) -> None:
+    def replace(self, tools: Tools, window: Window) -> None:
         """Replace the memory: all of it or, if interrupted, nothing."""
-        before = self.memory
+        before = self._tools, self._window
         try:
-            self._use(memory)
+            self._use(tools, window)
         except BaseException:
-            self._use(before)
+            self._use(*before)
             raise
 
-    def _use(self, memory: Memory) -> None:
-        self._system, self._tools, self._window = memory
-        self._nearby = _nearby(self._system)
-        if self._system.is_traced:
-            self._times.restart(self._window.time)
+    def _use(self, tools: Tools, window: Window) -> None:
+        self._tools, self._window = tools, window
+        if tools.given.is_traced:
+            self._times.restart(window.time)
         else:
             self._times.end()
 
@@ -469,7 +453,7 @@ class PythonEngine:
         """
         tools, own = self._tools, record.own.values()
         if usual is not tools.usual or not have_form(tools.form, *own):
-            tools = self._tools_for(usual, lambda form: have_form(form, *own))
+            tools = self._tools_for(usual, tools.given, lambda form: have_form(form, *own))
         window = self._fresh_window(record.z[record.start], tools)
         if window.metric is not None and metric is not None:
             window.metric.state = metric
@@ -479,7 +463,7 @@ class PythonEngine:
                 window.replay(window.length)
                 if self._reinitialized and window.length:
                     window.reinitialize(window.history[window.start : window.end])
-        self.replace(Memory(self._system, tools, window))
+        self.replace(tools, window)
 
     def run(self, ys: Array, us: Array | None) -> None:
         """None: this engine only takes one sample at a time."""
@@ -527,10 +511,10 @@ class PythonEngine:
         self._solver.forget()
 
     def _description(self) -> dict[str, Any]:
-        return described(self._system, self._observer, self._given_cost, self._settings)
+        return described(self._tools.given, self._observer, self._given_cost, self._settings)
 
     def _size(self) -> tuple[int, ...]:
-        system = self._system
+        system = self._tools.given
         return system.n, system.p, system.m, self._settings.horizon
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -544,33 +528,38 @@ class PythonEngine:
             )
         with reading():
             check_description(state["estimator"], self._description())
-            memory = self._checked_memory(state)
+            tools, window = self._checked_memory(state)
             self._solver.forget()
-        self.replace(memory)
+        self.replace(tools, window)
 
     def _checked_memory(
         self, state: dict[str, Any], fits: Callable[[WholeForm], bool] = lambda _: True
-    ) -> Memory:
+    ) -> tuple[Tools, Window]:
         """The memory in a state, with matrices in a form that fits."""
-        with_terms, given, places = state["linearized"], state["window"], state.get("places", {})
+        with_terms, saved, places = state["linearized"], state["window"], state.get("places", {})
         if not isinstance(with_terms, bool):
             raise TypeError(f"linearized is {with_terms!r}")
+        given = self._tools.given
         tools = self._tools_for(
-            self._reader.load(state["usual"], self._tools.usual),
-            lambda form: form.holds(form.readable(given, places)) and fits(form),
+            self._reader.load(state["usual"], self._tools.usual), given,
+            lambda form: form.holds(form.readable(saved, places)) and fits(form),
         )
-        window = self._fresh_window(np.zeros(self._system.n), tools)
+        window = self._fresh_window(np.zeros(given.n), tools)
         window.load_state_dict(
-            tools.form.taken(tools.form.readable(given, places)),
+            tools.form.taken(tools.form.readable(saved, places)),
             lambda own: self._reader.load(own, tools.usual),
-            may_be_irregular=self._system.has_timed, is_smoothed=self._smoothed,
+            may_be_irregular=given.has_timed, is_smoothed=self._smoothed,
             # A graduated loss may leave the trajectory of a widened one.
             ends_alike=self._cost.graduation == 1.0,
         )
         if window.has_terms and not with_terms:
             with np.errstate(all="ignore"):
                 window.restate()
-        return Memory(self._system, tools, window)
+        return tools, window
+
+
+def _with_own_model(system: System) -> System:
+    return system.evaluated_by(system.evaluation.copy())
 
 
 def _nearby(system: System) -> tuple[Nearby, Nearby]:

@@ -148,7 +148,7 @@ class WindowSamples(MemoryRecord):
         """Mark the missing components of y at stage k; return which are there, or None for all."""
         y = self._stage_views[k].y
         if not math.isfinite(y.dot(y)):
-            self.unusual = True  # first: `roll_back` makes usual again what an interrupt leaves
+            self.unusual = True  # first: undoing makes usual again what an interrupt leaves
             self.is_observed[k] = np.abs(y) < LARGEST  # False for NaN, too
             self._set_weight(k, time)
         elif not self.unusual or False not in self.is_observed[k].tolist():

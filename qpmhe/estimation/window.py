@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import copy
 from functools import cache
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..costs import Cost
-from ..memory.record import Mark, MemoryRecord
+from ..memory.record import MemoryRecord
 from ..model.system import System
 from ..observers import Observer
 from ..terms.base import read_only
@@ -179,7 +180,7 @@ class Window(ObserverSteps):
         of their sizes. The cost J does not: with another prior it is another function.
         """
         count, before, first = np.count_nonzero(self.observed), self.prediction_error, self.start
-        mark, events, failure = self.mark(True), self.events, self.failure
+        undo, events, failure = self.undo_point(True), self.events, self.failure
         newest = copy(self._sample), self._filled, self._nearest
         self.z[first] = self.history[first]
         if self.covariance is not None:
@@ -199,7 +200,7 @@ class Window(ObserverSteps):
             self.events |= _RESTARTED
             self.restarted = self.time
             return True
-        self.roll_back(mark)
+        undo()
         self.events, self.failure = events, failure
         self._sample, self._filled, self._nearest = newest  # which `filtered` reads
         return False
@@ -273,10 +274,17 @@ class Window(ObserverSteps):
             return False
         return bool(np.isfinite(checked).all())
 
-    def roll_back(self, mark: Mark) -> None:
-        """Undo all changes since a mark; see `MemoryRecord.roll_back`."""
-        self._advanced_to = -1
-        super().roll_back(mark)
+    def undo_point(self, whole: bool) -> Callable[[], None]:
+        """What undoes all changes from now on; see `MemoryRecord.undo_point`."""
+        undo = super().undo_point(whole)
+        if self._observers is None:
+            return undo
+
+        def with_observers() -> None:
+            self._advanced_to = -1
+            undo()
+
+        return with_observers
 
     def load_state_dict(self, *arguments: Any, **options: Any) -> None:
         """Load a snapshot; see `MemoryRecord.load_state_dict`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from operator import attrgetter
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +27,6 @@ class Slot(Protocol):
 
     def checked(self, saved: Any) -> Any:
         """The state that `state_dict` saved; raises any exception if it is damaged."""
-
-
-class Mark(NamedTuple):
-    """A point to which a record can be rolled back: what a sample changes."""
-
-    values: tuple[Any, ...]
-    own: dict[int, Any]
-    slots: tuple[Any, ...]
-    rows: dict[str, Array] | None
-    newest: tuple[bool, Array] | None
 
 
 class MemoryRecord:
@@ -120,8 +110,8 @@ class MemoryRecord:
         self.last_good = initial_state.copy()
         self.last_good_covariance = None if covariance is None else covariance.copy()
         self._single = tuple(one.name for one in sizes.fields("both", "once"))
-        self._marked = ("start", "end", "unusual", *self._single)
-        self._values = attrgetter(*self._marked)
+        self._undone = ("start", "end", "unusual", *self._single)
+        self._values = attrgetter(*self._undone)
         self.z[0] = self.history[0] = initial_state
         if self.covariance is not None:
             self.covariance[0] = covariance
@@ -181,31 +171,33 @@ class MemoryRecord:
         for name, array in self.rows.items():
             array[first : first + len(kept[name])] = kept[name]
 
-    def mark(self, whole: bool) -> Mark:
-        """What `roll_back` needs; all rows if ``whole``."""
-        return Mark(
-            self._values(self),
-            self.own.copy() if self.own else {},
-            tuple([slot.state for slot in self.slots.values()]) if self.slots else (),
-            self.copies() if whole else None,
-            # A step that finds the newest covariance vague begins with writing its root.
-            None if self.root is None else (self.is_vague[self.end], self.root[self.end].copy()),
-        )
+    def undo_point(self, whole: bool) -> Callable[[], None]:
+        """What undoes all changes from now on; those of older stages only if ``whole``.
 
-    def roll_back(self, mark: Mark) -> None:
-        """Undo all changes since a mark, which must be later than the last `make_room`."""
-        unusual = self.unusual
-        for name, value in zip(self._marked, mark.values, strict=True):
-            setattr(self, name, value)
-        self.own = mark.own
-        for slot, state in zip(self.slots.values(), mark.slots, strict=True):
-            slot.state = state
-        if mark.rows is not None:
-            self._write(mark.rows, self.start)
-        if mark.newest is not None and self.root is not None:
-            self.is_vague[self.end], self.root[self.end] = mark.newest
-        if unusual:
-            self._make_usual(self.end)
+        It works until the next `make_room`.
+        """
+        values, own = self._values(self), self.own.copy() if self.own else {}
+        states = [slot.state for slot in self.slots.values()] if self.slots else ()
+        rows = self.copies() if whole else None
+        # A step that finds the newest covariance vague begins with writing its root.
+        k, root = self.end, self.root
+        is_vague, newest = self.is_vague[k], None if root is None else root[k].copy()
+
+        def undo() -> None:
+            unusual = self.unusual
+            for name, value in zip(self._undone, values, strict=True):
+                setattr(self, name, value)
+            self.own = own
+            for slot, state in zip(self.slots.values(), states, strict=True):
+                slot.state = state
+            if rows is not None:
+                self._write(rows, self.start)
+            if root is not None:
+                self.is_vague[k], root[k] = is_vague, newest
+            if unusual:
+                self._make_usual(self.end)
+
+        return undo
 
     def copy_from(self, other: MemoryRecord) -> None:
         """Take over what both engines have from another record, which is not shared with it."""

@@ -69,14 +69,14 @@ def test_it_keeps_what_a_list_of_rows_keeps(kind):
     }
     for t in range(90):
         if record.end == record.room:
-            record.make_room()  # no mark outlives it
-        before, mark = window(record), record.mark(whole=t % 3 == 0)
+            record.make_room()  # no undo point outlives it
+        before, undo = window(record), record.undo_point(whole=t % 3 == 0)
         push(record, generator)
         if t % 4 == 1:
-            if t % 3 == 0:  # all rows were marked
+            if t % 3 == 0:  # all rows are undone
                 for array in record.rows.values():
                     array[record.start : record.end] = 0
-            record.roll_back(mark)
+            undo()
             assert window(record) == before
             push(record, generator)
         for name, rows in kept.items():
