@@ -25,7 +25,8 @@ from ..estimation.conditions import ConditionReader, Conditions, usual_condition
 from ..estimation.engine import PythonEngine, Tools
 from ..estimation.estimate import Estimate, Status
 from ..estimation.limits import FEASIBLE, LARGEST
-from ..estimation.optimizer import Optimizer, Outcome
+from ..estimation.optimizer import Optimizer
+from ..estimation.outcome import Outcome
 from ..estimation.problem import Problem
 from ..estimation.settings import Settings
 from ..estimation.start import check_start

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -19,6 +19,7 @@ from ..terms.information import prior_units
 from .apparent import apparent_information
 from .bank import Array, FilterBank, Filtered, Hypothesis, Mask
 from .causes import in_words
+from .correlations import OUTLIER, Correlations, coloured
 from .faults import SCALED, Evidence, Fault
 from .findings import Finding, Names, listed, number, percent
 from .search import search
@@ -32,9 +33,6 @@ _FILTERS = 40
 # Fewer samples with measurements say nothing about a covariance. Where the model fails, so many of
 # the longest stretches between are tried.
 LEAST_SAMPLES, _STRETCHES = 30, 3
-_LAGS = 20
-# In deviations of the innovations.
-_OUTLIER = 4.0
 # The data do not see a direction in which they say so much less than the prior; nor has a filter
 # seen it whose variance is still this share of the prior's. It matters if this share remains.
 _UNSEEN, _UNLEARNT, _REMAINS = 0.1, 0.5, 0.5
@@ -52,36 +50,15 @@ _FAILING, _KEPT, _WEAK_PRIOR, _REJECTED = 0.02, 0.5, 0.1, 0.02
 _SUITS = 0.3, 1.5
 # Correlations of innovations that matter, and how sure they must be.
 _CORRELATED, _SURE = 0.2, 1e-6
-# Those that raise doubts about what was found if they remain with it; also over so few samples.
-_COLOURED, _DOUBTFUL, _SOON = 0.1, 1e-5, 5
+# Those that raise doubts about what was found if they remain with it.
+_COLOURED, _DOUBTFUL = 0.1, 1e-5
 _CAUSES = (
     "Possible causes: noise that is correlated in time, a sensor's lag, gain or bias, and a "
     "parameter or a state that the model lacks."
 )
 _DOUBT = "This is not certain: the innovations stay coloured with it."
-# Pairs that have a correlation, and the share of its mean square by which a signal varies.
-_PAIRS, _CONSTANT = 3, 1e-12
 # Samples at the start, at least, that are no evidence: a filter needs some to forget it.
 _START = 10
-
-
-@dataclass(frozen=True, eq=False)
-class Correlations:
-    """Correlations of the normalised innovations.
-
-    Attributes
-    ----------
-    own : (L + 1, p) array
-        Autocorrelation of each sensor's innovations at lags 0, ..., L.
-    inputs : (L + 1, p, 2 m) array
-        Correlation with the inputs and with their changes, at these lags before.
-    limit : float
-        Limit that contains 95 % of the correlations of white innovations.
-    """
-
-    own: Array
-    inputs: Array
-    limit: float
 
 
 class Examination:
@@ -117,8 +94,8 @@ class Examination:
         self.nis_limits, self.nis_mean = _limits(system.p), float(np.nansum(self.nis) / count)
         low, high = _limits(count)
         self.nis_mean_limits = low / count, high / count
-        self.correlations = self._correlations(self.normalised)
-        far = np.abs(self.normalised) > _OUTLIER
+        self.correlations = Correlations.of(self.normalised, self._signals(self.normalised))
+        far = np.abs(self.normalised) > OUTLIER
         if same:  # those that the search has left out, if any
             left_out = np.isfinite(self.base.measurements) & ~np.isfinite(self.along.innovations)
             far = left_out if left_out.any() else far
@@ -202,18 +179,18 @@ class Examination:
         )
         faults, corrected = search(evidence)
         best, why = bank.run([corrected]), ""
-        coloured = self._colour(best.normalised, _COLOURED, _DOUBTFUL) if faults else []
+        remains = self._colour(best.normalised, _COLOURED, _DOUBTFUL) if faults else []
         scaled = [k for k, one in enumerate(faults) if one.kind in SCALED]
         if scaled:
             before = faults[: scaled[0]]
-            if coloured:
+            if remains:
                 why = "Factors of Q and R do not make them white. "
                 rest = before[-1].hypothesis if before else base
                 if rest.noise.ndim == base.noise.ndim:
                     rest = replace(rest, noise=base.noise, disturbance=base.disturbance)
                 faults, best, corrected = before, bank.run([rest]), rest
         return faults, best, [
-            (*one, why) for one in sorted(coloured, key=lambda one: -abs(one[2]))
+            (*one, why) for one in sorted(remains, key=lambda one: -abs(one[2]))
         ], corrected
 
     def _searched(self) -> tuple[FilterBank, Hypothesis, Filtered, int]:
@@ -310,38 +287,12 @@ class Examination:
             yield from self._unseen()
             yield from self._apparent()
 
-    def _correlations(self, normalised: Array) -> Correlations:
-        """Correlations of innovations; outliers count as the limit that they exceed."""
-        total, p = normalised.shape
-        lags = min(_LAGS, total // 4)
-        bounded = np.clip(normalised, -_OUTLIER, _OUTLIER)
-        signals = self.inputs[self.first :][:total]
-        both = np.hstack((signals, np.diff(signals, axis=0, prepend=signals[:1])))
-        own, inputs = np.ones((lags + 1, p)), np.zeros((lags + 1, p, both.shape[1]))
-        # A controller may use y(t) for u(t): only earlier inputs are evidence.
-        for lag in range(1, lags + 1):
-            found = _correlations_of(bounded[lag:], np.hstack((bounded, both))[:-lag])
-            own[lag], inputs[lag] = found[:, :p].diagonal(), found[:, p:]
-        seen = int(np.isfinite(normalised).any(axis=1).sum())
-        return Correlations(own, inputs, 1.96 / np.sqrt(max(seen, 1)))
+    def _signals(self, normalised: Array) -> Array:
+        """The inputs of these innovations."""
+        return self.inputs[self.first :][: len(normalised)]
 
     def _colour(self, normalised: Array, least: float, sure: float) -> list[tuple[int, int, float]]:
-        """Sensors whose innovations are not white, with the lag and size of their correlation."""
-        own, there = self._correlations(normalised).own[1:], np.isfinite(normalised)
-        total, p = there.shape
-        lags = np.arange(1, len(own) + 1)
-        # Only pairs of which both were measured are evidence.
-        pairs = np.array([(there[lag:] & there[:-lag]).sum(axis=0) for lag in lags])
-        weights = total * (total + 2) / (total - lags) ** 2
-        sums = np.cumsum(weights[:, None] * pairs * own**2, axis=0)
-        found = []
-        for j in range(p):
-            k = int(np.argmax(np.abs(own[:, j])))
-            ends = {min(_SOON, len(own)), len(own)}
-            chance = min(chi2.sf(sums[some - 1, j], some) for some in ends)
-            if chance < sure and abs(own[k, j]) > least:
-                found.append((j, k + 1, float(own[k, j])))
-        return found
+        return coloured(normalised, self._signals(normalised), least, sure)
 
     def _correlated(self) -> Iterator[Finding]:
         for j, lag, size in self._colour(self.best.normalised, _CORRELATED, _SURE):
@@ -409,7 +360,7 @@ class Examination:
         errors = self.bank.errors(self.base.measurements, expected)
         errors[~np.isfinite(self.null.innovations)] = np.nan
         spread = np.sqrt(np.diagonal(self.null.spreads, axis1=1, axis2=2))
-        squares = [np.clip(one, -_OUTLIER, _OUTLIER) ** 2
+        squares = [np.clip(one, -OUTLIER, OUTLIER) ** 2
                    for one in (errors / spread, self.normalised)]
         own, filters = map(np.nanmean, squares)
         ratio = float(np.sqrt(own / filters)) if filters > 0.0 else 1.0
@@ -611,27 +562,6 @@ def _held(inputs: Array) -> Array:
         last = np.maximum.accumulate(np.where(there, np.arange(column.size), -1))
         column[...] = np.where(last >= 0, column[np.maximum(last, 0)], 0.0)
     return held
-
-
-def _correlations_of(one: Array, other: Array) -> Array:
-    """Correlations of columns (p, q) where both are there; 0 where they are fewer than three."""
-    products = []
-    for x in (one, other):
-        there = np.isfinite(x)
-        x = np.where(there, x - x.mean(axis=0, where=there), 0.0)
-        products.append((there.astype(np.float64), x, x**2))
-    (there, x, squares), (there2, z, squares2) = products
-    counts = there.T @ there2
-    fewest = np.maximum(counts, 1.0)
-    sums, sums2 = x.T @ there2, there.T @ z
-    sizes = []
-    for total, part in ((squares.T @ there2, sums), (there.T @ squares2, sums2)):
-        size = total - part**2 / fewest
-        sizes.append(np.where(size > _CONSTANT * total, size, 0.0))
-    size = np.sqrt(sizes[0] * sizes[1])
-    known = (counts >= _PAIRS) & (size > 0.0)
-    shared = x.T @ z - sums * sums2 / fewest
-    return np.asarray(np.divide(shared, size, out=np.zeros_like(size), where=known))
 
 
 def _direction(vector: Array, names: Sequence[str]) -> str:

@@ -29,11 +29,11 @@ from .engines import EngineChangeError, engine_for, engine_for_record
 from .estimate import Estimate
 from .estimator_memory import EstimatorMemory
 from .reach import compared
-from .run import FixedLag, Run, RunSource
+from .run import Run, RunSource
 from .sample_arguments import SampleArguments, with_parameters
 from .settings import Settings
 from .start import check_cost, nominal_parameters, require, with_scaled_constraints
-from .step_length import TriedInputs, check_step, explosion
+from .step_length import StepCheck
 from .time_index import names_of, paired_record
 
 Array = NDArray[np.float64]
@@ -207,8 +207,8 @@ class MovingHorizonEstimator(EstimatorMemory):
         ))
         self._arguments = SampleArguments(system, cost, self.settings.parameters)
         self._takes_steps = False  # whether a step of another length has been tried
-        self._tried = None if is_copy or not self._arguments.inputs else TriedInputs()
-        self._step_error = 0.0  # of which the user has been warned
+        self._step_check = StepCheck(cost, observer.initial_covariance())
+        self._tries_inputs = not is_copy and self._arguments.inputs > 0
         # The system as this estimator evaluates it.
         self._initial_state: Array
         self._initial_state, self._own_system = self._checked_start(initial_state, own)
@@ -218,7 +218,7 @@ class MovingHorizonEstimator(EstimatorMemory):
             usual = self._arguments.usual_input
             check_correction(self._own_system, observer, cost, self._initial_state, usual)
             place = cost, observer.initial_covariance(), self._initial_state, usual
-            self._step_error = check_step(self._own_system, *place, 3)
+            self._step_check.warn(self._own_system, self._initial_state, usual, 3)
             check_branches(self._own_system, *place, 3)
             self._own_system = compared(self._own_system, *place, horizon)
         self._own_system = with_scaled_constraints(
@@ -346,10 +346,7 @@ class MovingHorizonEstimator(EstimatorMemory):
             Whether they agree. If not, an `EngineWarning` names the function and the point, and the
             estimator evaluates the functions as they are written from now on.
         """
-        self._step_error = check_step(
-            self._own_system, self.cost, self.observer.initial_covariance(), self.state,
-            self._arguments.input, 2, self._step_error,
-        )
+        self._step_check.warn(self._own_system, self.state, self._arguments.input, 2)
         try:
             return self._engine.verify(self._arguments.usual_input)
         except EngineChangeError as change:
@@ -425,15 +422,10 @@ class MovingHorizonEstimator(EstimatorMemory):
         self._check_inputs(us, 3)
 
     def _check_inputs(self, us: Array, level: int) -> None:
-        if self._tried is None:
-            return
-        tried = self._tried.new(us)
-        whole = with_parameters(tried, len(tried), self._engine.usual)
-        if whole is not None and len(tried):
-            self._step_error = check_step(
-                self._own_system, self.cost, self.observer.initial_covariance(),
-                self._initial_state, whole, level, self._step_error,
-            )
+        new = self._step_check.new_inputs(us) if self._tries_inputs else us[:0]
+        whole = with_parameters(new, len(new), self._engine.usual)
+        if whole is not None and len(new):
+            self._step_check.warn(self._own_system, self._initial_state, whole, level)
 
     def step_fault(self, estimate: Estimate) -> str:
         """Whether the model failed by the step of a discretised ODE, and what to do about it.
@@ -450,10 +442,8 @@ class MovingHorizonEstimator(EstimatorMemory):
             observer's states in the window, with the newest inputs.
         """
         finite = np.isfinite(estimate.candidate).all(axis=1)
-        return explosion(
-            self._own_system, self.cost, self.observer.initial_covariance(),
-            (self._initial_state, *estimate.candidate[finite]), self._arguments.input,
-        )
+        states = self._initial_state, *estimate.candidate[finite]
+        return self._step_check.explosion(self._own_system, states, self._arguments.input)
 
     def _check_step_length(self, dt: float) -> None:
         """Check once, before a sample is taken, that the model takes step lengths."""
@@ -579,23 +569,7 @@ class MovingHorizonEstimator(EstimatorMemory):
             at_once.source = self.run_source(ys, whole, None, time_unit, labels)
             at_once.index, at_once.engine_reason = index, reason
             return at_once
-        start, observer_start = self.state.copy(), self.observer_state
-        late = None if smoothed is None else FixedLag(start, smoothed, covariances)
-        estimates, collected = [], []
-        for t, y in enumerate(ys):
-            estimates.append(self.update(
-                y, None if us is None else us[t], dt=None if lengths is None else lengths[t]
-            ))
-            errors = self.known_covariances() if covariances else None
-            if errors is not None:
-                collected.append(errors[-1].copy())
-            if late is not None:
-                late.add(estimates[-1], errors)
-        n = self.system.n
-        blocks = np.array(collected).reshape(-1, n, n) if covariances else None
-        run = Run.of(start, estimates, blocks, observer_start=observer_start)
-        if late is not None:
-            run.smoothed, run.smoothed_covariances = late.smoothed()
+        run = Run.by_updates(self, ys, us, lengths, covariances, smoothed)
         run.source, run.index = self.run_source(ys, whole, lengths, time_unit, labels), index
         run.engine_reason = reason
         return run
@@ -619,18 +593,3 @@ class MovingHorizonEstimator(EstimatorMemory):
 
 
 _UPDATE = MovingHorizonEstimator.update.__code__
-
-
-def reweighted(
-    known: MovingHorizonEstimator, observer: Observer, cost: Cost
-) -> MovingHorizonEstimator:
-    """An estimator as a known one was at first, with another observer and cost.
-
-    Neither the model nor the length of its steps is tried again, and no warning is given twice.
-    """
-    made = MovingHorizonEstimator.__new__(MovingHorizonEstimator)
-    made.settings = known.settings
-    made.__init__(  # type: ignore[misc]  # as `__setstate__` does
-        known.system, observer, cost, initial_state=known.initial_state, **vars(known.settings)
-    )
-    return made

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ..sensitivity import Sensitivity
 
 Array = NDArray[np.float64]
+Estimator = TypeVar("Estimator", bound="EstimatorMemory")
 
 
 class EstimatorMemory:
@@ -311,3 +312,16 @@ class EstimatorMemory:
             # How the model is called and scaled depends on both; X is that of `set` by now.
             self.reset(saved["initial_state"])
             self.load_state_dict(saved["state"])
+
+
+def reweighted(known: Estimator, observer: Observer, cost: Cost) -> Estimator:
+    """An estimator as a known one was at first, with another observer and cost.
+
+    Neither the model nor the length of its steps is tried again, and no warning is given twice.
+    """
+    made = type(known).__new__(type(known))
+    made.settings = known.settings
+    made.__init__(  # type: ignore[misc]  # as `__setstate__` does
+        known.system, observer, cost, initial_state=known.initial_state, **vars(known.settings)
+    )
+    return made

@@ -24,6 +24,8 @@ from .time_index import elapsed_times, read_index, stored_index, unit_name
 if TYPE_CHECKING:
     import pandas
 
+    from .estimator import MovingHorizonEstimator
+
 Array = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
@@ -242,6 +244,42 @@ class Run:
             rejected_sensors=np.array([e.rejected for e in estimates]) if estimates else None,
             engine=", then ".join(dict.fromkeys(one.engine for one in estimates)) or "python",
         )
+
+    @classmethod
+    def by_updates(
+        cls, mhe: MovingHorizonEstimator, measurements: Array, inputs: Array | None,
+        steps: Array | None, covariances: bool, lag: int | None,
+    ) -> Run:
+        """Update an estimator with each sample of a record, and collect the estimates.
+
+        Parameters
+        ----------
+        mhe : MovingHorizonEstimator
+            The estimator.
+        measurements, inputs, steps : array
+            As for `RunSource`; inputs without the estimator's parameters.
+        covariances : bool
+            Whether to compute the covariance of each estimate.
+        lag : int or None
+            The samples by which states are smoothed, if they are.
+        """
+        start, observer_start = mhe.state.copy(), mhe.observer_state
+        late = None if lag is None else FixedLag(start, lag, covariances)
+        estimates, collected = [], []
+        for t, y in enumerate(measurements):
+            estimates.append(mhe.update(
+                y, None if inputs is None else inputs[t], dt=None if steps is None else steps[t]
+            ))
+            errors = mhe.known_covariances() if covariances else None
+            if errors is not None:
+                collected.append(errors[-1].copy())
+            if late is not None:
+                late.add(estimates[-1], errors)
+        blocks = np.array(collected).reshape(-1, start.size, start.size) if covariances else None
+        run = cls.of(start, estimates, blocks, observer_start=observer_start)
+        if late is not None:
+            run.smoothed, run.smoothed_covariances = late.smoothed()
+        return run
 
     @cached_property
     def statuses(self) -> list[Status]:

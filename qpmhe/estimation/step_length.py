@@ -143,6 +143,83 @@ class StepComparison:
         )
 
 
+class StepCheck:
+    """What an estimator says of the step of its discretised ODE where that is too long.
+
+    Parameters
+    ----------
+    cost, covariance
+        As for `reached`.
+    """
+
+    def __init__(self, cost: Cost, covariance: Array | None) -> None:
+        self._cost, self._covariance = cost, covariance
+        self._known = 0.0  # the error of which the user has been warned
+        self._range: tuple[Array, Array] | None = None  # of the inputs so far
+
+    def warn(self, system: System, state: Array, u: Array, level: int) -> None:
+        """Warn, at a level of the stack, where the step is too long.
+
+        Arguments are those of `StepComparison`. Later errors are worth a warning where they are ten
+        times as large as the last one of which there was one.
+        """
+        found = _comparison(system, self._cost, self._covariance, state, u)
+        if found is None or found[1].is_harmless or not found[1].deviations > 10.0 * self._known:
+            return
+        comparison, error = found
+        self._known = error.deviations
+        point = np.array2string(error.point, precision=4, separator=", ")
+        if error.inputs.any():
+            point += f" with u = {np.array2string(error.inputs, precision=4, separator=', ')}"
+        differs = (
+            f"differs from that of half the length by {error.deviations:.2g} standard deviations "
+            f"of the disturbance in state {error.component} (expected at most {error.most:g})"
+            if np.isfinite(error.deviations) else
+            f"and that of half the length are not both finite in state {error.component}"
+        )
+        warnings.warn(
+            f"{_named(system)} is too long: from x = {point} the result {differs}, so estimates "
+            f"may be wrong though each step improves its cost: {_remedy(comparison)}. Or make the "
+            "covariance of the disturbance as large as the error.",
+            ModelWarning,
+            stacklevel=level + 1,
+        )
+
+    def new_inputs(self, inputs: Array) -> Array:
+        """Of the finite inputs (T, m), the outermost ones if they lie beyond those so far, by half.
+
+        An input that creeps or jitters is new a few times, not at each sample.
+        """
+        inputs = inputs[np.isfinite(inputs).all(axis=1)]
+        if not len(inputs):
+            return inputs
+        least, most = inputs.min(axis=0), inputs.max(axis=0)
+        if self._range is not None:
+            low, high = self._range
+            margin = 0.5 * (high - low)
+            if (least >= low - margin).all() and (most <= high + margin).all():
+                return inputs[:0]
+            least, most = np.minimum(least, low), np.maximum(most, high)
+        self._range = least, most
+        rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
+        return inputs[sorted(rows)]
+
+    def explosion(self, system: System, states: Iterable[Array], u: Array) -> str:
+        """Why a model may fail: a step that is far too long near some states, and the remedy.
+
+        Blank where it is not. Other arguments are those of `StepComparison`.
+        """
+        for state in states:
+            found = _comparison(system, self._cost, self._covariance, state, u)
+            if found is not None and found[1].deviations > _FAR_TOO_LONG:
+                step = _named(system)
+                return (
+                    f"{step[0].upper()}{step[1:]} is far too long near such states: "
+                    f"{_remedy(found[0])}."
+                )
+        return ""
+
+
 def step_error(
     system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
 ) -> StepError | None:
@@ -169,57 +246,6 @@ def step_errors(
     return errors
 
 
-def check_step(
-    system: System, cost: Cost, covariance: Array | None, state: Array, u: Array, level: int,
-    known: float = 0.0,
-) -> float:
-    """Warn, at a level of the stack, where the step of a discretised ODE is too long.
-
-    Other arguments are those of `StepComparison`. What was warned of before, an error of `known`
-    deviations, is worth a second warning where it is ten times as large. The error of which the
-    user has been warned; 0 without any.
-    """
-    found = _comparison(system, cost, covariance, state, u)
-    if found is None or found[1].is_harmless or not found[1].deviations > 10.0 * known:
-        return known
-    comparison, error = found
-    point = np.array2string(error.point, precision=4, separator=", ")
-    if error.inputs.any():
-        point += f" with u = {np.array2string(error.inputs, precision=4, separator=', ')}"
-    differs = (
-        f"differs from that of half the length by {error.deviations:.2g} standard deviations of "
-        f"the disturbance in state {error.component} (expected at most {error.most:g})"
-        if np.isfinite(error.deviations) else
-        f"and that of half the length are not both finite in state {error.component}"
-    )
-    warnings.warn(
-        f"{_named(system)} is too long: from x = {point} the result {differs}, so estimates may be "
-        f"wrong though each step improves its cost: {_remedy(comparison)}. Or make the covariance "
-        "of the disturbance as large as the error.",
-        ModelWarning,
-        stacklevel=level + 1,
-    )
-    return error.deviations
-
-
-def explosion(
-    system: System, cost: Cost, covariance: Array | None, states: Iterable[Array], u: Array
-) -> str:
-    """Why a model may fail: a step that is far too long near some states, and the remedy.
-
-    Blank where it is not. Other arguments are those of `StepComparison`.
-    """
-    for state in states:
-        found = _comparison(system, cost, covariance, state, u)
-        if found is not None and found[1].deviations > _FAR_TOO_LONG:
-            step = _named(system)
-            return (
-                f"{step[0].upper()}{step[1:]} is far too long near such states: "
-                f"{_remedy(found[0])}."
-            )
-    return ""
-
-
 def _named(system: System) -> str:
     steps = f"{system.steps} substeps" if system.steps > 1 else "one step"
     return f"{steps} of {system.method} in dt = {system.dt:g}"
@@ -233,32 +259,6 @@ def _remedy(comparison: StepComparison) -> str:
         f"{' or '.join(remedies)} is fine enough" if remedies
         else "take more substeps (steps=), or for stiff rates method='radau'"
     )
-
-
-class TriedInputs:
-    """The range of the inputs with which a step was compared: what lies beyond it is new."""
-
-    def __init__(self) -> None:
-        self._range: tuple[Array, Array] | None = None
-
-    def new(self, inputs: Array) -> Array:
-        """Of the finite inputs (T, m), the outermost ones if they lie beyond the range, by half.
-
-        An input that creeps or jitters is new a few times, not at each sample.
-        """
-        inputs = inputs[np.isfinite(inputs).all(axis=1)]
-        if not len(inputs):
-            return inputs
-        least, most = inputs.min(axis=0), inputs.max(axis=0)
-        if self._range is not None:
-            low, high = self._range
-            margin = 0.5 * (high - low)
-            if (least >= low - margin).all() and (most <= high + margin).all():
-                return inputs[:0]
-            least, most = np.minimum(least, low), np.maximum(most, high)
-        self._range = least, most
-        rows = {0, *np.argmax(inputs, axis=0).tolist(), *np.argmin(inputs, axis=0).tolist()}
-        return inputs[sorted(rows)]
 
 
 def _most(method: str | None) -> float:

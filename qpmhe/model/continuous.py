@@ -1,12 +1,15 @@
-"""Systems of differential equations and of equations: the makers of `System`."""
+"""Systems of differential equations and of equations: how they are made, and their steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Unpack, cast
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from ..errors import InvalidInputError
 from .dae import made_from_dae, made_from_implicit
 from .functions import Trusted
 from .implicit_steps import COLLOCATIONS
@@ -15,13 +18,23 @@ from .sets import ConvexSet, SoftSet
 from .system_arguments import SystemOptions
 
 if TYPE_CHECKING:
+    from .model import Model, Origin
     from .system import System
+    from .traces import ModelTrace
 
+Array = NDArray[np.float64]
 Function = Callable[..., Any]
 
 
 class ContinuousTime:
     """The part of `System` by which models in continuous time are discretised."""
+
+    if TYPE_CHECKING:
+        n: int
+        m: int
+        origin: Origin
+        tracing: ModelTrace | None
+        evaluation: Model
 
     @classmethod
     def from_ode(
@@ -238,3 +251,90 @@ class ContinuousTime:
             how=how, guess=algebraic_guess, rate_guess=rate_guess, options=options,
             algebraic_set=algebraic_set, tolerance=allowed,
         )
+
+    @property
+    def dt(self) -> float | None:
+        """Sampling time of a discretised ODE; None for a discrete-time model."""
+        return self.origin.dt
+
+    @property
+    def method(self) -> str | None:
+        """How it is discretised; None for a discrete-time model."""
+        return None if self.origin.how is None else self.origin.how.method
+
+    @property
+    def steps(self) -> int:
+        """Number of substeps of an ODE in a sample; 1 for a discrete-time system."""
+        return 1 if self.origin.how is None else self.origin.how.steps
+
+    @property
+    def has_timed(self) -> bool:
+        """Whether it takes steps of other lengths: see `timed`."""
+        return self.origin.make_timed is not None
+
+    @property
+    def has_other_steps(self) -> bool:
+        """Whether it takes steps of other lengths that the trace knows nothing of."""
+        return self.has_timed and (self.tracing is None or self.tracing.dt is None)
+
+    @cached_property
+    def timed(self) -> System:
+        """The same system with the length of the step as one more input, behind the others.
+
+        Raises
+        ------
+        InvalidInputError
+            If the system has no model in continuous time.
+        """
+        user = self.evaluation.system
+        if self.evaluation is not user.evaluation:
+            return user.timed.evaluated_by(self.evaluation.timed)
+        if self is not user:
+            return user.timed
+        if self.origin.make_timed is None:
+            raise InvalidInputError(
+                "the system is discrete; steps of another length need a model in continuous "
+                "time, see System.from_ode."
+            )
+        return self.origin.make_timed(self)
+
+    def discretized(self, method: str, steps: int) -> System | None:
+        """The same model in continuous time by another discretisation; None if there is none.
+
+        Parameters
+        ----------
+        method, steps
+            As for `from_ode`.
+        """
+        if self.dt is None or self.origin.recipe is None:
+            return None
+        maker, arguments = self.origin.recipe
+        # Of parameters or noisy inputs among its states.
+        inner = next((name for name in ("f", "system") if isinstance(
+            arguments.get(name), ContinuousTime)), None)
+        if inner is not None:
+            found = arguments[inner].discretized(method, steps)
+            return None if found is None else maker(**arguments | {inner: found})
+        if "method" not in arguments:
+            return None
+        made: System = maker(**arguments | {"method": method, "steps": steps})
+        return made
+
+    def algebraic_states(self, x: ArrayLike, u: ArrayLike | None = None) -> Array:
+        """The algebraic states z (..., k) at states x (..., n) and inputs u (..., m); NaN for none.
+
+        Parameters
+        ----------
+        x, u : array_like
+            States, such as those of an estimate, and inputs, which may be left out if m is 0.
+
+        Raises
+        ------
+        InvalidInputError
+            If the system has none (see `from_dae`), or u is missing.
+        ShapeError
+            If the last dimension is not n or m.
+        """
+        if self.origin.equations is None:
+            raise InvalidInputError("the system has no algebraic states; see System.from_dae.")
+        return self.origin.equations.algebraic_states(x, u, self.n, self.m)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
 from inspect import signature
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
@@ -16,7 +15,7 @@ from qpmhe_solvers.errors import check_options, report_unknown_options
 from qpmhe_solvers.values import shown
 
 from .._checks import dimension
-from ..errors import InvalidInputError, ModelError
+from ..errors import ModelError
 from .constraint import Constraint, checked_constraints
 from .constraints import ConstraintFunctions
 from .continuous import ContinuousTime
@@ -417,21 +416,6 @@ class System(ContinuousTime):
         return self.evaluation.scales
 
     @property
-    def dt(self) -> float | None:
-        """Sampling time of a discretised ODE; None for a discrete-time model."""
-        return self.origin.dt
-
-    @property
-    def method(self) -> str | None:
-        """How it is discretised; None for a discrete-time model."""
-        return None if self.origin.how is None else self.origin.how.method
-
-    @property
-    def steps(self) -> int:
-        """Number of substeps of an ODE in a sample; 1 for a discrete-time system."""
-        return 1 if self.origin.how is None else self.origin.how.steps
-
-    @property
     def held(self) -> Mapping[int, float]:
         """Parameters that a window without information on them holds: see `Origin`."""
         return self.origin.held
@@ -440,11 +424,6 @@ class System(ContinuousTime):
     def signals(self) -> Signals | None:
         """Names, units and starts of its variables; None where its origin knows none."""
         return self.origin.signals
-
-    @property
-    def has_timed(self) -> bool:
-        """Whether it takes steps of other lengths: see `timed`."""
-        return self.origin.make_timed is not None
 
     @property
     def r(self) -> int:
@@ -458,70 +437,9 @@ class System(ContinuousTime):
         covariance: Array = self.disturbance_matrix @ disturbance @ self.disturbance_matrix.T
         return 0.5 * (covariance + covariance.T)
 
-    def algebraic_states(self, x: ArrayLike, u: ArrayLike | None = None) -> Array:
-        """The algebraic states z (..., k) at states x (..., n) and inputs u (..., m); NaN for none.
-
-        Parameters
-        ----------
-        x, u : array_like
-            States, such as those of an estimate, and inputs, which may be left out if m is 0.
-
-        Raises
-        ------
-        InvalidInputError
-            If the system has none (see `from_dae`), or u is missing.
-        ShapeError
-            If the last dimension is not n or m.
-        """
-        if self.origin.equations is None:
-            raise InvalidInputError("the system has no algebraic states; see System.from_dae.")
-        return self.origin.equations.algebraic_states(x, u, self.n, self.m)
-
     def __reduce__(self) -> tuple[Any, ...]:
         # Made again from the user's functions: the closures inside cannot be pickled.
         return _made, self.origin.recipe or (type(self), {})
-
-    @cached_property
-    def timed(self) -> System:
-        """The same system with the length of the step as one more input, behind the others.
-
-        Raises
-        ------
-        InvalidInputError
-            If the system has no model in continuous time.
-        """
-        user = self.evaluation.system
-        if self.evaluation is not user.evaluation:
-            return user.timed.evaluated_by(self.evaluation.timed)
-        if self is not user:
-            return user.timed
-        if self.origin.make_timed is None:
-            raise InvalidInputError(
-                "the system is discrete; steps of another length need a model in continuous "
-                "time, see System.from_ode."
-            )
-        return self.origin.make_timed(self)
-
-    def discretized(self, method: str, steps: int) -> System | None:
-        """The same model in continuous time by another discretisation; None if there is none.
-
-        Parameters
-        ----------
-        method, steps
-            As for `from_ode`.
-        """
-        if self.dt is None or self.origin.recipe is None:
-            return None
-        maker, arguments = self.origin.recipe
-        inner = next((name for name in ("f", "system") if isinstance(
-            arguments.get(name), System)), None)  # of parameters or noisy inputs among its states
-        if inner is not None:
-            found = arguments[inner].discretized(method, steps)
-            return None if found is None else maker(**arguments | {inner: found})
-        if "method" not in arguments:
-            return None
-        made: System = maker(**arguments | {"method": method, "steps": steps})
-        return made
 
     @property
     def symbolic(self) -> Any:
@@ -536,11 +454,6 @@ class System(ContinuousTime):
     def no_symbolic(self) -> str:
         """Why ``symbolic`` is None, as text; blank otherwise."""
         return self.evaluation.no_symbolic
-
-    @property
-    def has_other_steps(self) -> bool:
-        """Whether it takes steps of other lengths that the trace knows nothing of."""
-        return self.has_timed and (self.tracing is None or self.tracing.dt is None)
 
     def explain(self) -> str:
         """How f and h are evaluated, and what prevents a faster way, as text.

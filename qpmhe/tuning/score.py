@@ -17,7 +17,8 @@ from ..baselines.base import deviations
 from ..codegen import compile as compile_ahead
 from ..errors import EngineWarning, ObserverWarning, QpmheError
 from ..estimation.engines import python_only
-from ..estimation.estimator import MovingHorizonEstimator, reweighted
+from ..estimation.estimator import MovingHorizonEstimator
+from ..estimation.estimator_memory import reweighted
 from ..model.system import System
 from ..observers import Observer
 from .data import Data
