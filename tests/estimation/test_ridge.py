@@ -7,7 +7,7 @@ import pytest
 
 import qpmhe
 from qpmhe import Status
-from qpmhe.estimation import optimizer
+from qpmhe.estimation import optimizer, outcome
 from qpmhe.estimation.subproblem import Subproblem
 from qpmhe_solvers import Solution, SolveStatus
 from tests.oracles.nist import regression
@@ -73,7 +73,8 @@ def test_no_time_for_a_ridge_is_no_failure_of_the_solver(monkeypatch):
         ahead[0] = 1e6
         return True
 
-    monkeypatch.setattr(optimizer, "perf_counter", lambda: perf_counter() + ahead[0])
+    for module in (optimizer, outcome):
+        monkeypatch.setattr(module, "perf_counter", lambda: perf_counter() + ahead[0])
     monkeypatch.setattr(Subproblem, "give_ridge", give_ridge)
     monkeypatch.setattr(
         Subproblem, "solve", lambda *_: Solution(None, SolveStatus.FAILED, 0, message="no factor")

@@ -113,7 +113,7 @@ def clock(monkeypatch):
             # Half of the way, so that the sequence never converges.
             return RawSolution(0.5 * inner.solve(qp).d, False)
 
-    for module in ("estimator", "engine", "optimizer"):
+    for module in ("estimator", "engine", "optimizer", "outcome"):
         monkeypatch.setattr(f"qpmhe.estimation.{module}.perf_counter", lambda: Clock.now)
     qpmhe.solvers.register(Backend("ticking", Ticking, "a test's"))
     yield Clock
