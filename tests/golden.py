@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import io
+import itertools
 import os
 import pickle
 import statistics
@@ -402,6 +403,7 @@ def compared(there, options, names):
     """Comparisons by engine, and remarks: each lane takes its share of the cases."""
     _, flip = ALLOWED[options.mode]
     totals, remarks = {engine: Comparison() for engine in options.engines}, []
+    total = len(names) * len(options.engines)
 
     def one(before, now, name, engine):
         if options.mode == "resync":
@@ -413,6 +415,8 @@ def compared(there, options, names):
         # The predecessor second: where both have the same C, it finds it compiled.
         return [tree.ask("free", name, engine) for tree in (now, before)]
 
+    done = itertools.count(1)
+
     def lane(share):
         found = []
         with Server(there) as before, Server(HERE) as now:
@@ -422,6 +426,7 @@ def compared(there, options, names):
                         found.append((name, engine, one(before, now, name, engine)))
                     except RuntimeError as error:
                         remarks.append(f"{name}, {engine}: NOT COMPARED: {error}")
+                    print(f"{next(done)} of {total}: {name}, {engine}", file=sys.stderr, flush=True)
         return found
 
     shares = [names[k :: options.processes] for k in range(options.processes)]
