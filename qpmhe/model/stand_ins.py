@@ -159,7 +159,9 @@ def _is_looked_up(frame: Any, name: str) -> bool:
     """Whether the Python code of a frame looks up this name itself.
 
     Not a compiled function that this code calls: it takes an array for what it has asked for,
-    and writes numbers over objects. Nor a module that is imported and keeps what it finds.
+    and writes numbers over objects. NumPy's random generators, whose calls have no frame of their
+    own, ask for ``numpy.empty`` like this, and the process would crash: so the instruction decides,
+    and not the names in the code. Nor a module that is imported and keeps what it finds.
     """
     code = frame.f_code
     if "from_buffer" in code.co_names:  # it may pass on the memory to others, unseen
