@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from copy import copy
 from functools import cache
 from typing import Any
@@ -274,17 +273,10 @@ class Window(ObserverSteps):
             return False
         return bool(np.isfinite(checked).all())
 
-    def undo_point(self, whole: bool) -> Callable[[], None]:
-        """What undoes all changes from now on; see `MemoryRecord.undo_point`."""
-        undo = super().undo_point(whole)
-        if self._observers is None:
-            return undo
-
-        def with_observers() -> None:
-            self._advanced_to = -1
-            undo()
-
-        return with_observers
+    def _restore(self, *saved: Any) -> None:
+        """Undo all changes since an undo point; running observers start again."""
+        self._advanced_to = -1
+        super()._restore(*saved)
 
     def load_state_dict(self, *arguments: Any, **options: Any) -> None:
         """Load a snapshot; see `MemoryRecord.load_state_dict`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from operator import attrgetter
 from typing import Any, Protocol
 
@@ -176,28 +177,33 @@ class MemoryRecord:
 
         It works until the next `make_room`.
         """
-        values, own = self._values(self), self.own.copy() if self.own else {}
-        states = [slot.state for slot in self.slots.values()] if self.slots else ()
-        rows = self.copies() if whole else None
-        # A step that finds the newest covariance vague begins with writing its root.
-        k, root = self.end, self.root
-        is_vague, newest = self.is_vague[k], None if root is None else root[k].copy()
+        return partial(
+            self._restore,
+            self._values(self),
+            self.own.copy() if self.own else {},
+            tuple([slot.state for slot in self.slots.values()]) if self.slots else (),
+            self.copies() if whole else None,
+            # A step that finds the newest covariance vague begins with writing its root.
+            None if self.root is None else (self.is_vague[self.end], self.root[self.end].copy()),
+        )
 
-        def undo() -> None:
-            unusual = self.unusual
-            for name, value in zip(self._undone, values, strict=True):
-                setattr(self, name, value)
-            self.own = own
-            for slot, state in zip(self.slots.values(), states, strict=True):
-                slot.state = state
-            if rows is not None:
-                self._write(rows, self.start)
-            if root is not None:
-                self.is_vague[k], root[k] = is_vague, newest
-            if unusual:
-                self._make_usual(self.end)
-
-        return undo
+    def _restore(
+        self, values: tuple[Any, ...], own: dict[int, Any], states: tuple[Any, ...],
+        rows: dict[str, Array] | None, newest: tuple[bool, Array] | None,
+    ) -> None:
+        """Undo all changes since an undo point, which has saved this."""
+        unusual = self.unusual
+        for name, value in zip(self._undone, values, strict=True):
+            setattr(self, name, value)
+        self.own = own
+        for slot, state in zip(self.slots.values(), states, strict=True):
+            slot.state = state
+        if rows is not None:
+            self._write(rows, self.start)
+        if newest is not None and self.root is not None:
+            self.is_vague[self.end], self.root[self.end] = newest
+        if unusual:
+            self._make_usual(self.end)
 
     def copy_from(self, other: MemoryRecord) -> None:
         """Take over what both engines have from another record, which is not shared with it."""
