@@ -23,9 +23,10 @@ from ..observers import Observer
 from .compiler import NotCachedError, cached_library, compiled_library, known_failure
 from .directions import Directions
 from .fingerprint import source_key
-from .layout import TERMS, Layout, settings_record
+from .layout import TERMS, Layout
 from .losses import loss_function
 from .needs import Needs
+from .settings_record import settings_record
 from .source import MAIN, estimator_files
 from .templates import template
 
