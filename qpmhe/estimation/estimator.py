@@ -147,10 +147,11 @@ class MovingHorizonEstimator(EstimatorMemory):
     -----
     ModelWarning
         If the step of a discretised ODE is too long: at the initial state, or at points within one
-        standard deviation of the prior and within X, one step differs from two of half the length
-        by more than 0.1 standard deviations of the disturbance, or of the prior where there is no
-        disturbance; with ``method="euler"``, a coarse map by choice, by more than 1. The input is
-        the usual one, zero but for ``parameters``. Samples are not compared.
+        standard deviation of the prior and within X, one step differs from two of half the length,
+        or from solved ones of radau, by more than 0.1 standard deviations of the disturbance, or of
+        the prior where there is no disturbance; with ``method="euler"``, a coarse map by choice, by
+        more than 10. The input is the usual one, zero but for ``parameters``. Samples are not
+        compared.
 
     Examples
     --------

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from ..costs import Cost
 from ..errors import ModelWarning
+from ..model.accuracy import MOST_SOLVED, work
 from ..model.discretize import Discretization
-from ..model.evaluation import Evaluator, machine
 from ..model.residuals import difference
+from ..model.step_table import stepper
 from ..model.system import System
 from .reach import disturbance_deviations, prior_deviations, prior_points
 
@@ -28,11 +29,13 @@ _USUALLY_TOO_LONG = 0.1
 _FAR_TOO_LONG = 100.0
 # Numbers of substeps that a warning tries, by method.
 _EXPLICIT, _IMPLICIT = (2, 4, 8, 16, 32, 64), (1, 2, 4, 8, 16)
+# What other methods are compared with, in at most so many substeps, and at so many points.
+_REFERENCE, _MOST_SUBSTEPS, _MOST_POINTS = "radau", 4, 6
 
 
 @dataclass(frozen=True)
 class StepError:
-    """The largest difference between one step and two half steps, over some points.
+    """The largest difference of a step from finer ones, over some points.
 
     Attributes
     ----------
@@ -44,6 +47,8 @@ class StepError:
         Where it is so large.
     most : float
         The largest difference that does no harm, for this method.
+    finer : str
+        The other step, in words.
     """
 
     deviations: float
@@ -51,6 +56,7 @@ class StepError:
     point: Array
     inputs: Array
     most: float
+    finer: str = "that of half the length"
 
     @property
     def is_harmless(self) -> bool:
@@ -78,11 +84,14 @@ class StepComparison:
         self._inputs = np.repeat(inputs, len(points), axis=0)
         units = disturbance_deviations(system, cost)
         self._units = np.where(units > 0.0, units, prior)
-        #: What is too large an error, in standard deviations.
-        self.most = _most(system.method)
+        # The initial state with each input, and each input's last point.
+        first = np.arange(len(inputs)) * len(points)
+        few = np.column_stack((first, first + len(points) - 1)).ravel()
+        self._few = few[:_MOST_POINTS]
+        self._solved: dict[int, Array] = {}  # the reference there, by its substeps
 
     def error(self) -> StepError | None:
-        """One step against two of half the length; None where no step is finite."""
+        """One step against two of half the length, and a solved one; None where none is finite."""
         system = self._system
         assert system.dt is not None
         step, half = (
@@ -90,56 +99,100 @@ class StepComparison:
             for one in (system.dt, 0.5 * system.dt)
         )
         f = system.timed.f.batch
-        return self._largest(f(self._points, step), f(f(self._points, half), half))
+        one, two = f(self._points, step), f(f(self._points, half), half)
+        return self._error(one, two, system.origin.how)
 
     def others(self) -> Iterator[tuple[Discretization, StepError]]:
-        """Other discretisations and their errors, for each method up to the first fine one.
-
-        None without an expression.
-        """
-        model = self._system.symbolic
-        if model is None or model.how is None:
+        """Other discretisations and their errors, for each method up to the first fine one."""
+        how = self._system.origin.how
+        if how is None:
             return
-        own: list[tuple[str, tuple[int, ...]]] = [("radau", _IMPLICIT)]
-        if not model.how.is_implicit:
-            own.insert(0, (model.how.method, _EXPLICIT))
+        own: list[tuple[str, tuple[int, ...]]] = [(_REFERENCE, _IMPLICIT)]
+        if not how.is_implicit:
+            own.insert(0, (how.method, _EXPLICIT))
+        made = stepper(self._system)
 
-        def stepped(how: Discretization) -> Array:
-            evaluator = Evaluator(machine(replace(model, how=how), False))
-            return evaluator.one("f", self._points, self._inputs)
+        def stepped(one: Discretization) -> Array:
+            return made(one)(self._length(len(self._points)), self._points, self._inputs)
 
         for method, counts in own:
+            if method == _REFERENCE != how.method and self._system.n > MOST_SOLVED:
+                continue
             for steps in counts:
-                one, other = (stepped(Discretization(method, k)) for k in (steps, 2 * steps))
-                error = self._largest(one, other)
+                other = Discretization(method, steps)
+                error = self._error(
+                    stepped(other), stepped(other._replace(steps=2 * steps)), other)
                 if error is None:
                     continue
-                error = replace(error, most=_most(method))
-                yield Discretization(method, steps), error
+                yield other, error
                 if error.is_harmless:
                     break
 
-    def remedies(self) -> list[str]:
-        """Discretisations whose error is small enough, as arguments."""
-        found = []
-        for how, error in self.others():
-            if error.is_harmless:
-                texts = [f"method={how.method!r}"] if how.method != self._system.method else []
-                texts += [f"steps={how.steps}"] if how.steps > 1 else []
-                found.append(" with ".join(texts))
-        return [one for one in found if one]
+    def remedy(self) -> str:
+        """The cheapest discretisation whose error is small enough, as arguments; blank for none."""
+        fine = [(work(how), error.deviations, how)
+                for how, error in self.others() if error.is_harmless]
+        if not fine:
+            return ""
+        *_, how = min(fine)
+        texts = [f"method={how.method!r}"] if how.method != self._system.method else []
+        texts += [f"steps={how.steps}"] if how.steps > 1 else []
+        return " with ".join(texts)
 
-    def _largest(self, one: Array, other: Array) -> StepError | None:
-        shares = np.abs(difference(self._system.state_residual, one, other)) / self._units
-        finite = np.isfinite(one), np.isfinite(other)
+    def _error(
+        self, one: Array, finer: Array, how: Discretization | None
+    ) -> StepError | None:
+        """Of steps at all points, the largest difference from finer ones or from solved ones."""
+        shares = self._shares(one, finer)
+        finite = np.isfinite(one), np.isfinite(finer)
         # A model that is not finite either way is outside of its domain, else the step exploded.
         shares[~finite[0] | ~finite[1]] = np.inf
         shares[~finite[0].all(axis=1) & ~finite[1].all(axis=1)] = -1.0
+        most = _most(None if how is None else how.method)
+        found = [self._worst(shares, np.arange(len(one)), most)]
+        if how is not None and how.method != _REFERENCE and not found[0].deviations > most:
+            with suppress(Exception):  # outside of the functions' domain
+                found += self._against_solved(one[self._few], how, most)
+        worst = max(found, key=lambda error: error.deviations)
+        return None if worst.deviations < 0.0 else worst
+
+    def _against_solved(self, one: Array, how: Discretization, most: float) -> list[StepError]:
+        """Steps at few points against the reference, where that is accurate; often at once."""
+        if self._system.n > MOST_SOLVED:
+            return []
+        steps = min(how.steps, _MOST_SUBSTEPS)
+        coarse = self._reference(steps)
+        shares = self._shares(one, coarse)
+        if (shares <= most).all():
+            return []
+        fine = self._reference(2 * steps)
+        shares, own = self._shares(one, fine), self._shares(coarse, fine)
+        exploded = ~np.isfinite(one) & np.isfinite(coarse) & np.isfinite(fine)
+        shares[exploded] = np.inf
+        # What the reference itself is not sure of says nothing.
+        shares[~exploded & ~(own <= 0.5 * shares)] = -1.0
+        words = f"that of {Discretization(_REFERENCE, 2 * steps).words}"
+        return [replace(self._worst(shares, self._few, most), finer=words)]
+
+    def _reference(self, steps: int) -> Array:
+        if steps not in self._solved:
+            made, at = stepper(self._system)(Discretization(_REFERENCE, steps)), self._few
+            self._solved[steps] = made(self._length(len(at)), self._points[at], self._inputs[at])
+        return self._solved[steps]
+
+    def _length(self, count: int) -> Array:
+        assert self._system.dt is not None
+        return np.full(count, self._system.dt)
+
+    def _shares(self, one: Array, other: Array) -> Array:
+        shares: Array = np.abs(difference(self._system.state_residual, one, other)) / self._units
+        return shares
+
+    def _worst(self, shares: Array, rows: NDArray[np.intp], most: float) -> StepError:
         k, j = np.unravel_index(int(np.argmax(shares)), shares.shape)
-        if shares[k, j] < 0.0:
-            return None
+        row = rows[k]
         return StepError(
-            float(shares[k, j]), int(j), self._points[k], self._inputs[k], self.most
+            float(shares[k, j]), int(j), self._points[row], self._inputs[row], most
         )
 
 
@@ -172,10 +225,10 @@ class StepCheck:
         if error.inputs.any():
             point += f" with u = {np.array2string(error.inputs, precision=4, separator=', ')}"
         differs = (
-            f"differs from that of half the length by {error.deviations:.2g} standard deviations "
-            f"of the disturbance in state {error.component} (expected at most {error.most:g})"
+            f"differs from {error.finer} by {error.deviations:.2g} standard deviations of the "
+            f"disturbance in state {error.component} (expected at most {error.most:g})"
             if np.isfinite(error.deviations) else
-            f"and that of half the length are not both finite in state {error.component}"
+            f"and {error.finer} are not both finite in state {error.component}"
         )
         warnings.warn(
             f"{_named(system)} is too long: from x = {point} the result {differs}, so estimates "
@@ -223,7 +276,7 @@ class StepCheck:
 def step_error(
     system: System, cost: Cost, covariance: Array | None, state: Array, u: Array
 ) -> StepError | None:
-    """Compare one step of a discretised ODE with two of half the length.
+    """Compare one step of a discretised ODE with two of half the length, and with an implicit one.
 
     Arguments are those of `StepComparison`. None without a model in continuous time, and where no
     step is finite.
@@ -252,11 +305,11 @@ def _named(system: System) -> str:
 
 
 def _remedy(comparison: StepComparison) -> str:
-    remedies: list[str] = []
+    remedy = ""
     with suppress(Exception), np.errstate(all="ignore"):
-        remedies = comparison.remedies()
+        remedy = comparison.remedy()
     return (
-        f"{' or '.join(remedies)} is fine enough" if remedies
+        f"{remedy} is fine enough" if remedy
         else "take more substeps (steps=), or for stiff rates method='radau'"
     )
 

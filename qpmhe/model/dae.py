@@ -145,12 +145,12 @@ def made_from_dae(
     def implicit(how: Discretization) -> ImplicitStep:
         return ImplicitStep(joint.batch, differences.batch, how.method, how.steps, solver)
 
+    def stepper(how: Discretization) -> Callable[[Array, Array, Array], Array]:
+        tried = implicit(how)
+        return lambda dt, x, u: tried.value(solver.complete(x, u), u, dt)
+
     chosen: Choice | None = None
     if how.method == AUTO:
-        def stepper(how: Discretization) -> Callable[[Array, Array, Array], Array]:
-            tried = implicit(how)
-            return lambda dt, x, u: tried.value(solver.complete(x, u), u, dt)
-
         tries = tuple(one for one in TRIED if one in COLLOCATIONS)
         chosen = choice(stepper, tries, length, n, m, states, scales, tolerance)
         how = chosen.how
@@ -203,7 +203,7 @@ def made_from_dae(
     made = cls.made(
         Trusted(partial(step, length)), Trusted(output),
         Origin(
-            dt=length, how=how, rate=joint, equations=equations, choice=chosen,
+            dt=length, how=how, rate=joint, equations=equations, choice=chosen, stepper=stepper,
             jacobians="finite differences", make_timed=timed, make_augmented=augmented,
             recipe=(cls.from_dae, {
                 "rate": rate, "algebraic": algebraic, "h": h, "dt": dt, "n": n, "k": k, "p": p,

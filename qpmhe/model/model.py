@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ModelError
-from .accuracy import Choice
+from .accuracy import Choice, Stepper
 from .derivatives import Jacobian
 from .discretize import Discretization
 from .evaluation import Evaluator, Places
@@ -177,6 +177,8 @@ class Origin:
         The Jacobian of the rate, where the user gave it.
     equations : Equations, optional
         The functions of a DAE: ``rate`` then is the joint function of states and algebraic states.
+    stepper : callable, optional
+        Makes the step of a discretisation, from the user's functions: see `qpmhe.model.accuracy`.
     choice : Choice, optional
         Which discretisations were tried, where the method was to be chosen.
     sources : dict, optional
@@ -214,6 +216,7 @@ class Origin:
     rate: BatchedFunction | None = None
     rate_jacobian: Jacobian | None = None
     equations: Equations | None = None
+    stepper: Stepper | None = None
     choice: Choice | None = None
     sources: dict[str, Callable[[Array, Array], Any]] | None = None
     kernel: ModelKernel | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -70,29 +70,31 @@ def made_from_ode(
     if rate_jacobian is not None:
         compared = Jacobian(batched, rate_jacobian, m, probes, states)
         given = BatchedFunction("rate_jacobian", rate_jacobian, (n, n), m, probes)
-    slope = given and _over_leading(given)
     sizes = options.get("scales")
     scales = None if sizes is None else checked_scales(sizes, n)
-    if (how.is_implicit or how.method == AUTO) and slope is None:
+    length, over_leading = positive("dt", dt), _over_leading(batched)
+
+    @cache
+    def slope() -> Function:
+        if given is not None:
+            return _over_leading(given)
         differences = Jacobian(batched, None, m, probes, states)
         if scales is not None:  # else steps are shares of 1 and of the states
             differences.use_scales(scales, None, ())
-        slope = partial(_of_inputs, differences.batch, m)
-        if h_jacobian is None:
-            jacobians = "finite differences"  # a trace replaces them, however far they are from it
-    length, over_leading = positive("dt", dt), _over_leading(batched)
+        return partial(_of_inputs, differences.batch, m)
+
+    def stepper(how: Discretization) -> Callable[[Array, Array, Array], Array]:
+        tried = discretize(over_leading, slope() if how.is_implicit else None, how)[0]
+        return lambda dt, x, u: tried(dt[:, None], x, *([u] if m else []))
+
+    if (how.is_implicit or how.method == AUTO) and given is None and h_jacobian is None:
+        jacobians = "finite differences"  # a trace replaces them, however far they are from it
     chosen: Choice | None = None
     if how.method == AUTO:
-        def stepper(how: Discretization) -> Callable[[Array, Array, Array], Array]:
-            tried = discretize(over_leading, slope, how)[0]
-            return lambda dt, x, u: tried(dt, x, *([u] if m else []))
-
-        chosen = choice(
-            stepper, tuple(TRIED), length, n, m, states, scales, tolerance
-        )
+        chosen = choice(stepper, tuple(TRIED), length, n, m, states, scales, tolerance)
         how = chosen.how
-    step, step_jacobian = discretize(over_leading, slope if how.is_implicit else (
-        given and _over_leading(given)), how)
+    needs_slope = how.is_implicit or given is not None
+    step, step_jacobian = discretize(over_leading, slope() if needs_slope else None, how)
 
     def timed(system: System) -> System:
         return cls.made(
@@ -119,6 +121,7 @@ def made_from_ode(
         Trusted(partial(step, length)), h,
         Origin(
             dt=length, how=how, rate=batched, rate_jacobian=compared, choice=chosen,
+            stepper=stepper,
             jacobians=jacobians, sources=sources,
             make_timed=timed, make_augmented=augmented,
             recipe=(cls.from_ode, {

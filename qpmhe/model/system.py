@@ -26,6 +26,7 @@ from .points import FEW, USUAL, Points, points
 from .residuals import Residual, Turns, checked_residual
 from .sets import ConvexSet, SoftSet
 from .signals import Signals
+from .step_table import step_table
 from .system_arguments import (
     check_soft_angles,
     checked_matrix,
@@ -461,7 +462,8 @@ class System(ContinuousTime):
         A traced function is known as an expression: it has exact Jacobians, and estimators evaluate
         it in CasADi's virtual machine or in generated C code. Any other function is called as
         written; the text names the operation that stopped the trace, and its line.
-        Of a discretised system, it names the step, and says where its error is shown.
+        Of a discretised system, it shows the errors of its step and of others, as shares of states
+        whose magnitudes ``scales`` says, and what they cost. That takes some tenths of a second.
 
         Examples
         --------
@@ -478,14 +480,8 @@ class System(ContinuousTime):
                 found = (own.trace or self.tracing.now).found[name]
                 text = "traced" if found.function else f"not traced: {found.reason}"
             lines.append(f"{name}: {text}. Jacobian: {_METHODS.get(method, method)}.")
-        how, choice = self.origin.how, self.origin.choice
-        if choice is not None:
-            lines.append(str(choice))
-        elif how is not None and self.has_timed:
-            lines.append(
-                f"step: {how.words} in dt = {self.dt:g}. Each estimator compares it with two of "
-                "half the length,\n  relative to its disturbance; `qpmhe doctor` shows the errors."
-            )
+        if self.origin.how is not None and self.dt is not None:
+            lines.append(step_table(self))
         if self.signals is not None:
             lines.append(str(self.signals))
         if own.no_symbolic and self.has_other_steps:

@@ -387,7 +387,7 @@ def test_auto_takes_the_fewest_substeps_that_are_accurate():
     np.testing.assert_array_equal(made.f(x), other.f(x))
     words = made.explain().split("step: ")[1].splitlines()
     assert words[0].startswith(f"radau with {made.steps} substeps, the cheapest")
-    errors = {int(one.split()[1]): float(one.split()[-3]) for one in words[1:]}
+    errors = {int(one.split()[1]): float(one.split()[3]) for one in words[1:]}
     assert list(errors) == [1, 2, 4, 8, 16]
     assert errors[made.steps] <= 1e-6 < errors[made.steps // 2]
 

@@ -1,6 +1,7 @@
 """Steps of an ODE by each method: order, stiff problems, derivatives, units, failures."""
 
 import pickle
+import re
 
 import casadi as ca
 import numpy as np
@@ -468,16 +469,50 @@ def test_an_iteration_that_fails_is_a_failed_stage(engine):
     assert np.isfinite(mhe.update([1.5], [0.0]).state).all()
 
 
-def test_the_explanation_names_the_step_and_where_it_is_checked():
-    made = system(pendulum, 2, 1, dt=0.2, method="radau", steps=2)
+ROW = r"  (\w+) +(\d+)   error (?:above 1 |([\d.e+-]+)) +work ([\d.]+) +time [\d.]+ us"
+
+
+def rows(text):
+    """Method, substeps, error and work of each row of a table."""
+    found = [re.fullmatch(ROW, line) for line in text.split("step: ")[1].splitlines()]
+    return [(one[1], int(one[2]), float(one[3] or np.inf), float(one[4])) for one in found if one]
+
+
+def test_the_explanation_shows_the_errors_of_the_step_and_of_others():
+    made = system(pendulum, 2, 1, dt=0.2, method="radau", steps=3)
     for one in (made, qpmhe.augment_parameters(made, nominal=[0.1])):
-        step = one.explain().split("step: ")[1]
-        assert step.startswith("radau with 2 substeps in dt = 0.2. Each estimator compares it")
-        assert "qpmhe doctor" in step
-    given = qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1)
-    chosen = system(pendulum, 2, 1, dt=0.2, method="auto", tolerance=1e-3)
-    for one in (given, chosen):
-        assert "Each estimator" not in one.explain()
+        text = one.explain()
+        assert "radau with 3 substeps in dt = 0.2. Each estimator compares it" in text
+        assert "qpmhe doctor" in text
+        found = rows(text)
+        assert [row[:2] for row in found] == [
+            ("radau", 1), ("radau", 3), ("rk4", 1), ("rk4", 2)]
+        assert [row[3] for row in found] == [4.0, 12.0, 1.0, 2.0]
+        assert [row[2] <= 1e-6 for row in found] == [True, True, False, True]
+    assert "step: " not in qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1).explain()
+
+
+@pytest.mark.parametrize("kind", ["traced", "called"])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_errors_in_the_explanation_are_those_of_the_steps(method, kind):
+    """Against SciPy's Radau at the same states, as shares of them."""
+    options = {"dt": 0.5, "states": qpmhe.Box([1.0, 0.3], [1.0001, 0.30001])}
+    rate = pendulum if kind == "traced" else untraced(pendulum)
+    made, x, u = system(rate, 2, 1, method=method, **options), np.array([1.0, 0.3]), np.zeros(1)
+    found = rows(made.explain())
+    assert found[0][:2] == (method, 1)
+    exact = right(lambda x: pendulum(x, u), x, 0.5)
+    for name, steps, error, _ in found:
+        if error > 1e-8:
+            step = system(pendulum, 2, 1, method=name, steps=steps, **options).f(x, u)
+            shares = np.abs(step - exact) / np.maximum(np.abs(x), np.abs(exact))
+            assert error == pytest.approx(shares.max(), rel=1.0, abs=1e-9)  # other inputs
+
+
+def test_where_no_error_is_known_the_explanation_says_so():
+    text = system(lambda x: np.log(x - 100.0), 2, dt=0.5).explain()
+    assert "so that no\n  error is known: give scales or bounded states." in text
+    assert not rows(text)
 
 
 @pytest.mark.slow
@@ -491,9 +526,9 @@ def test_auto_chooses_the_cheapest_step_that_is_accurate(rate, n, options, metho
     other = system(rate, n, method=method, steps=made.steps, **options)
     x, u = np.array([0.9, 0.4, 0.1])[:n], np.full(options.get("m", 0), 0.2)
     np.testing.assert_array_equal(made.f(x, u), other.f(x, u))
-    words = made.explain().split("step: ")[1].splitlines()
-    assert words[0].startswith(f"{method} with {made.steps} substep")
-    assert len(words) == 12
+    text = made.explain()
+    assert f"step: {method} with {made.steps} substep" in text
+    assert len(rows(text)) == 11
     loose = system(rate, n, method="auto", tolerance=0.1, **options)
     assert loose.steps < made.steps
     again = pickle.loads(pickle.dumps(qpmhe.System.from_ode(
