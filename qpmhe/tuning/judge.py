@@ -132,6 +132,6 @@ def judge(
         )
     return theta, (
         f"by the likelihood: tuning the estimator's {what} as well would change its mean "
-        f"square on {blocks.name} by {-share:+.2g} % (standard error {doubt:.2g} %), no gain "
+        f"square on {blocks.name} by {0.0 - share:+.2g} % (standard error {doubt:.2g} %), no gain "
         "beyond chance."
     )

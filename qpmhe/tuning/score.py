@@ -26,6 +26,8 @@ from .weights import Weights
 
 # Beyond this many robust deviations an error counts with its size only.
 _OUTLYING = 3.0
+# Of a part of the records, this share lets the initial error decay. Runs whose errors are kept.
+_SETTLING, _KEPT = 6, 6
 
 
 class Score:
@@ -48,6 +50,7 @@ class Score:
         # The first estimator of each record and horizon: those of other weights are not checked
         # again.
         self._checked: dict[tuple[int, int], MovingHorizonEstimator] = {}
+        self._known: dict[tuple[Any, ...], list[Array]] = {}  # the last errors, by weights
         #: A compiled step of the model: of states and of inputs with the step's length behind them.
         self.follow: Callable[[Array, Array], Array] | None = None
         #: Seconds that a step took, the median of the last run.
@@ -58,6 +61,7 @@ class Score:
         # While the initial error lasts, the score depends on all weights against the prior: where
         # that is given, Q and R would make up for it. So the first block does not tune, if there
         # are others.
+        self._begins = begins
         later = [~one.held & (begins | (one.block > one.block[0])) for one in data]
         self._used = [
             mask if mask.any() else ~one.held for mask, one in zip(later, data, strict=True)
@@ -67,10 +71,26 @@ class Score:
         """The score of another estimator, in the same units: those of this one."""
         _, other = self.scale, copy(self)
         other.kind, other._options = kind, {**self._options, "max_qps": qps}
-        other._checked = {}
+        other._checked, other._known = {}, {}
         if self._compiled:
             other.compile()
         return other
+
+    def shortened(self, count: int) -> Score | None:
+        """The one of so many samples, those of the first records; None of less than four times."""
+        if sum(int((~one.held).sum()) for one in self._data) < 4 * count:
+            return None
+        _, short, left = self.scale, copy(self), count
+        short._data, short._used, short._checked, short._known = [], [], {}, {}
+        for one in self._data:
+            if left > 0:
+                end = int(np.searchsorted(np.cumsum(~one.held), min(left, len(one)))) + 1
+                part = one.first(end)
+                settled = np.arange(len(part)) >= min(left, len(part)) // _SETTLING
+                short._data.append(part)
+                short._used.append(~part.held & (self._begins | settled))
+                left -= int((~part.held).sum())
+        return short
 
     def typical(self, weights: Weights) -> tuple[Array, Array]:
         """The mean state, by the truth or else by the estimates, and the mean of all inputs."""
@@ -124,8 +144,14 @@ class Score:
 
     def errors(self, weights: Weights) -> list[Array]:
         """Errors of each record (T, n) or (T, p), NaN where there is nothing to compare."""
-        system = self._make(weights.parameters)
-        return [self._of_record(system, weights, one) for one in self._data]
+        key = weights.key
+        if key not in self._known:
+            system = self._make(weights.parameters)
+            found = [self._of_record(system, weights, one) for one in self._data]
+            if len(self._known) == _KEPT:
+                self._known.pop(next(iter(self._known)))
+            self._known[key] = found
+        return self._known[key]
 
     def total(self, weights: Weights) -> float:
         """The mean score of the samples that tune; infinite where the model fails."""

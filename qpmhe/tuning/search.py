@@ -43,8 +43,14 @@ _HESSIAN_STEP = 1e-3
 _STEPS, _GAIN, _FLAT, _NEAR = 20, 1e-6, 1e-3, 0.02
 # How far beyond a point that is still within the limit the next one may be, upwards.
 _FURTHER = 3.0
-# Samples of the part of long records that is searched first.
-_SHORT = 1000
+# How far a parabola may lead beyond the end of a way that the estimator's search took on a part.
+_BEYOND = 4.0
+# Length of a step that tells the curvature along a slope, and the largest unit of the next ones.
+_TRIAL, _MOST_SPREAD = 0.2, 10.0
+# Samples of the part of long records that is searched first: by the likelihood, and by the
+# estimator. Its search ends there where a step gains less than the first share, altogether if it
+# has gained less than the last, else where a step gains less than the second.
+_SHORT, _PART, _ROUGHLY, _NEARLY, _MATTERS = 1000, 1500, 1e-3, 2e-4, 0.01
 
 
 class TuningCheckpointError(QpmheError):
@@ -356,7 +362,8 @@ def refine(
 ) -> Array:
     """The minimum of the estimator's score, by differences of runs, with a share of the likelihood.
 
-    It starts at the likelihood's weights or, if these are worse, at the start weights.
+    It starts at the likelihood's weights or, if these are worse, at the start weights. Of long
+    records, a part is searched first, and all of them only if what that finds matters on them.
     """
     known, value, done = checkpoint.known("estimator")
     if done and known is not None:
@@ -367,58 +374,119 @@ def refine(
         for one, mask in zip(likelihood.data, likelihood.tuned, strict=True)
     )
 
-    def plain(point: Array) -> float:
-        return score.total(structure.weights(structure.bounded(point)))
+    def plain(point: Array, some: Score = score) -> float:
+        return some.total(structure.weights(structure.bounded(point)))
 
-    def total(point: Array) -> float:
-        return min(plain(point) + _STAY * float(np.sum((point - anchor) ** 2)), _FAILED)
+    def total(point: Array, some: Score) -> float:
+        return min(plain(point, some) + _STAY * float(np.sum((point - anchor) ** 2)), _FAILED)
 
-    samples = sum(map(len, likelihood.data))
-    most = score.seconds * samples * 2 * len(theta) * _REFINEMENTS
-    advance(f"estimator, at most about {most:.2g} s")
+    def whole(point: Array) -> float:
+        unlikely = share * (likelihood.value(point) - least)
+        return min(total(point, score) + unlikely, _FAILED)
+
     anchor = min((theta, structure.start), key=plain)
-    best: list[Any] = [anchor if known is None else known, value]
-    # The newest point with a gradient, and the one at which the search stands.
-    newest: list[Any] = []
-    here: list[Any] = []
-    first: Array = best[0]
+    most = score.seconds * sum(map(len, likelihood.data)) * 2 * len(theta) * _REFINEMENTS
+    advance(f"estimator, at most about {most:.2g} s")
 
-    def difference(point: Array, move: Array) -> float:
-        return (total(point + move) - total(point - move)) / (2 * _STEP)
+    def lowered(
+        some: Score, begin: Array, value: float, note: Callable[[Array, float], None], ends: float,
+        spread: float = 0.0,
+    ) -> tuple[Array, float, float]:
+        """Where the search of a score ends from here, its value there, and the unit of a step.
 
-    def cost(point: Array) -> tuple[float, Array]:
-        value, (unlikely, slope) = total(point), likelihood.gradient(point)
-        value = min(value + share * (unlikely - least), _FAILED)
-        if value == _FAILED:
-            return _FAILED, np.zeros(len(point))
-        if value < best[1]:
-            best[:] = point.copy(), value
-        slope = share * slope
-        if here:
-            # Where the search is going to end here, the slope along its way tells.
-            at, before, by = here
-            way, gain = point - at, before - value
-            size = float(np.linalg.norm(way))
-            if -_ARMIJO * (by @ way) <= gain <= _ENDS * max(abs(before), abs(value), 1.0):
-                along = slope @ way + size * difference(point, _STEP / size * way)
-                # The first step, which has a largest length, may end where it still descends.
-                if (along if at is first else abs(along)) <= _WOLFE * abs(by @ way):
-                    raise _EndedError
-        for k, move in enumerate(_STEP * np.eye(len(point))):
-            slope[k] += difference(point, move)
-            advance(f"estimator, score {best[1]:.5g}")
-        checkpoint.note("estimator", best[0], best[1], False)
-        newest[:] = point.copy(), value, slope
-        if not here:
-            here[:] = first, value, slope
-        return value, slope
+        If no unit is given, the curvature along the first slope tells it.
+        """
+        is_rough = ends > _STEP**2  # the bias of differences ahead is far below
+        best: list[Any] = [begin, value]
+        # The newest point with a gradient, and the one at which the search stands.
+        newest: list[Any] = []
+        here: list[Any] = []
 
-    with suppress(_EndedError):
-        minimize(
-            cost, best[0], jac=True, method="L-BFGS-B", bounds=structure.limits,
-            callback=lambda _: here.__setitem__(slice(None), newest),
-            options={"maxiter": _REFINEMENTS, "ftol": _ENDS},
-        )
-    checkpoint.note("estimator", best[0], best[1], True)
-    found: Array = best[0]
-    return found
+        def difference(point: Array, move: Array) -> float:
+            return (total(point + move, some) - total(point - move, some)) / (2 * _STEP)
+
+        def cost(point: Array) -> tuple[float, Array]:
+            if here and point is begin:
+                return here[1], here[2]
+            alone, (unlikely, slope) = total(point, some), likelihood.gradient(point)
+            value = min(alone + share * (unlikely - least), _FAILED)
+            if value == _FAILED:
+                return _FAILED, np.zeros(len(point))
+            if value < best[1]:
+                best[:] = point.copy(), value
+            slope = share * slope
+            if here:
+                # Where the search is going to end here, the slope along its way tells.
+                at, before, by = here
+                way, gain = point - at, before - value
+                size = float(np.linalg.norm(way))
+                if -_ARMIJO * (by @ way) <= gain <= ends * max(abs(before), abs(value), 1.0):
+                    along = slope @ way + size * difference(point, _STEP / size * way)
+                    # The first step, which has a largest length, may end where it still descends.
+                    if (along if at is begin else abs(along)) <= _WOLFE * abs(by @ way):
+                        raise _EndedError
+            for k, move in enumerate(_STEP * np.eye(len(point))):
+                slope[k] += (
+                    (total(point + move, some) - alone) / _STEP if is_rough
+                    else difference(point, move)
+                )
+                advance(f"estimator, score {best[1]:.5g}")
+            note(best[0], best[1])
+            newest[:] = point.copy(), value, slope
+            if not here:
+                here[:] = begin, value, slope
+            return value, slope
+
+        if not spread:
+            first, slope = cost(begin)
+            size = float(np.linalg.norm(slope))
+            if not size:
+                return best[0], best[1], 1.0
+            trial = structure.bounded(begin - _TRIAL / size * slope)
+            moved = total(trial, some) + share * (likelihood.value(trial) - least)
+            bend = 2.0 * (moved - first + _TRIAL * size) / _TRIAL**2
+            spread = 1.0 / np.sqrt(np.clip(bend, 1.0 / _MOST_SPREAD**2, 1.0))
+
+        def scaled(part: Array) -> tuple[float, Array]:
+            value, slope = cost(begin + spread * part if part.any() else begin)
+            return value, spread * slope
+
+        limits = [tuple((np.array(pair) - at) / spread)
+                  for pair, at in zip(structure.limits, begin, strict=True)]
+        with suppress(_EndedError):
+            minimize(
+                scaled, np.zeros(len(begin)), jac=True, method="L-BFGS-B", bounds=limits,
+                callback=lambda _: here.__setitem__(slice(None), newest),
+                options={"maxiter": _REFINEMENTS, "ftol": ends},
+            )
+        return best[0], best[1], spread
+
+    def note(point: Array, value: float) -> None:
+        checkpoint.note("estimator", point, value, False)
+
+    begin, enough, spread = anchor if known is None else known, False, 1.0
+    short = score.shortened(_PART)
+    if short is not None and known is None:
+        found, _, spread = lowered(short, anchor, np.inf, lambda *_: None, _ROUGHLY, 0.0)
+        begin, value, enough = _along(whole, anchor, found - anchor)
+    if not enough:
+        ends = _ENDS if short is None else _NEARLY
+        begin, value, _ = lowered(score, begin, value, note, ends, spread)
+    checkpoint.note("estimator", begin, value, True)
+    return begin
+
+
+def _along(whole: Callable[[Array], float], anchor: Array, way: Array) -> tuple[Array, float, bool]:
+    """The best point along a way, by a parabola, its value, and whether it hardly matters."""
+    first = whole(anchor)
+    found = [(first, 0.0)]
+    if np.abs(way).max(initial=0.0) > _STEP:
+        half, end = whole(anchor + 0.5 * way), whole(anchor + way)
+        found += [(half, 0.5), (end, 1.0)]
+        slope, bend = 4.0 * half - 3.0 * first - end, first - 2.0 * half + end
+        top = -0.25 * slope / bend if bend > 0.0 else 0.0
+        if top > 0.0:
+            top = min(top, _BEYOND)
+            found.append((whole(anchor + top * way), top))
+    value, place = min(found)
+    return anchor + place * way, value, first - value < _MATTERS * abs(first)

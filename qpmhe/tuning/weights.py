@@ -67,6 +67,15 @@ class Weights:
     observer_name: str | None = None
     max_qps: int | None = None
 
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What is the same for equal weights alone."""
+        return tuple(
+            one.tobytes() if isinstance(one, np.ndarray)
+            else tuple(one.items()) if isinstance(one, dict) else one
+            for one in vars(self).values()
+        )
+
     def observer(
         self, kind: Callable[..., Observer] | None = None, *, system: System | None = None
     ) -> Observer:

@@ -13,7 +13,15 @@ import pytest
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError
 from qpmhe.model.signals import Signal, Signals
-from qpmhe.tuning import TuningCheckpointError, TuningRecord, contest, judge, load, score, search
+from qpmhe.tuning import (
+    TuningCheckpointError,
+    TuningRecord,
+    contest,
+    judge,
+    load,
+    score,
+    search,
+)
 from qpmhe.tuning.structures import Correlated
 
 tuning_module = sys.modules["qpmhe.tuning.tune"]
@@ -342,6 +350,43 @@ def test_the_estimators_search_ends_without_a_gradient_that_changes_nothing(seed
     for mine, expected in zip(found[0][1:3], found[1][1:3], strict=True):
         np.testing.assert_array_equal(mine, expected)
     assert found[0][3] == found[1][3]
+
+
+@pytest.mark.slow
+def test_the_estimators_search_takes_a_part_first_and_all_where_that_matters(monkeypatch):
+    lengths, found = [], []
+    run = score.Score._of_record
+    monkeypatch.setattr(score.Score, "_of_record", lambda self, system, weights, one: (
+        lengths.append(len(one)), run(self, system, weights, one))[1])
+    for part, matters in ((80, 0.01), (80, -np.inf), (10**6, 0.0)):
+        monkeypatch.setattr(search, "_PART", part)
+        monkeypatch.setattr(search, "_MATTERS", matters)
+        lengths.clear()
+        tuning = tuned(
+            [simulated(steps=440)], objective="prediction", horizon=3, max_qps=0,
+            structure="scalar")
+        found.append((lengths.count(440), len(lengths), tuning.scores["y1, 5 ahead"][1] ** 2))
+    (some, both, mine), (more, _, _), (all_, whole, best) = found
+    assert both > some
+    assert whole == all_ > 6
+    # The start, the likeliest weights and up to four on the way.
+    assert some <= 6 < more
+    assert mine < 1.005 * best
+
+
+def test_a_judge_runs_no_estimator_again(monkeypatch):
+    runs = []
+    run = score.Score._of_record
+    monkeypatch.setattr(score.Score, "_of_record", lambda *given: (
+        runs.append(1), run(*given))[1])
+    tuning = tuned(objective="prediction", horizon=3, max_qps=0, structure="scalar")
+    before = len(runs)
+    weights = tuning._structure.weights
+    for theta in (tuning._structure.start, tuning._judged_theta):
+        tuning._score.errors(weights(theta))
+    assert len(runs) == before
+    tuning._score.errors(weights(tuning._judged_theta + 0.01))
+    assert len(runs) == before + 1
 
 
 @pytest.mark.parametrize("errors", [1.5, 3.0])
