@@ -37,12 +37,15 @@ _STEP = 1e-2
 # The search of the estimator ends where a step gains less than this share; a step is one that
 # L-BFGS-B's line search takes: by how much the value falls, and the slope along it.
 _ENDS, _ARMIJO, _WOLFE = 1e-5, 1e-3, 0.9
-_HESSIAN_STEP = 1e-3
+_HESSIAN_STEP = 3e-4
 # Newton's steps at most, the gain (in the likelihood's logarithm) that is the last one, curvatures
 # that are none, and how far off a Hessian is still the one of the minimum.
 _STEPS, _GAIN, _FLAT, _NEAR = 20, 1e-6, 1e-3, 0.02
 # How far beyond a point that is still within the limit the next one may be, upwards.
 _FURTHER = 3.0
+# What Newton's steps gain, in the likelihood's logarithm, that does not move an end of an interval,
+# and the same as a share of the rise; how often a step is halved.
+_CLOSE, _ROUGH, _HALVINGS = 0.02, 3e-3, 8
 # How far a parabola may lead beyond the end of a way that the estimator's search took on a part.
 _BEYOND = 4.0
 # Length of a step that tells the curvature along a slope, and the largest unit of the next ones.
@@ -138,19 +141,17 @@ def identity_of(likelihood: Likelihood, value: float, options: Any) -> str:
 
 
 def search_likelihood(
-    likelihood: Likelihood, begin: Array, note: Callable[[Array, float, bool], None],
-    hessian: Array | None = None,
+    likelihood: Likelihood, begin: Array, note: Callable[[Array, float, bool], None]
 ) -> tuple[Array, float]:
     """The minimum of the likelihood near a start, and its value per sample.
 
-    Of long records, a part is searched first: its minimum is nearby, where its Hessian, or one
-    that is known, tells the directions in which to search.
+    Of long records, a part is searched first: its minimum is nearby, where its Hessian tells the
+    directions in which to search.
     """
-    if hessian is None:
-        short = likelihood.shortened(_SHORT)
-        if short is not None:
-            begin = search_likelihood(short, begin, lambda *_: None)[0]
-            hessian = likelihood.samples / short.samples * _curvature(short, begin)
+    hessian, short = None, likelihood.shortened(_SHORT)
+    if short is not None:
+        begin = search_likelihood(short, begin, lambda *_: None)[0]
+        hessian = likelihood.samples / short.samples * _curvature(short, begin)
     count, spread = likelihood.structure.seen, np.eye(len(begin))
     if hessian is not None:
         spread[:count, :count] = _alike(hessian)
@@ -222,14 +223,11 @@ def _alone(recipe: tuple[Any, ...], k: int, begin: Array) -> tuple[int, Array, f
 
 
 def _curvature(likelihood: Likelihood, theta: Array) -> Array:
-    """The Hessian by what the likelihood depends on, from differences of gradients."""
-    count = likelihood.structure.seen
+    """The Hessian by what the likelihood depends on, from differences to gradients ahead."""
+    count, slope = likelihood.structure.seen, likelihood.gradient(theta)[1]
     moves = _HESSIAN_STEP * np.eye(len(theta))[:count]
-    rows = [
-        likelihood.gradient(theta + move)[1] - likelihood.gradient(theta - move)[1]
-        for move in moves
-    ]
-    found = np.array(rows)[:, :count] / (2 * _HESSIAN_STEP)
+    rows = [likelihood.gradient(theta + move)[1] - slope for move in moves]
+    found = np.array(rows)[:, :count] / _HESSIAN_STEP
     return np.asarray(0.5 * (found + found.T))
 
 
@@ -239,33 +237,66 @@ def _alike(hessian: Array) -> Array:
     return np.asarray(vectors / np.sqrt(np.maximum(values, 1.0)))
 
 
-def polish(
-    likelihood: Likelihood, theta: Array, hessian: Array | None = None
-) -> tuple[Array, Array]:
-    """Newton's steps to the minimum, and the Hessian there; one of nearby may be known.
+def _descended(
+    cost: Callable[[Array], tuple[float, Array]], x: Array, H: Array, enough: float,
+    bounded: Callable[[Array], Array] = np.asarray, share: float = 0.0,
+) -> tuple[Array, float, Array, Array]:
+    """Newton's steps to a minimum: the point, its value, slope and Hessian.
 
-    Between Hessians, the differences of slopes update them (BFGS).
+    Slopes update the Hessian (BFGS). A step that leads up is halved. They end before one that
+    gains less than enough, or than a share of the value.
     """
-    count = likelihood.structure.seen
-    value, slope = likelihood.gradient(theta)
-    known = theta
-    H = _curvature(likelihood, theta) if hessian is None else hessian
+    value, slope = cost(x)
     for _ in range(_STEPS):
-        values, vectors = np.linalg.eigh(H)
-        usable = vectors[:, values > _FLAT]
-        step = np.zeros(len(theta))
-        step[:count] = -(usable / values[values > _FLAT]) @ (usable.T @ slope[:count])
-        moved = likelihood.structure.bounded(theta + np.clip(step, -1.0, 1.0))
-        reached, by = likelihood.gradient(moved)
-        if not reached < value:
+        step = _newton(H, slope)
+        if -0.5 * (slope @ step) < enough + share * abs(value):
             break
-        s, change = (moved - theta)[:count], (by - slope)[:count]
-        gain, theta, value, slope = value - reached, moved, reached, by
-        if gain < _GAIN:
+        for _ in range(_HALVINGS):
+            moved = bounded(x + step)
+            reached, by = cost(moved)
+            if reached < value:
+                break
+            step = 0.5 * step
+        else:
             break
+        s, change = moved - x, by - slope
+        gain, x, value, slope = value - reached, moved, reached, by
         along = H @ s
         if s @ change > 0.0 and s @ along > 0.0:
             H = H + np.outer(change, change) / (s @ change) - np.outer(along, along) / (s @ along)
+        if gain < enough + share * abs(value):
+            break
+    return x, value, slope, H
+
+
+def _newton(H: Array, slope: Array) -> Array:
+    """Newton's step, in the directions that have a curvature, of a limited length."""
+    values, vectors = np.linalg.eigh(H)
+    usable = vectors[:, values > _FLAT]
+    step = -(usable / values[values > _FLAT]) @ (usable.T @ slope)
+    return np.asarray(step / max(1.0, np.abs(step).max(initial=0.0)))
+
+
+def polish(
+    likelihood: Likelihood, theta: Array, hessian: Array | None = None
+) -> tuple[Array, Array]:
+    """Newton's steps to the minimum, and the Hessian there; one of nearby may be known."""
+    structure, rest = likelihood.structure, theta[likelihood.structure.seen :]
+
+    def whole(part: Array) -> Array:
+        return np.concatenate((part, rest))
+
+    def cost(part: Array) -> tuple[float, Array]:
+        value, slope = likelihood.gradient(whole(part))
+        return value, slope[: structure.seen]
+
+    known = theta
+    H = _curvature(likelihood, theta) if hessian is None else hessian
+    part, *_ = _descended(
+        cost, theta[: structure.seen], H, _GAIN,
+        lambda part: structure.bounded(whole(part))[: structure.seen],
+    )
+    theta = whole(part)
     if hessian is not None or np.abs(theta - known).max() > _NEAR:
         H = _curvature(likelihood, theta)
     return theta, H
@@ -281,7 +312,6 @@ def refit(likelihood: Likelihood, theta: Array, hessian: Array) -> tuple[Array, 
     tuned = likelihood.samples
     likelihood.tuned = [np.ones_like(mask) for mask in likelihood.tuned]
     hessian = likelihood.samples / tuned * hessian
-    theta, _ = search_likelihood(likelihood, theta, lambda *_: None, hessian)
     return polish(likelihood, theta, hessian)
 
 
@@ -295,31 +325,39 @@ def limit(
     structure = likelihood.structure
     least, end = likelihood.value(theta), structure.limits[k][1 if sign > 0 else 0]
     others = [j for j in range(structure.seen) if j != k]
-    spread = _alike(hessian[np.ix_(others, others)])
-    point = theta.copy()
+    H = hessian[np.ix_(others, others)]
+    # The furthest point within the limit, the curvature there, and where the others go from there.
+    nearest, slant = theta.copy(), _newton(H, hessian[others, k])
 
     def rise(to: float) -> float:
         """The rise in standard deviations at the point where the others are best."""
-        begin = point.copy()
-        begin[k] = to
+        nonlocal nearest, slant, H
+
+        def at(part: Array) -> Array:
+            whole = theta.copy()
+            whole[k], whole[others] = to, part
+            return structure.bounded(whole)
 
         def cost(part: Array) -> tuple[float, Array]:
-            whole = begin.copy()
-            whole[others] += spread @ part
-            value, slope = likelihood.gradient(structure.bounded(whole))
-            if not np.isfinite(value):
-                return _FAILED, np.zeros(len(others))
-            return value - least, spread.T @ slope[others]
+            value, slope = likelihood.gradient(at(part))
+            return value - least, slope[others]
 
-        found = minimize(
-            cost, np.zeros(len(others)), jac=True, method="L-BFGS-B",
-            options={"maxiter": 15, "gtol": 0.05, "ftol": 1e-4},
-        ) if others else None
-        if found is not None:
-            begin[others] += spread @ found.x
-        difference = likelihood.value(begin) - least if found is None else float(found.fun)
-        point[:] = structure.bounded(begin)
-        return float(np.sqrt(2.0 * max(difference, 0.0)))
+        begin, further = nearest[others], to - nearest[k]
+        for ahead in (begin + np.clip(slant * further, -1.0, 1.0), begin):
+            part, value, slope, curved = _descended(cost, ahead, H, _CLOSE, share=_ROUGH)
+            if np.isfinite(value):
+                break
+        step = _newton(curved, slope)
+        gain = -0.5 * float(slope @ step)
+        if not np.isfinite(value):
+            return _FAILED
+        if gain < _CLOSE:
+            part, value = part + step, value - gain
+        found = float(np.sqrt(2.0 * max(value, 0.0)))
+        if found < NORMAL:
+            nearest, H = at(part), curved
+            slant = (nearest - theta)[others] / (to - theta[k])
+        return found
 
     # The rise is about a power of the distance, which is one of variances where k is a logarithm:
     # also where the least cost is at a variance of 0, behind a long way on which nothing changes.

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 import qpmhe
 from qpmhe.errors import InvalidInputError, ModelError, OptionError, QpmheError
@@ -18,6 +19,7 @@ from qpmhe.tuning import (
     TuningRecord,
     contest,
     judge,
+    likelihood,
     load,
     score,
     search,
@@ -389,6 +391,32 @@ def test_a_judge_runs_no_estimator_again(monkeypatch):
     assert len(runs) == before + 1
 
 
+def test_gradients_of_a_search_are_few(monkeypatch):
+    gradients = []
+    gradient = likelihood.Likelihood.gradient
+    monkeypatch.setattr(likelihood.Likelihood, "gradient", lambda *given: (
+        gradients.append(1), gradient(*given))[1])
+    tuning = tuned(starts=1, held_out=0.0)
+    assert len(gradients) < 60
+    theta, one = tuning._likeliest, tuning._likelihood
+    exact = np.array([
+        one.gradient(theta + move)[1] - one.gradient(theta - move)[1] for move in 1e-4 * np.eye(3)
+    ]) / 2e-4
+    np.testing.assert_allclose(search.polish(one, theta)[1], exact, rtol=2e-3, atol=2e-3)
+    for k, name in enumerate(tuning.values):  # ends of intervals are on the limit
+        end = search.limit(one, theta, exact, k, 1.0)
+        free = np.delete(np.arange(3), k)
+
+        def least(part, k=k, end=end, free=free):
+            at = theta.copy()
+            at[k], at[free] = end, part
+            value, slope = gradient(one, at)
+            return value, slope[free]
+
+        rise = minimize(least, theta[free], jac=True).fun - one.value(theta)
+        assert np.sqrt(2.0 * rise) == pytest.approx(search.NORMAL, abs=0.04), name
+
+
 @pytest.mark.parametrize("errors", [1.5, 3.0])
 def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors, monkeypatch):
     """The second search's weights are less likely, and better by so many standard errors."""
@@ -576,7 +604,7 @@ def test_a_search_that_was_stopped_resumes(tmp_path, monkeypatch):
     with pytest.raises(TuningCheckpointError, match="another search"):
         tuned(starts=3, checkpoint=path, threshold=2.0)
     resumed = tuned(starts=3, checkpoint=path)
-    assert len(calls) == 5  # two of three starts were left, and the last search over all blocks
+    assert len(calls) == 4  # two of three starts were left
     assert not path.exists()
     # Uninterrupted, and in two processes.
     assert resumed.values == tuned(starts=3).values
