@@ -31,6 +31,8 @@ _FAR_TOO_LONG = 100.0
 _EXPLICIT, _IMPLICIT = (2, 4, 8, 16, 32, 64), (1, 2, 4, 8, 16)
 # What other methods are compared with, in at most so many substeps, and at so many points.
 _REFERENCE, _MOST_SUBSTEPS, _MOST_POINTS = "radau", 4, 6
+# Points of an implicit step, by the operations of a solution: this many over n cubed.
+_MOST_SOLVES = 1e7
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,10 @@ class StepComparison:
     ) -> None:
         self._system, prior = system, prior_deviations(cost, covariance)
         points, inputs = prior_points(system, state, prior), np.atleast_2d(u)
+        how = system.origin.how
+        if how is not None and how.is_implicit:
+            most = max(_MOST_POINTS, int(_MOST_SOLVES / system.n**3))
+            points = points[np.linspace(0, len(points) - 1, min(most, len(points))).astype(np.intp)]
         self._points = np.tile(points, (len(inputs), 1))
         self._inputs = np.repeat(inputs, len(points), axis=0)
         units = disturbance_deviations(system, cost)

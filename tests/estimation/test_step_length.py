@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import qpmhe
 from qpmhe.cli import doctor
-from qpmhe.estimation.step_length import StepCheck, step_error, step_errors
+from qpmhe.estimation.step_length import StepCheck, StepComparison, step_error, step_errors
 from qpmhe.models import catalogue
 
 
@@ -160,6 +160,27 @@ def test_large_models_are_compared_with_halves_alone():
         prior=np.eye(n), disturbance=np.eye(n), noise=[[1.0]])
     found = step_error(system, cost, None, np.ones(n), np.zeros(0))
     assert found.finer == "that of half the length"
+
+
+def test_implicit_steps_of_many_states_are_tried_at_few_points(monkeypatch):
+    """Each costs the cube of the states: 2 n + 1 points and more took most of the constructor."""
+    counts, n = [], 60
+
+    def counted(self, one, finer, how):
+        counts.append(len(one))
+        return error(self, one, finer, how)
+
+    error = StepComparison._error
+    monkeypatch.setattr(StepComparison, "_error", counted)
+    system = qpmhe.System.from_ode(
+        lambda x: -x - 0.1 * x**3, lambda x: x[:1], dt=0.1, n=n, p=1, method="midpoint"
+    )
+    weights = qpmhe.QuadraticCost(
+        prior=np.eye(n), disturbance=np.eye(n), noise=np.eye(1)
+    )
+    step_error(system, weights, None, np.ones(n), np.zeros(0))
+    assert counts
+    assert 6 <= max(counts) <= 1e7 / n**3
 
 
 def test_a_model_outside_of_its_domain_is_no_error():
