@@ -37,6 +37,9 @@ from .templates import filled, prologue, template
 
 # Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
+# Stages whose next correction is at most such a share of the states' sizes have Jacobians that are
+# accurate enough for the derivative, whose equations make this correction.
+_ROUGH = 1e-12
 # Rows need not be exchanged where the sum of the squares of all multipliers is at most this.
 _LARGEST_MULTIPLIERS = 100.0
 
@@ -255,6 +258,7 @@ def _step_parts(model: CasadiModel, single: bool) -> list[str]:
         "curved": repr(CURVED), "least": repr(LESS[0]), "most": repr(LESS[1]),
         "count": len(model.guess), "guess": ", ".join(map(repr, model.guess)),
         "kept": MOST_KEPT, "contraction": repr(CONTRACTION), "few": repr(FEW_ROUNDINGS),
+        "rough": repr(max(_ROUGH, 4.0 * coarser * ROUNDING)),
         "spread": repr(LARGEST_SPREAD / coarser), "parts": FOLLOWED, "whole": MOST_WHOLE,
         "following": MOST_FOLLOWING,
     } | names | _elimination(pattern) | _collocation(COLLOCATIONS[how.method])
@@ -272,6 +276,7 @@ def _elimination(pattern: NDArray[np.bool_]) -> dict[str, object]:
         "order": ", ".join(map(str, order)), "start": ", ".join(map(str, ends)),
         "near": ", ".join(str(one) for some in near for one in some) or "0",
         "multipliers": repr(_LARGEST_MULTIPLIERS),
+        "full": int(2 * sum(map(len, near)) == len(near) * (len(near) - 1)),
     }
 
 

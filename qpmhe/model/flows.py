@@ -31,14 +31,19 @@ def flow_pattern(model: CasadiModel) -> Pattern:
 
 
 def few_fill_ins(pattern: Pattern) -> tuple[list[int], list[list[int]]]:
-    """An order of elimination by least degrees, and the states that each is beside at its turn."""
+    """An order of elimination by least degrees, and the states that each is beside at its turn.
+
+    Among equal degrees, those first that wait for the fewest others in a row: a processor works at
+    both ends of a chain at the same time.
+    """
     beside = [set(np.flatnonzero(row).tolist()) - {a} for a, row in enumerate(pattern | pattern.T)]
-    left, order, near = set(range(len(beside))), [], []
+    left, order, near, waits = set(range(len(beside))), [], [], [0] * len(beside)
     while left:
-        one = min(left, key=lambda a: (len(beside[a]), a))
+        one = min(left, key=lambda a: (len(beside[a]), waits[a], a))
         left.remove(one)
         order.append(one)
         near.append(sorted(beside[one]))
         for a in beside[one]:
             beside[a] = (beside[a] | beside[one]) - {a, one}
+            waits[a] = max(waits[a], waits[one] + 1)
     return order, near

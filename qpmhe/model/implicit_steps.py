@@ -10,7 +10,8 @@ alone. A simplified iteration with one Jacobian comes first; where its correctio
 fast, Newton's method starts again, with whole and then with damped steps; and where these fail,
 too, it follows the stages as h grows. C does the same in the same order. The implicit function
 theorem gives the derivative, from the Jacobians at the converged stages: exact, whatever the
-iteration did.
+iteration did. Where C computes it, its equations also make the last correction of the stages, by
+less than 1e-12 of the states.
 """
 
 from __future__ import annotations
@@ -251,10 +252,10 @@ class ImplicitStep:
                 parts = parts / factor[:, None]
             made.append(parts)
             shares = parts.reshape(now.shape)
-            lost = ~np.isfinite(_dot(parts, parts))
+            length = np.sqrt(_dot(parts, parts))
+            lost = ~np.isfinite(length)
             lost |= ((scale[:, None] == 0.0) & (shares != 0.0)).any(axis=(1, 2))
             now = now + shares * scale[:, None]
-            length = np.abs(shares).max(axis=(1, 2))
             falls = length / last
             done = (length <= ROUNDING) | ((length * falls <= ROUNDING) & np.isfinite(last))
             slow = ~done & (falls > CONTRACTION)

@@ -1,5 +1,6 @@
 """Steps of an ODE by each method: order, stiff problems, derivatives, units, failures."""
 
+import dataclasses
 import pickle
 import re
 
@@ -10,9 +11,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import qpmhe
-from qpmhe.codegen.compiler import find_compiler
+from qpmhe.adapters.casadi import _compiled
+from qpmhe.codegen.compiler import compiled_library, find_compiler
+from qpmhe.codegen.model_source import model_files
 from qpmhe.errors import ModelError, OptionError
-from qpmhe.model.discretize import METHODS
+from qpmhe.model.discretize import METHODS, Discretization
 from qpmhe.model.evaluation import Evaluator, machine
 from qpmhe.model.implicit_steps import COLLOCATIONS, ImplicitStep
 
@@ -350,6 +353,28 @@ def test_the_compiled_step_keeps_a_jacobian_and_has_the_same_values(method):
     slopes, expected = (model.linear(states, inputs)[0] for model in (written, python))
     sizes = np.abs(expected).max(axis=2, keepdims=True)
     assert (np.abs(slopes - expected) < 1e-9 * sizes).all()
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
+@pytest.mark.parametrize("method", COLLOCATIONS)
+def test_a_compiled_derivative_costs_its_value_no_digit(method):
+    """With a derivative, iterations end earlier, and its equations correct the stages once more."""
+    model, _, _ = drawn(arrhenius, 0.01, 3 * [0.0], 3 * [1.0])
+    model = dataclasses.replace(model, how=Discretization(method, 1))
+    x = np.random.default_rng(0).uniform([0.3, 330.0, 300.0], [0.7, 360.0, 330.0], (300, 3))
+    none = np.zeros((300, 0))
+    python = Evaluator(machine(model, False)).one
+    values = evaluated_in_c(model)("f", x, none)
+    states, _, results, evaluate = _compiled(
+        model, compiled_library(model_files(model), "model.c"), False, 300, ("f", "f_jacobian"))
+    states[:] = x
+    evaluate()
+    along, slopes = results["f"], results["f_jacobian"]
+    np.testing.assert_allclose(values, python("f", x, none), rtol=1e-13)
+    np.testing.assert_allclose(along, values, rtol=1e-13)
+    expected = python("f_jacobian", x, none)
+    sizes = np.abs(expected).max(axis=2, keepdims=True)
+    assert (np.abs(slopes - expected) < 3e-11 * sizes).all()
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")

@@ -18,7 +18,7 @@ static void mhe_step_back(const real *x, const real *u, real h, const real *by_n
     mhe_reduced r[MHE_STAGES];
     int pivot[MHE_UNKNOWNS];
     for (int j = 0; j < NX; j++) by_x[j] = NAN;
-    if (!mhe_solve_stages(x, u, h, 1, W, r)) return;
+    if (!mhe_solve_stages(x, u, h, 1, 0, W, r)) return;
     mhe_state_reciprocals(x, h, W, MHE_STAGES, r, per);
     if (!mhe_stage_factor(h, r, per, M, pivot)) return;
     for (int i = 0; i < MHE_UNKNOWNS * NX; i++) T[i] = i / NX % NX == i % NX;

@@ -7,6 +7,20 @@ static const int mhe_order[NX] = {$order};
 static const int mhe_near_start[NX + 1] = {$start};
 static const int mhe_near[] = {$near};
 
+/* Zeros where elimination needs entries. */
+static void mhe_clear_blocks(int size, real *M)
+{
+    if ($full)
+        for (int i = 0; i < NX * NX * size; i++) M[i] = 0;
+    for (int p = 0; p < NX * !$full; p++) {
+        const int c = mhe_order[p];
+        for (int i = 0; i < size; i++) M[(c * NX + c) * size + i] = 0;
+        for (int q = mhe_near_start[p]; q < mhe_near_start[p + 1]; q++)
+            for (int i = 0; i < size; i++)
+                M[(c * NX + mhe_near[q]) * size + i] = M[(mhe_near[q] * NX + c) * size + i] = 0;
+    }
+}
+
 /* Invert the block on the diagonal, last row first, and add the squares of the multipliers. */
 static void mhe_invert_block(int size, real *D, real *squares)
 {
@@ -63,13 +77,14 @@ static int mhe_factor_blocks(int size, real *M, const real *per)
 }
 
 /* to -= block from, for NX columns. */
-static void mhe_subtract_block(int size, const real *block, const real *from, real *to)
+static void mhe_subtract_block(int size, const real *restrict block, const real *restrict from,
+                               real *restrict to)
 {
-    for (int k = 0; k < NX; k++)
-        for (int i = 0; i < size; i++) {
-            real sum = 0;
-            for (int j = 0; j < size; j++) sum += block[i * size + j] * from[j * NX + k];
-            to[i * NX + k] -= sum;
+    for (int i = 0; i < size; i++)
+        for (int k = 0; k < NX; k++) {
+            real sum = to[i * NX + k];
+            for (int j = 0; j < size; j++) sum -= block[i * size + j] * from[j * NX + k];
+            to[i * NX + k] = sum;
         }
 }
 
@@ -92,11 +107,44 @@ static void mhe_solve_blocks(int size, const real *M, real *z)
             mhe_subtract_block(size, M + (c * NX + r) * size * size, z + r * size * NX, row);
         }
         for (int i = 0; i < size * NX; i++) held[i] = row[i];
-        for (int k = 0; k < NX; k++)
-            for (int i = 0; i < size; i++) {
+        for (int i = 0; i < size; i++)
+            for (int k = 0; k < NX; k++) {
                 real sum = 0;
                 for (int j = 0; j < size; j++) sum += D[i * size + j] * held[j * NX + k];
                 row[i * NX + k] = sum;
             }
+    }
+}
+
+/* The same for a single column. */
+static void mhe_solve_one(int size, const real *M, real *z)
+{
+    for (int p = 0; p < NX; p++) {
+        const real *from = z + mhe_order[p] * size;
+        for (int q = mhe_near_start[p]; q < mhe_near_start[p + 1]; q++) {
+            const real *block = M + (mhe_near[q] * NX + mhe_order[p]) * size * size;
+            real *to = z + mhe_near[q] * size;
+            for (int i = 0; i < size; i++) {
+                real sum = to[i];
+                for (int j = 0; j < size; j++) sum -= block[i * size + j] * from[j];
+                to[i] = sum;
+            }
+        }
+    }
+    for (int p = NX - 1; p >= 0; p--) {
+        const int c = mhe_order[p];
+        const real *D = M + (c * NX + c) * size * size;
+        real *row = z + c * size, held[3];
+        for (int i = 0; i < size; i++) held[i] = row[i];
+        for (int q = mhe_near_start[p]; q < mhe_near_start[p + 1]; q++) {
+            const real *block = M + (c * NX + mhe_near[q]) * size * size, *from = z + mhe_near[q] * size;
+            for (int i = 0; i < size; i++)
+                for (int j = 0; j < size; j++) held[i] -= block[i * size + j] * from[j];
+        }
+        for (int i = 0; i < size; i++) {
+            real sum = 0;
+            for (int j = 0; j < size; j++) sum += D[i * size + j] * held[j];
+            row[i] = sum;
+        }
     }
 }

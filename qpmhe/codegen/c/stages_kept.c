@@ -27,44 +27,106 @@ typedef struct {
     real one[NX * NX], parts[SIZE(2 * NX * NX * MHE_PAIR)];
 } mhe_modes;
 
-/* The same by elimination without exchanges; whether it may do without. */
+/* Row `to` of all three minus a real and a complex factor times row `from`. */
+static void mhe_subtract_modes(const real *factor, real *restrict one, real *restrict direct,
+                               real *restrict across, int from, int to)
+{
+    const real plain = factor[0], first = factor[MHE_PAIR], second = factor[2 * MHE_PAIR];
+    for (int j = 0; j < NX; j++) one[to + j] -= plain * one[from + j];
+    for (int j = 0; j < NX * MHE_PAIR; j++) {
+        const real a = direct[from + j], b = across[from + j];
+        direct[to + j] -= first * a - second * b;
+        across[to + j] -= first * b + second * a;
+    }
+}
+
+/* The same by elimination without exchanges, of the transposed matrices, so that rows of the result are
+ * columns of the inverses; whether it may do without: see `mhe_factor_blocks`. */
 static int mhe_invert_blocks(real h, const real *J, const real *per, mhe_modes *modes)
 {
-    real one[NX * NX], z[NX * NX];
-    for (int i = 0; i < NX * NX; i++) one[i] = z[i] = 0;
+    enum { PARTS = 1 + 2 * MHE_PAIR };
+    real M[NX * NX * PARTS], squares = 0;
+    mhe_clear_blocks(PARTS, M);
     for (int a = 0; a < NX; a++) {
-        one[a * NX + a] = $real;
-        z[a * NX + a] = 1;
+        real *own = M + (a * NX + a) * PARTS;
+        own[0] = $real;
+        if (MHE_PAIR) {
+            own[MHE_PAIR] = $real + $shift;
+            own[2 * MHE_PAIR] = $turning;
+        }
     }
-    for (int q = 0; q < MHE_FLOW_NONZEROS; q++)
-        one[mhe_flow_row[q] * NX + mhe_flow_column[q]] -= h * J[q];
-    if (!mhe_factor_blocks(1, one, per)) return 0;
-    mhe_solve_blocks(1, one, z);
-    for (int i = 0; i < NX * NX; i++) modes->one[i % NX * NX + i / NX] = z[i];
-    if (MHE_PAIR) {
-        real pair[4 * NX * NX], both[2 * NX * NX];
-        for (int i = 0; i < 4 * NX * NX; i++) pair[i] = 0;
-        for (int i = 0; i < 2 * NX * NX; i++) both[i] = 0;
-        for (int a = 0; a < NX; a++) {
-            real *block = pair + 4 * (a * NX + a);
-            block[0] = block[3] = $real + $shift;
-            block[1] = -$turning;
-            block[2] = $turning;
-            both[2 * a * NX + a] = 1;
+    for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
+        real *entry = M + (mhe_flow_column[q] * NX + mhe_flow_row[q]) * PARTS;
+        entry[0] -= h * J[q];
+        if (MHE_PAIR) entry[MHE_PAIR] -= h * J[q];
+    }
+    for (int p = 0; p < NX; p++) {
+        const int c = mhe_order[p];
+        real *pivot = M + (c * NX + c) * PARTS;
+        pivot[0] = 1 / pivot[0];
+        squares += 0 * pivot[0]; /* no number if it is none */
+        if (MHE_PAIR) {
+            real *pair = pivot + MHE_PAIR;
+            const real size = 1 / (pair[0] * pair[0] + pair[1] * pair[1]);
+            pair[0] *= size;
+            pair[1] *= -size;
+            squares += 0 * size;
         }
-        for (int q = 0; q < MHE_FLOW_NONZEROS; q++) {
-            real *block = pair + 4 * (mhe_flow_row[q] * NX + mhe_flow_column[q]);
-            block[0] -= h * J[q];
-            block[3] -= h * J[q];
-        }
-        if (!mhe_factor_blocks(2, pair, per)) return 0;
-        mhe_solve_blocks(2, pair, both);
-        for (int i = 0; i < NX; i++)
-            for (int j = 0; j < NX; j++) {
-                modes->parts[j * NX + i] = both[2 * i * NX + j];
-                modes->parts[NX * NX + j * NX + i] = -both[(2 * i + 1) * NX + j];
+        for (int q = mhe_near_start[p]; q < mhe_near_start[p + 1]; q++) {
+            const int r = mhe_near[q];
+            const real ratio = per[c] / per[r];
+            real *left = M + (r * NX + c) * PARTS;
+            real first = 0, second = 0;
+            left[0] *= pivot[0];
+            real most = left[0] * left[0];
+            if (MHE_PAIR) {
+                const real *own = pivot + MHE_PAIR;
+                real *both = left + MHE_PAIR;
+                first = both[0] * own[0] - both[1] * own[1];
+                second = both[0] * own[1] + both[1] * own[0];
+                both[0] = first;
+                both[1] = second;
+                most += first * first + second * second;
             }
+            squares += most * ratio * ratio;
+            for (int o = mhe_near_start[p]; o < mhe_near_start[p + 1]; o++) {
+                const real *right = M + (c * NX + mhe_near[o]) * PARTS;
+                real *to = M + (r * NX + mhe_near[o]) * PARTS;
+                to[0] -= left[0] * right[0];
+                if (MHE_PAIR) {
+                    const real a = right[MHE_PAIR], b = right[2 * MHE_PAIR];
+                    to[MHE_PAIR] -= first * a - second * b;
+                    to[2 * MHE_PAIR] -= first * b + second * a;
+                }
+            }
+        }
     }
+    if (!(squares <= (real)$multipliers)) return 0;
+    real *one = modes->one, *direct = modes->parts, *across = direct + NX * NX * MHE_PAIR;
+    for (int i = 0; i < NX * NX; i++) one[i] = 0;
+    for (int i = 0; i < 2 * NX * NX * MHE_PAIR; i++) direct[i] = 0;
+    for (int a = 0; a < NX; a++) {
+        one[a * NX + a] = 1;
+        if (MHE_PAIR) direct[a * NX + a] = 1;
+    }
+    for (int p = 0; p < NX; p++)
+        for (int q = mhe_near_start[p]; q < mhe_near_start[p + 1]; q++) {
+            const int c = mhe_order[p] * NX, r = mhe_near[q] * NX;
+            mhe_subtract_modes(M + (r + mhe_order[p]) * PARTS, one, direct, across, c, r);
+        }
+    for (int p = NX - 1; p >= 0; p--) {
+        const int c = mhe_order[p] * NX;
+        const real *pivot = M + (c + mhe_order[p]) * PARTS;
+        for (int q = mhe_near_start[p]; q < mhe_near_start[p + 1]; q++)
+            mhe_subtract_modes(M + (c + mhe_near[q]) * PARTS, one, direct, across, mhe_near[q] * NX, c);
+        for (int j = 0; j < NX; j++) one[c + j] *= pivot[0];
+        for (int j = c; j < (c + NX) * MHE_PAIR; j++) {
+            const real a = direct[j], b = across[j];
+            direct[j] = a * pivot[MHE_PAIR] - b * pivot[2 * MHE_PAIR];
+            across[j] = a * pivot[2 * MHE_PAIR] + b * pivot[MHE_PAIR];
+        }
+    }
+    for (int i = 0; i < NX * NX * MHE_PAIR; i++) across[i] = -across[i];
     return 1;
 }
 
@@ -102,45 +164,70 @@ static int mhe_invert_modes(real h, const real *J, real *per, mhe_modes *modes)
     return 1;
 }
 
-/* to += weights from, of values at all stages. */
-static void mhe_add_stages(const real (*weights)[MHE_STAGES], const real *from, real *to)
+/* to = weights from, of values at all stages. */
+static void mhe_mix_stages(const real (*weights)[MHE_STAGES], const real *restrict from,
+                           real *restrict to)
 {
     for (int i = 0; i < MHE_STAGES; i++)
-        for (int j = 0; j < MHE_STAGES; j++)
-            for (int a = 0; a < NX; a++) to[i * NX + a] += weights[i][j] * from[j * NX + a];
+        for (int a = 0; a < NX; a++) {
+            real sum = 0;
+            for (int j = 0; j < MHE_STAGES; j++) sum += weights[i][j] * from[j * NX + a];
+            to[i * NX + a] = sum;
+        }
 }
 
-/* The corrections of Z, in place of the residuals h f_i - sum_j (1/A)_ij Z_j. */
-static void mhe_solve_modes(const mhe_modes *modes, real *stages)
+/* to = M from, with a matrix by columns. */
+static void mhe_times_columns(const real *restrict M, const real *restrict from, real *restrict to)
 {
-    real right[MHE_STAGES * NX], found[MHE_STAGES * NX];
-    for (int i = 0; i < MHE_STAGES * NX; i++) right[i] = 0;
-    mhe_add_stages(mhe_to_modes, stages, right);
     for (int i = 0; i < NX; i++) {
         real sum = 0;
-        for (int j = 0; j < NX; j++) sum += modes->one[j * NX + i] * right[j];
-        found[i] = sum;
+        for (int j = 0; j < NX; j++) sum += M[j * NX + i] * from[j];
+        to[i] = sum;
     }
-    for (int i = 0; i < NX * MHE_PAIR; i++) {
-        const real *direct = modes->parts + i, *across = direct + NX * NX;
-        const real *a = right + NX, *b = a + NX;
+}
+
+/* The same of complex numbers, both parts one behind the other. */
+static void mhe_times_pair(const real *restrict M, const real *restrict from, real *restrict to)
+{
+    for (int i = 0; i < NX; i++) {
+        const real *direct = M + i, *across = direct + NX * NX;
         real first = 0, second = 0;
         for (int j = 0; j < NX; j++) {
-            first += direct[j * NX] * a[j] + across[j * NX] * b[j];
-            second += direct[j * NX] * b[j] - across[j * NX] * a[j];
+            first += direct[j * NX] * from[j] + across[j * NX] * from[NX + j];
+            second += direct[j * NX] * from[NX + j] - across[j * NX] * from[j];
         }
-        found[NX + i] = first;
-        found[2 * NX + i] = second;
+        to[i] = first;
+        to[NX + i] = second;
     }
-    for (int i = 0; i < MHE_STAGES * NX; i++) stages[i] = 0;
-    mhe_add_stages(mhe_from_modes, found, stages);
+}
+
+/* The corrections of Z by the residuals h f_i - sum_j (1/A)_ij Z_j. */
+static void mhe_solve_modes(const mhe_modes *modes, const real *defect, real *stages)
+{
+    real right[MHE_STAGES * NX], found[MHE_STAGES * NX];
+    mhe_mix_stages(mhe_to_modes, defect, right);
+    mhe_times_columns(modes->one, right, found);
+    if (MHE_PAIR) mhe_times_pair(modes->parts, right + NX * MHE_PAIR, found + NX * MHE_PAIR);
+    mhe_mix_stages(mhe_from_modes, found, stages);
+}
+
+/* What is missing to the stages' equations, h f(x + Z) - Z / A. */
+static void mhe_stage_defect(const real *restrict rates, real h, const real *restrict W,
+                             real *restrict defect)
+{
+    for (int i = 0; i < MHE_STAGES; i++)
+        for (int a = 0; a < NX; a++) {
+            real sum = h * rates[i * NX + a];
+            for (int j = 0; j < MHE_STAGES; j++) sum -= mhe_stage_inverse[i][j] * W[j * NW + a];
+            defect[i * NX + a] = sum;
+        }
 }
 
 /* Newton's corrections of the stages W by the frozen r. */
 static void mhe_kept_moves(const real *x, const real *u, real h, const mhe_reduced *r,
                           const mhe_modes *modes, const real *W, int first, real *moves)
 {
-    real at[NW], values[NW], stages[MHE_STAGES * NX], rates[MHE_STAGES * NX];
+    real at[NW], values[NW], defect[MHE_UNKNOWNS], stages[MHE_UNKNOWNS], rates[MHE_UNKNOWNS];
     for (int i = 0; i < MHE_STAGES; i++) {
         real *move = moves + i * NW;
         if (first) {
@@ -152,13 +239,8 @@ static void mhe_kept_moves(const real *x, const real *u, real h, const mhe_reduc
         mhe_call_f(at, u, values);
         mhe_freeze(r, values, rates + i * NX, move);
     }
-    for (int i = 0; i < MHE_STAGES; i++)
-        for (int a = 0; a < NX; a++) {
-            real sum = h * rates[i * NX + a];
-            for (int j = 0; j < MHE_STAGES; j++) sum -= mhe_stage_inverse[i][j] * W[j * NW + a];
-            stages[i * NX + a] = sum;
-        }
-    mhe_solve_modes(modes, stages);
+    mhe_stage_defect(rates, h, W, defect);
+    mhe_solve_modes(modes, defect, stages);
     for (int i = 0; i < MHE_STAGES; i++) {
         for (int a = 0; a < NX; a++) moves[i * NW + a] = stages[i * NX + a];
         mhe_follow(r, moves + i * NW);
@@ -214,8 +296,10 @@ static real mhe_stage_product(const real *a, const real *b)
     return (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
 
-/* The stages W of a step from w = (x, z), at which f is linearised; whether they converge fast. */
-static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_reduced *r, real *W)
+/* The stages W of a step from w = (x, z), at which f is linearised; whether they converge fast, so far
+ * that the next correction is likely to be less than `rough`, a share of the sizes. */
+static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_reduced *r, real rough,
+                             real *W)
 {
     mhe_modes modes;
     real moves[MHE_STAGE_VALUES], sizes[MHE_STAGE_VALUES], per[MHE_STAGE_VALUES];
@@ -226,7 +310,7 @@ static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_red
     mhe_state_reciprocals(w, h, W, 1, r, sizes);
     if (!mhe_invert_modes(h, r->jacobian, sizes, &modes)) return 0;
     for (int k = 0; k < $kept; k++) {
-        real *share = made[k], length = 0;
+        real *share = made[k];
         mhe_kept_moves(w, u, h, r, &modes, W, k == 0, moves);
         if (k == 0) {
             if (!mhe_kept_sizes(w, h, r, &modes, moves, sizes, rounding)) return 0;
@@ -249,19 +333,19 @@ static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_red
         for (int i = 0; i < MHE_STAGE_VALUES && !sized; i++)
             /* What stays 0 in linear equations has no size. */
             if (!(sizes[i] > 0) && share[i] != 0) return 0;
-        for (int i = 0; i < MHE_STAGE_VALUES; i++) length = mhe_max((real)fabs(share[i]), length);
-        const real square = mhe_stage_product(share, share);
+        const real square = mhe_stage_product(share, share), rate = square / last;
         squares[k] = 1 / square;
-        const real rate = length / last;
         if (!isfinite(square)) return 0;
-        if (length <= (real)$rounding || (k > 0 && length * rate <= (real)$rounding)) return 1;
-        if (rate > (real)$contraction) {
+        if (square <= (real)$rounding * (real)$rounding || (k > 0 && square * rate <= rough * rough))
+            return 1;
+        if (rate > (real)$contraction * (real)$contraction) {
+            const real few = (real)$few * (real)$rounding;
             real most = 0;
             for (int i = 0; i < MHE_STAGE_VALUES; i++)
                 most = mhe_max((real)fabs(share[i]) * rounding[i % NW], most);
-            return length <= (real)$few * (real)$rounding || most <= (real)$rounding;
+            return square <= few * few || most <= (real)$rounding;
         }
-        last = length;
+        last = square;
     }
     return 0;
 }
