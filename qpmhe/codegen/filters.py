@@ -18,6 +18,8 @@ from .model_source import filter_files
 
 Array = NDArray[np.float64]
 
+# Shares of the prior with which a library is compared, until one of them agrees.
+_SHARES = 1.0, 1e-4, 1e-8
 # Bytes that the adjoint may keep of all samples; of longer records it filters stretches again.
 _MOST_BYTES = 2**27
 
@@ -220,6 +222,19 @@ class HypothesisLibrary(FilterLibrary):
         done = self._library.mhe_filter_hypothesis(
             ctypes.byref(record), ctypes.c_int64(len(logs)), _at(logs), _at(left_out), out)
         return (logs, left_out) if done == len(logs) else None
+
+
+def first_fault(compared: Callable[[float], str]) -> str:
+    """What is wrong with a library, with the prior or with shares of it; blank if nothing.
+
+    Where a prior is vague, rounding differs between filters by more than the data say.
+    """
+    faults = []
+    for share in _SHARES:
+        faults.append(compared(share))
+        if not faults[-1]:
+            return ""
+    return faults[0]
 
 
 def _at(array: NDArray[Any]) -> ctypes.c_void_p:

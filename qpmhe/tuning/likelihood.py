@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import copy
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from .._checks import Array
-from ..codegen.filters import LikelihoodInput, LikelihoodLibrary, scalar_model
+from ..codegen.filters import LikelihoodInput, LikelihoodLibrary, first_fault, scalar_model
 from ..diagnosis.bank import FilterBank, Hypothesis
 from ..errors import CompilationError, QpmheError
 from ..estimation.engines import python_only
@@ -257,7 +258,8 @@ class _Filter:
 
         def fault(library: LikelihoodLibrary) -> str:
             try:
-                return compared(library, weights, first, chosen)
+                return first_fault(lambda share: compared(
+                    library, replace(weights, prior=share * weights.prior), first, chosen))
             finally:
                 self._library = None
 

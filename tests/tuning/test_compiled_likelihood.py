@@ -119,6 +119,12 @@ def test_vague_priors_and_units(unit, vague):
     np.testing.assert_allclose(slope, slopes, rtol=0, atol=error)
 
 
+def test_where_a_vague_prior_takes_digits_the_library_is_compared_with_a_share_of_it():
+    system, record, (prior, *others) = zoo("vehicle")
+    first, second, theta = both(system, record, (1e10 * np.eye(len(prior)), *others))
+    assert second.value(theta) == pytest.approx(first.value(theta), rel=1e-4)
+
+
 def test_a_prior_without_variance_and_a_disturbance_of_one_direction():
     y = np.random.default_rng(3).standard_normal((50, 1))
     y[10:20] = np.nan
