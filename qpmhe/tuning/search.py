@@ -324,6 +324,8 @@ def limit(
     """
     structure = likelihood.structure
     least, end = likelihood.value(theta), structure.limits[k][1 if sign > 0 else 0]
+    if end == theta[k]:
+        return None
     others = [j for j in range(structure.seen) if j != k]
     H = hessian[np.ix_(others, others)]
     # The furthest point within the limit, the curvature there, and where the others go from there.

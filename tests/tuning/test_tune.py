@@ -417,6 +417,16 @@ def test_gradients_of_a_search_are_few(monkeypatch):
         assert np.sqrt(2.0 * rise) == pytest.approx(search.NORMAL, abs=0.04), name
 
 
+def test_an_estimate_at_the_end_of_its_range_has_no_limit_beyond():
+    """It divided by the distance to itself there."""
+    structure = SimpleNamespace(limits=[(0.0, 2.0), (-9.0, 9.0)], seen=2)
+    one = SimpleNamespace(structure=structure, value=lambda theta: 0.0)
+    for k, sign, at in (0, 1.0, 2.0), (0, -1.0, 0.0), (1, 1.0, 9.0):
+        theta = np.array([1.0, 1.0])
+        theta[k] = at
+        assert search.limit(one, theta, np.eye(2), k, sign) is None
+
+
 @pytest.mark.parametrize("errors", [1.5, 3.0])
 def test_a_gain_must_be_beyond_chance_and_scores_are_those_of_the_answer(errors, monkeypatch):
     """The second search's weights are less likely, and better by so many standard errors."""
