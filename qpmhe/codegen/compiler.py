@@ -26,8 +26,9 @@ from .folders import cache_folders, own_file, writable_folder
 # They keep infinities and NaN, and the order of operations: without contraction of a * b + c to
 # one rounding, all levels give the same bits. The verdict compares costs that are stored, each
 # computed once, so that it holds whichever way they were rounded.
+_THREADS = "-DTHREAD_LOCAL=__thread"
 _FLAGS = ("-std=c99", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno",
-          "-fno-trapping-math")
+          "-fno-trapping-math", _THREADS)
 # Tried in turn until the code is right. Without vectors, masked loads cannot go wrong.
 _LEVELS = (("-O3", "-march=native"), ("-O2", "-fno-tree-vectorize"), ("-O0",))
 # Folders of compilations in progress, in the cache; and the seconds after which none is.
@@ -160,7 +161,7 @@ def _compiled(
 def shared_library(sources: list[Path], target: Path) -> None:
     """Compile C sources to a shared library for any machine of this kind, beside the cache."""
     compiler = required_compiler()
-    message = _run([*compiler, "-O2", "-fvisibility=hidden"], (), sources, target, None)
+    message = _run([*compiler, "-O2", "-fvisibility=hidden", _THREADS], (), sources, target, None)
     if message:
         raise CompilationError(f"{' '.join(compiler)} failed: {message}")
 

@@ -37,6 +37,16 @@ from .templates import filled, prologue, template
 
 # Four (n, n) arrays of them fit on any usual stack.
 _MOST_STATES = 256
+# The matrices of an implicit step are 30 to 60 times (n, n): with more states than this, those of a
+# library are the thread's. A macro of the compiler's command says how.
+_MOST_ON_STACK = 16
+_LARGE = """/* What keeps large matrices from the stack, where the compiler's command says how. */
+#ifdef THREAD_LOCAL
+#define MHE_LARGE static THREAD_LOCAL
+#else
+#define MHE_LARGE
+#endif
+"""
 # Stages whose next correction is at most such a share of the states' sizes have Jacobians that are
 # accurate enough for the derivative, whose equations make this correction.
 _ROUGH = 1e-12
@@ -265,7 +275,8 @@ def _step_parts(model: CasadiModel, single: bool) -> list[str]:
     rate = filled("algebraic", values) if model.guess else template("rate.c")
     parts = "equations", "blocks", "stages", "stages_kept", "step_implicit"
     first, blocks, *others = (filled(part, values) for part in parts)
-    return [tables, first, blocks, rate, *others, *substeps]
+    large = _LARGE if model.width > _MOST_ON_STACK else "#define MHE_LARGE\n"
+    return [large, tables, first, blocks, rate, *others, *substeps]
 
 
 def _elimination(pattern: NDArray[np.bool_]) -> dict[str, object]:

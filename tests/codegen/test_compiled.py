@@ -3,6 +3,8 @@
 import copy
 import math
 import pickle
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -261,3 +263,34 @@ def test_a_filter_that_explodes_does_not_convict_the_compiler():
             initial_state=[0.3785754024951795, -9.807693590675465], engine="compiled",
         )
     assert mhe.engine == "compiled"
+
+
+SMALL_STACK = """
+import threading
+import numpy as np
+import qpmhe
+
+n = 60
+system = qpmhe.System.from_ode(
+    lambda x: np.tanh(np.roll(x, 1)) - 2.0 * x, lambda x: x[:1], dt=0.1, n=n, p=1, method="radau"
+)
+cost = qpmhe.QuadraticCost(prior=np.eye(n), disturbance=np.eye(n), noise=np.eye(1))
+observer = qpmhe.observers.Luenberger(np.zeros((n, 1)))
+mhe = qpmhe.MovingHorizonEstimator(
+    system, observer, cost, horizon=3, initial_state=np.ones(n), engine="compiled"
+)
+threading.stack_size(256 * 1024)
+thread = threading.Thread(target=lambda: print(mhe.update([0.5]).status))
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.slow
+def test_implicit_steps_of_many_states_need_little_stack():
+    """With their matrices on it, 60 states ended a process whose thread has 256 kB."""
+    found = subprocess.run(
+        [sys.executable, "-c", SMALL_STACK], capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0, found.stderr
+    assert "IMPROVED" in found.stdout

@@ -113,7 +113,7 @@ static void mhe_freeze(const mhe_reduced *r, const real *values, real *rate, rea
  * whether they converge. `last_r` gets f, linearised before the last correction, unless it is null. */
 static int mhe_complete(const real *x, const real *u, real *w, mhe_reduced *last_r)
 {
-    mhe_reduced both[2];
+    MHE_LARGE mhe_reduced both[2];
     real trial[NW], sizes[NX], scale[NZ], again[NZ], last = INFINITY;
     int now = 0;
     for (int j = 0; j < NX; j++) {
@@ -169,7 +169,7 @@ static void mhe_h(const real *x, const real *u, real *y)
 /* h and its Jacobian with respect to x, with z following, by rows. */
 static void mhe_h_jacobian(const real *x, const real *u, real *y, real *C)
 {
-    mhe_reduced r;
+    MHE_LARGE mhe_reduced r;
     real w[NW], full[NY * NW];
     if (!mhe_complete(x, u, w, 0) || !mhe_reduce(w, u, &r)) {
         for (int i = 0; i < NY; i++) y[i] = NAN;

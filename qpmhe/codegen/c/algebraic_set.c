@@ -19,7 +19,7 @@ static void mhe_call_g(const real *joint, const real *u, real *values)
 /* Behind the derivatives by (x, w, v), those by x of each row that is a function of z. */
 static void mhe_call_g_jacobian(const real *joint, const real *u, real *values, real *slopes)
 {
-    mhe_reduced r;
+    MHE_LARGE mhe_reduced r;
     real full[$joint + NZ], w[NW], inner[$direct + $chained];
     const int regular = mhe_join_algebraic(joint, u, full, w) && mhe_reduce(w, u, &r);
     mhe_call_joined_g_jacobian(full, u, values, inner);

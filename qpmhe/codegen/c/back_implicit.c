@@ -11,13 +11,14 @@
 static void mhe_step_back(const real *x, const real *u, real h, const real *by_next,
                           const real *by_A, real *by_x, real *by_u)
 {
-    real W[MHE_STAGES * NW], M[MHE_UNKNOWNS * MHE_UNKNOWNS], T[MHE_UNKNOWNS * NX], per[NX];
-    real turned[MHE_UNKNOWNS], by_J[MHE_STAGES * NX * NX] = {0}, at[MHE_STAGES * NW];
+    MHE_LARGE real M[MHE_UNKNOWNS * MHE_UNKNOWNS], T[MHE_UNKNOWNS * NX], by_J[MHE_STAGES * NX * NX];
+    real W[MHE_STAGES * NW], per[NX], turned[MHE_UNKNOWNS], at[MHE_STAGES * NW];
     real rate[NX] = {0}, moved[NX], inputs[NU + 1];
     const real output[NY] = {0}, slope[NY * NX] = {0};
-    mhe_reduced r[MHE_STAGES];
+    MHE_LARGE mhe_reduced r[MHE_STAGES];
     int pivot[MHE_UNKNOWNS];
     for (int j = 0; j < NX; j++) by_x[j] = NAN;
+    for (int i = 0; i < MHE_STAGES * NX * NX; i++) by_J[i] = 0;
     if (!mhe_solve_stages(x, u, h, 1, 0, W, r)) return;
     mhe_state_reciprocals(x, h, W, MHE_STAGES, r, per);
     if (!mhe_stage_factor(h, r, per, M, pivot)) return;
@@ -65,9 +66,10 @@ static void mhe_call_back(const real *given, const real *u, real *by_z, real *by
     /* Before each substep: the state, and its derivative by z. Then the substep's own. */
     real *at = malloc(sizeof(real) * ((STEPS + 1) * (NX + NX * NX) + STEPS * NX * NX));
     real *reached = at + (STEPS + 1) * NX, *slopes = reached + (STEPS + 1) * NX * NX;
-    real ahead[NX], held[NX * NX], own[NX * NX], moved[NX], inputs[NU + 1], w[NW];
-    const real nothing[NX * NX] = {0};
-    mhe_reduced r;
+    MHE_LARGE real held[NX * NX], own[NX * NX];
+    MHE_LARGE mhe_reduced r;
+    static const real nothing[NX * NX] = {0};
+    real ahead[NX], moved[NX], inputs[NU + 1], w[NW];
     for (int k = 0; k <= NU; k++) by_u[k] = 0;
     for (int j = 0; j < NX; j++) by_z[j] = NAN;
     if (!at) return;

@@ -82,7 +82,8 @@ static int mhe_stage_factor(real h, const mhe_reduced *r, const real *per, real 
 static int mhe_stage_sizes(const real *x, real h, const real *W, const real *step,
                             const mhe_reduced *r, const real *M, const int *pivot, real *sizes)
 {
-    real states[NX], equations[NX], reach[NX], own[NX], inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
+    real states[NX], equations[NX], reach[NX], own[NX];
+    MHE_LARGE real inverse[MHE_UNKNOWNS * MHE_UNKNOWNS];
     for (int a = 0; a < NX; a++) {
         real most = 0;
         for (int i = 0; i < MHE_STAGES; i++)
@@ -163,9 +164,10 @@ static void mhe_start_stages(const real *w, real *W)
  * nearly linear; whether they converge. */
 static int mhe_iterate_stages(const real *w, const real *u, real h, int damped, int most, real *W)
 {
-    mhe_reduced both[2][MHE_STAGES];
+    MHE_LARGE mhe_reduced both[2][MHE_STAGES];
     real rates[MHE_UNKNOWNS], step[MHE_UNKNOWNS], moves[MHE_STAGES * NW], trial[MHE_STAGES * NW];
-    real M[MHE_UNKNOWNS * MHE_UNKNOWNS], scale[MHE_STAGES * NW], sizes[MHE_UNKNOWNS];
+    real scale[MHE_STAGES * NW], sizes[MHE_UNKNOWNS];
+    MHE_LARGE real M[MHE_UNKNOWNS * MHE_UNKNOWNS];
     real per[NX], last = INFINITY;
     int pivot[MHE_UNKNOWNS], now = 0;
     if (!mhe_stage_rates(w, u, W, both[0])) return 0;

@@ -45,7 +45,8 @@ static void mhe_subtract_modes(const real *factor, real *restrict one, real *res
 static int mhe_invert_blocks(real h, const real *J, const real *per, mhe_modes *modes)
 {
     enum { PARTS = 1 + 2 * MHE_PAIR };
-    real M[NX * NX * PARTS], squares = 0;
+    MHE_LARGE real M[NX * NX * PARTS];
+    real squares = 0;
     mhe_clear_blocks(PARTS, M);
     for (int a = 0; a < NX; a++) {
         real *own = M + (a * NX + a) * PARTS;
@@ -134,7 +135,8 @@ static int mhe_invert_blocks(real h, const real *J, const real *per, mhe_modes *
 static int mhe_invert_modes(real h, const real *J, real *per, mhe_modes *modes)
 {
     enum { WIDE = 2 * NX };
-    real block[NX * NX], wide[SIZE(NX * WIDE * MHE_PAIR)], *P = modes->one;
+    MHE_LARGE real block[NX * NX], wide[SIZE(NX * WIDE * MHE_PAIR)];
+    real *P = modes->one;
     int pivot[NX];
     if (mhe_invert_blocks(h, J, per, modes)) return 1;
     mhe_shifted($real, h, J, block);
@@ -301,7 +303,7 @@ static real mhe_stage_product(const real *a, const real *b)
 static int mhe_keep_jacobian(const real *w, const real *u, real h, const mhe_reduced *r, real rough,
                              real *W)
 {
-    mhe_modes modes;
+    MHE_LARGE mhe_modes modes;
     real moves[MHE_STAGE_VALUES], sizes[MHE_STAGE_VALUES], per[MHE_STAGE_VALUES];
     real rounding[NW], last = INFINITY;
     real made[$kept][MHE_STAGE_VALUES], squares[$kept]; /* the corrections, as shares of the sizes */

@@ -11,7 +11,7 @@ static const real mhe_step_weights[MHE_STAGES] = {$ends};
 static int mhe_solve_stages(const real *x, const real *u, real h, int wanted, int rough, real *W,
                             mhe_reduced *r)
 {
-    mhe_reduced first;
+    MHE_LARGE mhe_reduced first;
     real w[NW];
     if (!mhe_complete(x, u, w, &first)) return 0;
     wanted = wanted || NW > NX;
@@ -48,7 +48,7 @@ static void mhe_step_end(const real *x, const real *W, real *next)
 static void $value(const real *x, const real *u, real dt, real *next)
 {
     real W[MHE_STAGES * NW];
-    mhe_reduced r[MHE_STAGES];
+    MHE_LARGE mhe_reduced r[MHE_STAGES];
     if (mhe_solve_stages(x, u, dt, 0, 0, W, r)) {
         mhe_step_end(x, W, next);
         return;
@@ -64,7 +64,8 @@ static int mhe_step_slope(real h, const mhe_reduced *r, real *per, const real *W
                           real *correction)
 {
     enum { BLOCK = MHE_STAGES * MHE_STAGES };
-    real M[NX * NX * BLOCK], z[MHE_UNKNOWNS * NX], rates[MHE_UNKNOWNS], moves[MHE_UNKNOWNS];
+    MHE_LARGE real M[NX * NX * BLOCK], z[MHE_UNKNOWNS * NX];
+    real rates[MHE_UNKNOWNS], moves[MHE_UNKNOWNS];
     int pivot[MHE_UNKNOWNS], stride = NX, between = MHE_STAGES * NX;
     mhe_clear_blocks(BLOCK, M);
     for (int i = 0; i < MHE_UNKNOWNS * NX; i++) z[i] = 0;
@@ -138,7 +139,7 @@ static int mhe_correct_stages(const real *x, const mhe_reduced *r, const real *c
 static void $slope(const real *x, const real *u, real dt, real *next, real *A)
 {
     real W[MHE_STAGE_VALUES], per[NX], correction[MHE_UNKNOWNS];
-    mhe_reduced r[MHE_STAGES];
+    MHE_LARGE mhe_reduced r[MHE_STAGES];
     for (int rough = 1; rough >= 0; rough--) {
         int found = mhe_solve_stages(x, u, dt, 1, rough, W, r);
         for (int k = 0; found && k < 1 + rough; k++) {
