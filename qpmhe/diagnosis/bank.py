@@ -190,6 +190,16 @@ class FilterBank:
         """States (T, n) after a step from states (T, n); NaN where the model raises."""
         return self._values(self.model.f.batch, states, inputs, (self.system.n,))
 
+    def bounded_prior(self, one: Hypothesis, most: float) -> Array:
+        """The prior, smaller where outputs would vary by more than a multiple of the noise."""
+        slope = self._values(
+            self.functions()[3], one.start[None], self.full_inputs(one.inputs[:1], one.step),
+            (self.system.p, self.n),
+        )[0]
+        shown = np.einsum("ij,jk,ik->i", slope, one.prior, slope)
+        ratio = float(np.max(shown / one.usual_noise.diagonal()))
+        return one.prior * (most / ratio) if np.isfinite(ratio) and ratio > most else one.prior
+
     def moves(self, states: Array, inputs: Array) -> tuple[Array, Array]:
         """Expected outputs (T, p) at states (T, n), and how far they move within a step."""
         expected = self.expected(states, inputs)

@@ -33,6 +33,9 @@ _FILTERS = 40
 # Fewer samples with measurements say nothing about a covariance. Where the model fails, so many of
 # the longest stretches between are tried.
 LEAST_SAMPLES, _STRETCHES = 30, 3
+# By how much more than the noise outputs vary by the prior with which a filter begins: a vaguer one
+# says no more, and leaves covariances, of a lag above all, without digits.
+_VAGUE = 1e7
 # The data do not see a direction in which they say so much less than the prior; nor has a filter
 # seen it whose variance is still this share of the prior's. It matters if this share remains.
 _UNSEEN, _UNLEARNT, _REMAINS = 0.1, 0.5, 0.5
@@ -119,6 +122,7 @@ class Examination:
         base = Hypothesis(
             y[part], self.inputs[part], self.noise, disturbance, start, self.prior
         )
+        base = replace(base, prior=self.bank.bounded_prior(base, _VAGUE))
 
         def contradicts(repeated: Mask, sensor: int) -> bool:
             errors = self.bank.run([base]).normalised[repeated[self.first :], sensor]
@@ -310,7 +314,7 @@ class Examination:
     def _unseen(self) -> Iterator[Finding]:
         """Directions that the data do not see, that no filter has learnt, and that stay."""
         view, names, length = self.observability, self.names, self.horizon
-        units, inverse_units = prior_units(self.prior)
+        units, inverse_units = prior_units(self.base.prior)
         ends = inverse_units @ self.along.covariances[length - 1 :] @ inverse_units.T
         count = len(ends)
         vectors = view.directions[:count, :, 0]  # the weakest
@@ -339,7 +343,8 @@ class Examination:
     def _apparent(self) -> Iterator[Finding]:
         """Information of the points of linearisation, which the data do not have."""
         found = apparent_information(
-            self.bank, self.along, self.bank.full_inputs(self.base.inputs), self.noise, self.prior
+            self.bank, self.along, self.bank.full_inputs(self.base.inputs), self.noise,
+            self.base.prior,
         ) if self.along.states.shape[1] == self.bank.n else None
         if found is not None and found[0] > _APPARENT:
             growth, direction = found

@@ -669,3 +669,34 @@ def test_a_wrong_sign_that_leads_to_long_steps_comes_before_them():
     case = plant("tanks", 1)
     first = diagnosed(case).findings[0]
     assert first.kind == "sign", first.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("title", [
+    "sensor with a lag of 4 samples", "noise of a sensor correlated, 0.9", "healthy"])
+def test_a_vague_prior_is_no_vaguer_than_the_data_need(title):
+    """Beside 1e10, covariances of a sensor with memory would have no digits."""
+    plant = planted.healthy if title == "healthy" else planted.FAULTS[title][1]
+    case, found = plant("vehicle", 1), []
+    scenario = planted.SYSTEMS["vehicle"][0]().scenario
+    Q, R = scenario.disturbance_covariance, scenario.noise_covariance
+    for vague in (1e6, 1e10):
+        diagnosis = diagnosed(
+            case, cost=qpmhe.QuadraticCost.from_covariances(disturbance=Q, noise=R),
+            observer=qpmhe.ExtendedKalman(prior=vague * np.eye(3), disturbance=Q, noise=R))
+        found.append((
+            [str(one) for one in diagnosis.findings], [one.gain for one in diagnosis.faults]))
+    (texts, gains), (others, other_gains) = found
+    assert texts == others
+    np.testing.assert_allclose(gains, other_gains, rtol=1e-6)
+
+
+def test_what_is_not_seen_is_told_beside_a_vague_prior():
+    case = planted.unseen("", 1)
+    Q, R = (np.linalg.inv(one) for one in (case.cost.disturbance, case.cost.noise))
+    for vague in (1.0, 1e10):
+        diagnosis = diagnosed(
+            case, cost=qpmhe.QuadraticCost.from_covariances(disturbance=Q, noise=R),
+            observer=qpmhe.ExtendedKalman(
+                prior=vague * np.diag([1.0, 1.0, 0.25]), disturbance=Q, noise=R))
+        assert kinds(diagnosis) == ["unseen"]
