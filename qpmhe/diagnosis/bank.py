@@ -112,15 +112,15 @@ class FilterBank:
 
     With a `loss`, of whitened innovations to their costs and to what corrects the filter, they are
     as `qpmhe.ExtendedKalman` is: linearised at the predictions alone; all samples are evidence.
-    Where so many filters are expected that C pays, they are compiled.
+    Where so many filters are expected, of so many samples at least, that C pays, they are compiled.
     """
 
     def __init__(
         self, system: System, steps: Array | None, before: int = 0, *, loss: Loss | None = None,
-        filters: int = 1,
+        filters: int = 1, samples: int = 0,
     ) -> None:
         self.system, self.before, self.steps, self._loss = system, before, steps, loss
-        self._filters = filters
+        self._filters, self._samples = filters, samples
         #: Which filters of the system's they are: those of a kind have one library.
         self.kind: tuple[int, ...] = ()
         #: Length of the state that is filtered.
@@ -419,7 +419,8 @@ class FilterBank:
         operations = step.n_instructions() + model.h.n_instructions()
         running = (_IMPLICIT_RUNNING if implicit else _RUNNING) + _ENTRY * self.n**2
         library = (_IMPLICIT_LIBRARY if implicit else _LIBRARY) + operations * _COMPILING
-        if self._filters * len(one.measurements) * running < _PAYS * library:
+        samples = max(self._samples, len(one.measurements))
+        if self._filters * samples * running < _PAYS * library:
             return None
         part = one.first(_COMPARED)
 

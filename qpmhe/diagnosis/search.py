@@ -26,6 +26,11 @@ _ALIKE, _SHARE, _MOST_ALIKE = 6.0, 0.03, 15.0
 # Nothing else is looked for where means, squares and correlations over so few samples of the
 # innovations are within so many standard errors; larger innovations count as the last.
 _CALM, _SOON, _FAR = 2.5, 5, 4.0
+# The first samples of records of so many times as many are filtered first. They contradict what
+# makes them less likely by this, as a logarithm, and need show this share of what is enough. What
+# that leaves must explain the record up to so many deviations of the innovations, of which the
+# mean squares of the whole record are at most so many times those of the first samples.
+_PART, _LONG, _LOSES, _HOPE, _WILD, _LIKE = 1000, 4, 30.0, 0.3, 0.15, 1.25
 # Families of values that are searched twice.
 _CLOSELY = 6
 # A sensor with a memory looks like a wrong Q and R, and these like it: they are searched together
@@ -70,16 +75,20 @@ def _given(evidence: Evidence, base: Hypothesis) -> Evidence:
     return replace(evidence, bank=bank, base=base, null=bank.run([base]), shared={})
 
 
-def _is_explained(evidence: Evidence) -> bool:
-    """Whether the innovations are as they should be: then nothing else is looked for."""
+def _is_explained(evidence: Evidence, least: float = 0.0) -> bool:
+    """Whether the innovations are as they should be: then nothing else is looked for.
+
+    That is, up to chance, or to `least` in their deviations.
+    """
     squares = evidence.null.normalised**2
     counts = np.maximum(np.isfinite(squares).sum(axis=0), 1)
+    limit = np.maximum(_CALM, least * np.sqrt(counts))
     means = np.nanmean(np.minimum(squares, _FAR**2), axis=0) - 1.0
     return bool(
         np.isfinite(evidence.null.logs).all()
-        and (np.abs(means) < _CALM * np.sqrt(2.0 / counts)).all()
-        and (colours(evidence, _SOON) < _CALM).all()
-        and (np.abs(np.nanmean(evidence.null.normalised, axis=0)) < _CALM / np.sqrt(counts)).all()
+        and (np.abs(means) < limit * np.sqrt(2.0 / counts)).all()
+        and (colours(evidence, _SOON) < limit).all()
+        and (np.abs(np.nanmean(evidence.null.normalised, axis=0)) < limit / np.sqrt(counts)).all()
     )
 
 
@@ -176,8 +185,58 @@ def _disjoint(found: list[Fault], base: Hypothesis) -> list[Fault]:
 
 def _best(evidence: Evidence, kinds: Collection[str]) -> tuple[Fault | None, bool]:
     """The best fault, and whether factors of R or Q alone explain much of what it does."""
+    every = [one for kind in kinds for make in CAUSES[kind].makers for one in make(evidence)]
+    some = _possible(evidence, every)
+    found = _best_of(evidence, some)
+    # What the first samples do not show may be behind them.
+    if some is not every and not _is_explained(
+        evidence if found[0] is None else _given(evidence, found[0].hypothesis), _WILD
+    ):
+        found = _best_of(evidence, every)
+    return found
+
+
+def _possible(evidence: Evidence, tried: list[Fault]) -> list[Fault]:
+    """The faults that the first samples of a long record do not contradict.
+
+    All, if it is short, or if the first samples are more like the model than the others.
+    """
+    base, bank = evidence.base, evidence.bank
+    if evidence.total < _LONG * _PART or not np.isfinite(evidence.null.logs).all():
+        return tried
+    squares = np.minimum(evidence.null.normalised**2, _FAR**2)
+    if not (np.nanmean(squares, axis=0) <= _LIKE * np.nanmean(squares[:_PART], axis=0)).all():
+        return tried
+    # Others may concern later samples.
+    doubtful = [one for one in tried if one.span is None and (one.again or not _is_local(one))]
+    values = bank.run(
+        [base.first(_PART), *(one.hypothesis.first(_PART) for one in doubtful)]).likelihoods
+    gains = np.nan_to_num(values[1:] - values[0], nan=-np.inf)
+    share = _PART / evidence.total
+    enough = share * _HOPE * (LEAST_GAIN + _GAIN_EACH * np.isfinite(base.measurements).sum())
+    kept: set[int] = set()
+    for some in _families(doubtful, gains).values():
+        one, found = doubtful[some[0][2]], [*some]
+        if _may_be_none(one):
+            found.append((0.0, 0.0, -1))
+        places, heights, which = map(np.array, zip(*sorted(found), strict=True))
+        top = int(np.argmax(heights))
+        peak = _peak(places, heights, top)
+        if _is_local(one) or max(heights[top], -np.inf if peak is None else peak[1]) > enough:
+            chosen = heights > max(0.0, heights[top]) - _LOSES
+            chosen[max(0, top - 1) : top + 2] = True
+            kept.update(which[chosen].tolist())
+    known = {id(one) for k, one in enumerate(doubtful) if k not in kept}
+    return [one for one in tried if id(one) not in known]
+
+
+def _is_local(one: Fault) -> bool:
+    return CAUSES[one.kind].local
+
+
+def _best_of(evidence: Evidence, tried: list[Fault]) -> tuple[Fault | None, bool]:
+    """The best of these, and whether factors of R or Q alone explain much of what it does."""
     bank, base, null = evidence.bank, evidence.base, evidence.null
-    tried = [one for kind in kinds for make in CAUSES[kind].makers for one in make(evidence)]
     logs = bank.run([base, *(one.hypothesis for one in tried)]).logs
     for most in (None, _CLOSELY):
         refined = list(_refined(tried, logs.sum(axis=0), most))
@@ -275,30 +334,58 @@ def _rival(evidence: Evidence) -> tuple[list[Fault], Hypothesis, float]:
     return found
 
 
+def _families(
+    tried: list[Fault], values: Array
+) -> dict[tuple[object, ...], list[tuple[float, float, int]]]:
+    """Faults that differ by a value alone: place on its scale, log likelihood and number.
+
+    One that has no value is a family of its own.
+    """
+    found: dict[tuple[object, ...], list[tuple[float, float, int]]] = {}
+    for k, (one, value) in enumerate(zip(tried, values.tolist(), strict=True)):
+        at = float(np.log(one.value)) if _is_factor(one) else one.value
+        has_value = one.again is not None and np.isfinite(one.value)
+        key = one.kind, one.subject, one.family if has_value else ("alone", k)
+        found.setdefault(key, []).append((at, value, k))
+    return found
+
+
+def _peak(places: Array, heights: Array, k: int) -> tuple[float, float] | None:
+    """The top of a parabola through three neighbours, of which the middle one is the best."""
+    if not 0 < k < len(places) - 1 or not np.isfinite(heights[k - 1 : k + 2]).all():
+        return None
+    (before, _, behind), (low, _, high) = (
+        one[k - 1 : k + 2] - one[k] for one in (places, heights)
+    )
+    if not before < 0.0 < behind:
+        return None
+    curve = (low / before - high / behind) / (before - behind)
+    if not curve < 0.0:
+        return None
+    slope = low / before - curve * before
+    return float(places[k] - 0.5 * slope / curve), float(heights[k] - 0.25 * slope**2 / curve)
+
+
 def _refined(tried: list[Fault], values: Array, most: int | None) -> Iterator[Fault]:
     """For each family of values, or the best ones, the top of a parabola through its best ones."""
-    families: dict[tuple[object, ...], list[tuple[float, float, Fault]]] = {}
-    for one, value in zip(tried, values[1:].tolist(), strict=True):
-        if one.again is not None and np.isfinite(one.value):
-            at = float(np.log(one.value)) if _is_factor(one) else one.value
-            key = one.kind, one.subject, one.family
-            families.setdefault(key, []).append((at, value, one))
-    best = sorted(families.values(), key=lambda some: -max(value for _, value, _ in some))
-    for some in best[:most]:
-        pairs = {at: value for at, value, _ in some}
-        if some[0][2].kind not in ("lag", "coloured", "jitter"):
+    families = [
+        some for some in _families(tried, values[1:]).values()
+        if tried[some[0][2]].again is not None and np.isfinite(some[0][0])
+    ]
+    families.sort(key=lambda some: -max(value for _, value, _ in some))
+    for some in families[:most]:
+        one, pairs = tried[some[0][2]], {at: value for at, value, _ in some}
+        if _may_be_none(one):
             pairs.setdefault(0.0, float(values[0]))
         places, heights = np.array(sorted(pairs.items())).T
-        k = int(np.argmax(heights))
-        if not 0 < k < len(places) - 1 or not np.isfinite(heights[k - 1 : k + 2]).all():
-            continue
-        near = slice(k - 1, k + 2)
-        scale = float(np.ptp(places[near]))
-        curve = np.polyfit((places[near] - places[k]) / scale, heights[near], 2)
-        again = some[0][2].again
-        if curve[0] < 0.0 and again is not None:
-            top = float(places[k]) - 0.5 * scale * float(curve[1] / curve[0])
-            yield again(float(np.exp(top)) if _is_factor(some[0][2]) else top)
+        found = _peak(places, heights, int(np.argmax(heights)))
+        if found is not None and one.again is not None:
+            yield one.again(float(np.exp(found[0])) if _is_factor(one) else found[0])
+
+
+def _may_be_none(one: Fault) -> bool:
+    """Whether there is no fault at the place 0."""
+    return one.again is not None and one.kind not in ("lag", "coloured", "jitter")
 
 
 def _is_factor(one: Fault) -> bool:

@@ -36,8 +36,9 @@ class MemoryBank(FilterBank):
     inputs of a hypothesis are a, b, c and d of each.
     """
 
-    def __init__(self, bank: FilterBank, sensors: Sequence[int]) -> None:
-        super().__init__(bank.system, bank.steps, bank.before, filters=_FILTERS)
+    def __init__(self, bank: FilterBank, sensors: Sequence[int], samples: int = 0) -> None:
+        super().__init__(
+            bank.system, bank.steps, bank.before, filters=_FILTERS, samples=samples)
         self._bank, self._sensors = bank, list(sensors)
         self.n = bank.system.n + len(self._sensors)
         # In C, a single memory is that of any sensor.
@@ -165,7 +166,7 @@ def _bank(evidence: Evidence, part: Sequence[int]) -> MemoryBank:
     sensors = tuple(range(p)) if evidence.bank.n + p <= _SMALL else tuple(part)
     kept: dict[tuple[int, ...], MemoryBank] = evidence.shared.setdefault("memories", {})
     if sensors not in kept:
-        kept[sensors] = MemoryBank(evidence.bank, sensors)
+        kept[sensors] = MemoryBank(evidence.bank, sensors, evidence.total)
     return kept[sensors]
 
 
