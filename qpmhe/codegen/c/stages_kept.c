@@ -77,17 +77,15 @@ static int mhe_invert_blocks(real h, const real *J, const real *per, mhe_modes *
             const int r = mhe_near[q];
             const real ratio = per[c] / per[r];
             real *left = M + (r * NX + c) * PARTS;
-            real first = 0, second = 0;
             left[0] *= pivot[0];
             real most = left[0] * left[0];
             if (MHE_PAIR) {
                 const real *own = pivot + MHE_PAIR;
                 real *both = left + MHE_PAIR;
-                first = both[0] * own[0] - both[1] * own[1];
-                second = both[0] * own[1] + both[1] * own[0];
-                both[0] = first;
-                both[1] = second;
-                most += first * first + second * second;
+                const real product = both[0] * own[0] - both[1] * own[1];
+                both[1] = both[0] * own[1] + both[1] * own[0];
+                both[0] = product;
+                most += both[0] * both[0] + both[1] * both[1];
             }
             squares += most * ratio * ratio;
             for (int o = mhe_near_start[p]; o < mhe_near_start[p + 1]; o++) {
@@ -95,6 +93,7 @@ static int mhe_invert_blocks(real h, const real *J, const real *per, mhe_modes *
                 real *to = M + (r * NX + mhe_near[o]) * PARTS;
                 to[0] -= left[0] * right[0];
                 if (MHE_PAIR) {
+                    const real first = left[MHE_PAIR], second = left[2 * MHE_PAIR];
                     const real a = right[MHE_PAIR], b = right[2 * MHE_PAIR];
                     to[MHE_PAIR] -= first * a - second * b;
                     to[2 * MHE_PAIR] -= first * b + second * a;
