@@ -35,6 +35,15 @@ for name in ("certificates", "models", "plots", "records", "studies", "tune", "t
         qpmhe.plot()
 
 
+def test_diagnosis_and_tuning_load_no_statistics():
+    """It took 0.7 s of a diagnosis, for three quantiles of a distribution that SciPy has elsewhere."""
+    code = "import sys, qpmhe; qpmhe.diagnose, qpmhe.tune; print('scipy.stats' in sys.modules)"
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert answer.stdout.strip() == "False"
+
+
 def public_classes_and_functions():
     for module in (qpmhe, qpmhe_solvers, qpmhe.models, qpmhe.errors):
         for name in module.__all__:

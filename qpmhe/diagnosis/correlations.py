@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from .bank import Array
 
@@ -73,7 +73,7 @@ def coloured(
     for j in range(p):
         k = int(np.argmax(np.abs(own[:, j])))
         ends = {min(_SOON, len(own)), len(own)}
-        chance = min(chi2.sf(sums[some - 1, j], some) for some in ends)
+        chance = min(float(chdtrc(some, sums[some - 1, j])) for some in ends)
         if chance < sure and abs(own[k, j]) > least:
             found.append((j, k + 1, float(own[k, j])))
     return found

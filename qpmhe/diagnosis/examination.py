@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from .._linalg import inverse
 from ..costs import RobustCost
@@ -536,7 +536,7 @@ class Examination:
         signals = [*names.inputs, *(f"the change of {one}" for one in names.inputs)]
         counts = np.isfinite(self.normalised).sum(axis=0)
         for j, k in np.ndindex(*found.inputs.shape[1:]):
-            sure = np.sqrt(chi2.isf(_SURE, 1) / max(int(counts[j]), 1))
+            sure = np.sqrt(chdtri(1, _SURE) / max(int(counts[j]), 1))
             strongest = float(np.abs(found.inputs[:, j, k]).max())
             if strongest > max(_CORRELATED, sure):
                 yield Finding(
@@ -556,7 +556,7 @@ def _expected(system: System) -> int:
 
 def _limits(count: int) -> tuple[float, float]:
     """What 99 % of sums of so many squares lie within."""
-    return float(chi2.ppf(0.005, count)), float(chi2.ppf(0.995, count))
+    return float(chdtri(count, 0.995)), float(chdtri(count, 0.005))
 
 
 def _held(inputs: Array) -> Array:

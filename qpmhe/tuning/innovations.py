@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from .._checks import Array
 from ..diagnosis.bank import FilterBank, Hypothesis
@@ -132,8 +132,8 @@ def innovations_of(
             pairs[lag - 1] += (there[lag:] * there[:-lag]).sum(axis=0)
     variance = np.maximum(power / np.maximum(seen, 1), 1e-300)
     correlations = sums / np.maximum(pairs, 1) / variance
-    chances = np.asarray(chi2.sf((pairs * correlations**2).sum(axis=0), lags))
-    low, high = (float(chi2.ppf(share, count)) / count for share in (0.005, 0.995))
+    chances = np.asarray(chdtrc(lags, (pairs * correlations**2).sum(axis=0)))
+    low, high = (float(chdtri(count, share)) / count for share in (0.995, 0.005))
     few = far < _FEW
     return Innovations(
         squares / count, (low, high), correlations, chances,
