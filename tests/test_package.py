@@ -36,7 +36,7 @@ for name in ("certificates", "models", "plots", "records", "studies", "tune", "t
 
 
 def test_diagnosis_and_tuning_load_no_statistics():
-    """It took 0.7 s of a diagnosis, for three quantiles of a distribution that SciPy has elsewhere."""
+    """It took 0.7 s of a diagnosis, for quantiles that `scipy.special` has, too."""
     code = "import sys, qpmhe; qpmhe.diagnose, qpmhe.tune; print('scipy.stats' in sys.modules)"
     answer = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
