@@ -111,6 +111,7 @@ class ActiveSetSolver(Solver):
         search = _Search(qp, columns, self._most, until)
         message, duals = search.go(last), search.duals
         if not message:
+            self._last.pop(qp.sizes, None)
             if len(self._last) >= _KEPT:
                 del self._last[next(iter(self._last))]
             self._last[qp.sizes] = search.sides

@@ -59,6 +59,13 @@ def test_a_shift_moves_the_set_that_it_begins_with():
     assert [cold_again.solve(qp).iterations for _ in range(2)] == [cold, cold]
 
 
+def test_sets_of_two_sizes_are_kept_in_any_order():
+    one, other = (make(12, n, bounds="all", seed=3)[0] for n in (2, 3))
+    solver = create("active_set")
+    assert min(solver.solve(qp).iterations for qp in (one, other)) >= 1
+    assert [solver.solve(qp).iterations for qp in (one, one, other, other, one)] == [0] * 5
+
+
 def test_new_limits_and_gradients_of_the_same_matrices_and_new_matrices():
     """One factorisation serves while H and the rows stay; a new solver gives the same answers."""
     solver, (qp, _) = create("active_set"), make(9, 3, 2, bounds="all", sides="two", seed=1)
