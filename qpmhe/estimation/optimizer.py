@@ -502,14 +502,14 @@ class Optimizer:
         if not subproblem.misses(solution):
             subproblem.note(qp, solution)
             return solution
-        if self._solver.chooses:
+        if self._solver.chooses and not outcome.time_is_up():
             began = perf_counter()
-            found = subproblem.directly(qp)
+            found = subproblem.directly(qp, outcome.deadline)
             outcome.count(0 if found is None else found.iterations, perf_counter() - began)
             if found is not None:
                 return found
         solution = self._solve(subproblem.softened(qp), outcome)
-        return None if solution is None else subproblem.lowered(qp, solution)
+        return None if solution is None else subproblem.lowered(qp, solution, outcome.deadline)
 
     def _solve(self, qp: QP, outcome: Outcome) -> Solution | None:
         """Solve a QP within the time left; None if no time is left.

@@ -259,10 +259,10 @@ class Subproblem:
         soft, d = self._softened, solution.d
         return soft is not None and d is not None and bool(soft.misses(d).any())
 
-    def directly(self, qp: QP) -> Solution | None:
+    def directly(self, qp: QP, deadline: float) -> Solution | None:
         """The solution with the soft rows, without slack variables; None where it is not found."""
         base, soft = self._with_soft_rows(qp)
-        found = soft.directly(base)
+        found = soft.directly(base, deadline)
         return None if found is None else self._restored(qp, base, soft, found)
 
     def softened(self, qp: QP) -> QP:
@@ -270,10 +270,10 @@ class Subproblem:
         base, soft = self._with_soft_rows(qp)
         return soft.lifted(base)
 
-    def lowered(self, qp: QP, solution: Solution) -> Solution:
+    def lowered(self, qp: QP, solution: Solution, deadline: float) -> Solution:
         """A solution of the QP with slack variables, as one of the QP without."""
         base, soft = self._with_soft_rows(qp)
-        return self._restored(qp, base, soft, soft.lowered(base, solution))
+        return self._restored(qp, base, soft, soft.lowered(base, solution, deadline))
 
     def _with_soft_rows(self, qp: QP) -> tuple[QP, Softened]:
         """The QP that the soft rows join, and these, after noise-free directions have left."""

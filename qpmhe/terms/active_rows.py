@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -43,14 +44,16 @@ class Inequalities(NamedTuple):
 
 
 def minimised(
-    base: QP, inequalities: Inequalities, start: Array | None, forces: Array
+    base: QP, inequalities: Inequalities, start: Array | None, forces: Array,
+    deadline: float = math.inf,
 ) -> tuple[Array, Array, int] | None:
     """The minimiser, its forces, and the Newton steps on the optimality conditions.
 
     The forces and the start say which rows are active at first; without a start it is the
     minimiser with these forces. Each step changes all rows that are wrong, until that has not made
     fewer wrong for some steps; then one row at a time, by one place: inactive, active, violated.
-    None where this does not tell which rows are active.
+    None where this does not tell which rows are active, or not before the deadline, a time by
+    `time.perf_counter`: after the first step, none begins behind that.
     """
     from scipy.linalg.lapack import dpbtrf, dpbtrs  # late, as in `Subproblem`
 
@@ -87,6 +90,8 @@ def minimised(
         wrong = np.flatnonzero(due != place)
         if not wrong.size and steps:
             return step, forces, steps
+        if steps and perf_counter() > deadline:
+            return None
         patience = _PATIENCE if wrong.size < fewest else patience - 1
         fewest = min(wrong.size, fewest)
         if patience <= 0:  # one at a time does not come back to where it was

@@ -435,7 +435,7 @@ class Softened:
         if self.stacked is not None:
             self.stacked._last = None
 
-    def directly(self, base: QP) -> Solution | None:
+    def directly(self, base: QP, deadline: float = math.inf) -> Solution | None:
         """The solution with the soft rows and without slack variables; None where it is not found.
 
         The search begins with the rows that were active in the last QP of the sequence.
@@ -443,14 +443,14 @@ class Softened:
         shape = 2, base.stages, self._size + base.rows + (self._n if base.bounded else 0)
         last = self._last
         found = self._exact(
-            base, None, np.zeros(shape) if last is None or last.shape != shape else last
+            base, None, np.zeros(shape) if last is None or last.shape != shape else last, deadline
         )
         if found is None:
             return None
         d, self._last, steps = found
         return Solution(d, SolveStatus.SOLVED, steps, row_duals=self._duals(base, self._last))
 
-    def lowered(self, base: QP, solution: Solution) -> Solution:
+    def lowered(self, base: QP, solution: Solution, deadline: float = math.inf) -> Solution:
         """A solution of the lifted QP without its slack variables; exact where that succeeds.
 
         It has the multipliers of all of that QP's rows.
@@ -462,7 +462,7 @@ class Softened:
         d = None if solution.d is None else solution.d[:, : self._n].copy()
         if d is not None and status in (SolveStatus.SOLVED, SolveStatus.INACCURATE):
             forces = self._forces_of(base, solution)
-            exact = None if forces is None else self._exact(base, d, forces)
+            exact = None if forces is None else self._exact(base, d, forces, deadline)
             if exact is not None:
                 d, self._last, _ = exact
                 status, duals = SolveStatus.SOLVED, self._duals(base, self._last)
@@ -471,7 +471,7 @@ class Softened:
         )
 
     def _exact(
-        self, base: QP, d: Array | None, forces: Array
+        self, base: QP, d: Array | None, forces: Array, deadline: float
     ) -> tuple[Array, Array, int] | None:
         """The minimiser, its forces, and the search's steps; None where the search fails.
 
@@ -482,6 +482,7 @@ class Softened:
         found = minimised(
             base, inequalities, None if d is None else d.ravel(),
             np.append(forces[0].ravel()[which[:uppers]], forces[1].ravel()[which[uppers:]]),
+            deadline,
         )
         if found is None:
             return None

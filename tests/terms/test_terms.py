@@ -1,5 +1,6 @@
 """Each term of J against differences of its cost: its quadratic model, and its derivatives."""
 
+import math
 from copy import copy
 
 import numpy as np
@@ -219,8 +220,8 @@ def test_soft_rows_are_solved_exactly_beside_active_hard_ones(monkeypatch, name,
     """Without a named backend from no forces, otherwise from those in its answer."""
     exact, beside = Softened._exact, []
 
-    def watched(self, base, d, forces):
-        found = exact(self, base, d, forces)
+    def watched(self, base, d, forces, deadline):
+        found = exact(self, base, d, forces, deadline)
         hard = (forces if d is not None or found is None else found[1])[:, :, self._size :]
         beside.append((hard.max(initial=0.0) > 1e-3, found is not None))
         return found
@@ -243,9 +244,9 @@ def test_solutions_found_directly_are_those_with_slack_variables(monkeypatch, na
     directly, found = Softened.directly, []
     solver, largest = make_solver(NATIVE["piqp"], SolverOptions()), 0.0
 
-    def watched(self, base):
+    def watched(self, base, deadline):
         nonlocal largest
-        one = directly(self, base)
+        one = directly(self, base, deadline)
         other = self.lowered(base, solver.solve(self.lifted(base)))
         assert other.status is SolveStatus.SOLVED
         largest = max(largest, np.abs(other.d).max())  # steps of later QPs vanish
@@ -263,3 +264,22 @@ def test_solutions_found_directly_are_those_with_slack_variables(monkeypatch, na
         mhe.update(**sample)
     assert len(found) > 5
     assert np.mean(found) > 0.9
+
+
+def test_no_search_for_active_rows_goes_on_behind_the_deadline(monkeypatch):
+    directly, late = Softened.directly, []
+
+    def watched(self, base, deadline):
+        found = directly(self, base, deadline)
+        if found is not None and found.iterations > 1:
+            self.start()
+            late.append(directly(self, base, -math.inf))
+        return found
+
+    monkeypatch.setattr(Softened, "directly", watched)
+    one = case("soft disturbances and noises")
+    mhe = one.estimator("python")
+    for sample in one.samples:
+        mhe.update(**sample)
+    assert late
+    assert not any(late)
