@@ -43,8 +43,8 @@ class Subproblem:
       without disturbance gives an equality row, which `solve` eliminates;
     - rows on the linearised nonlinear constraints.
 
-    Soft rows are not among them: `softened` adds these, with slack variables, where a solution
-    without them violates one.
+    Soft rows are not among them: `directly` and, with slack variables, `softened` add these, where
+    a solution without them violates one.
 
     `damp` adds :math:`\tfrac\mu2 (|d_0|_D^2 + \sum_i |d_{i+1} - A_i d_i|_{Q_i}^2)` to the
     objective: it rescales the weights of the prior and of the disturbances, has no unit, and leaves
