@@ -16,7 +16,7 @@ from qpmhe_solvers import QP, Solution, SolveStatus
 from .._linalg import inverse
 from ..costs import Cost
 from ..model.system import System
-from .active_rows import Inequalities, minimised
+from .active_rows import Inequalities, StageRows, minimised
 from .base import (
     QuadraticModel,
     SoftRows,
@@ -532,17 +532,9 @@ class Softened:
             (0.5 * window.linear, free + np.inf), (window.quadratic, free),
         ))
         uppers, lowers = (np.flatnonzero(np.isfinite(one)) for one in (upper, lower))
-        which, matrix = np.append(uppers, lowers), _dense(own, following)
+        which = np.append(uppers, lowers)
+        signs = np.where(np.arange(which.size) < uppers.size, 1.0, -1.0)
         return Inequalities(
-            np.vstack((matrix[uppers], -matrix[lowers])),
+            StageRows(own, following, which, signs),
             np.append(upper.ravel()[uppers], -lower.ravel()[lowers]), most[which], curvature[which],
         ), which, len(uppers)
-
-
-def _dense(own: Array, following: Array) -> Array:
-    """Rows on each state and the next, ((K + 1) R, (K + 1) n)."""
-    stages, rows, n = own.shape
-    matrix, k = np.zeros((stages, rows, stages, n)), np.arange(stages)
-    matrix[k, :, k] = own
-    matrix[k[:-1], :, k[1:]] = following[:-1]
-    return matrix.reshape(stages * rows, stages * n)
