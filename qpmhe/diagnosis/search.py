@@ -222,7 +222,10 @@ def _possible(evidence: Evidence, tried: list[Fault]) -> list[Fault]:
         places, heights, which = map(np.array, zip(*sorted(found), strict=True))
         top = int(np.argmax(heights))
         peak = _peak(places, heights, top)
-        if _is_local(one) or max(heights[top], -np.inf if peak is None else peak[1]) > enough:
+        # Where no value is contradicted, as of an input that rests, these samples say nothing.
+        untold = heights.min() > -_LOSES
+        highest = max(heights[top], -np.inf if peak is None else peak[1])
+        if _is_local(one) or untold or highest > enough:
             chosen = heights > max(0.0, heights[top]) - _LOSES
             chosen[max(0, top - 1) : top + 2] = True
             kept.update(which[chosen].tolist())

@@ -69,3 +69,21 @@ def test_the_faults_are_those_of_the_whole_search(fault, monkeypatch):
     assert bool(faults) == (fault != "none")
     if fault in ("none", "noise", "input", "late"):  # others are later than the first samples
         assert counts[0] < 0.6 * counts[1]
+
+
+@pytest.mark.slow
+def test_an_input_that_rests_first_is_not_ruled_out(monkeypatch):
+    """It explains little of each sample, so that innovations look as they should without it."""
+    monkeypatch.setattr(search, "_PART", 300)
+    rng, total = np.random.default_rng(0), 3000
+    system = System(lambda x, u: 0.9 * x + u, lambda x, u: x, n=1, p=1, m=1)
+    u, x, y = 0.013 * rng.standard_normal((total, 1)), np.zeros(1), np.zeros((total, 1))
+    u[:310] = 0.0
+    for t in range(total):
+        y[t] = x + 0.1 * rng.standard_normal()
+        x = 0.9 * x - u[t] + 0.02 * rng.standard_normal()
+    base = Hypothesis(y, u, 0.01 * np.eye(1), 4e-4 * np.eye(1), np.zeros(1), np.eye(1))
+    bank = FilterBank(system, None)
+    with np.errstate(all="ignore"):
+        faults, _ = search.search(Evidence(bank, base, bank.run([base]), [np.zeros(1)]))
+    assert [one.kind for one in faults] == ["sign"]
