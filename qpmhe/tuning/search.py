@@ -506,6 +506,8 @@ def refine(
 
     begin, enough, spread = anchor if known is None else known, False, 1.0
     short = score.shortened(_PART)
+    if short is not None and not plain(anchor, short) < _FAILED:
+        short = None  # it compares nothing, as in a gap
     if short is not None and known is None:
         found, _, spread = lowered(short, anchor, np.inf, lambda *_: None, _ROUGHLY, 0.0)
         begin, value, enough = _along(whole, anchor, found - anchor)

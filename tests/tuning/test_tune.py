@@ -376,6 +376,24 @@ def test_the_estimators_search_takes_a_part_first_and_all_where_that_matters(mon
     assert mine < 1.005 * best
 
 
+@pytest.mark.slow
+def test_the_estimators_search_takes_all_where_a_record_begins_with_a_gap(monkeypatch):
+    y, u = simulated(steps=440)
+    y[:90] = np.nan
+    runs, found = [], []
+    run = score.Score._of_record
+    monkeypatch.setattr(score.Score, "_of_record", lambda *given: (
+        runs.append(len(given[-1])), run(*given))[1])
+    for part in (80, 10**6):
+        monkeypatch.setattr(search, "_PART", part)
+        runs.clear()
+        tuning = tuned(
+            [(y, u)], objective="prediction", horizon=3, max_qps=0, structure="scalar",
+            held_out=0.0)
+        found.append((runs.count(440), tuning.values))
+    assert found[0] == found[1]
+
+
 def test_a_judge_runs_no_estimator_again(monkeypatch):
     runs = []
     run = score.Score._of_record
