@@ -146,12 +146,26 @@ def search_likelihood(
     """The minimum of the likelihood near a start, and its value per sample.
 
     Of long records, a part is searched first: its minimum is nearby, where its Hessian tells the
-    directions in which to search.
+    directions in which to search. Where that leads to a limit, below which nothing changes, the
+    start's own way is tried as well.
     """
-    hessian, short = None, likelihood.shortened(_SHORT)
+    start, hessian, short = begin, None, likelihood.shortened(_SHORT)
     if short is not None:
         begin = search_likelihood(short, begin, lambda *_: None)[0]
         hessian = likelihood.samples / short.samples * _curvature(short, begin)
+    found = _minimum(likelihood, begin, note, hessian)
+    low = np.array([pair[0] for pair in likelihood.structure.limits])
+    if short is not None and (found[0] < low + _NEAR).any():
+        found = min(found, _minimum(likelihood, start, note, None), key=lambda one: one[1])
+    note(*found, True)
+    return found
+
+
+def _minimum(
+    likelihood: Likelihood, begin: Array, note: Callable[[Array, float, bool], None],
+    hessian: Array | None,
+) -> tuple[Array, float]:
+    """The minimum near a point, where a Hessian may be known, and its value per sample."""
     count, spread = likelihood.structure.seen, np.eye(len(begin))
     if hessian is not None:
         spread[:count, :count] = _alike(hessian)
@@ -178,7 +192,6 @@ def search_likelihood(
         callback=lambda _: note(best[0], best[1], False),
         options={"maxiter": _ITERATIONS, "ftol": 1e-9, "gtol": 1e-6},
     )
-    note(best[0], best[1], True)
     return best[0], float(best[1])
 
 
@@ -460,6 +473,8 @@ def refine(
                 at, before, by = here
                 way, gain = point - at, before - value
                 size = float(np.linalg.norm(way))
+                if not size:
+                    raise _EndedError
                 if -_ARMIJO * (by @ way) <= gain <= ends * max(abs(before), abs(value), 1.0):
                     along = slope @ way + size * difference(point, _STEP / size * way)
                     # The first step, which has a largest length, may end where it still descends.

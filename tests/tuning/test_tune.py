@@ -394,6 +394,35 @@ def test_the_estimators_search_takes_all_where_a_record_begins_with_a_gap(monkey
     assert found[0] == found[1]
 
 
+def test_a_first_part_that_rests_leads_the_likelihood_to_no_worse_minimum(monkeypatch):
+    y, u = simulated(steps=800, noise=(0.05, 0.05, 0.3))
+    u[:] = 0.0
+    y[:210] *= 0.02
+    found = []
+    for short in (200, 10**6):
+        monkeypatch.setattr(search, "_SHORT", short)
+        found.append(tuned([(y, u)], held_out=0.0, starts=1).scores)
+    (_, mine), (_, whole) = (one["negative log likelihood per sample"] for one in found)
+    assert mine < whole + 1e-4
+
+
+@pytest.mark.slow
+def test_a_search_of_the_estimator_that_does_not_move_ends(monkeypatch):
+    """In a record that begins with numbers without noise, its steps round to none."""
+    monkeypatch.setattr(search, "_SHORT", 100)
+    monkeypatch.setattr(search, "_PART", 150)
+    A = np.array([[0.9, 0.2], [-0.2, 0.9]])
+    rng, x, y = np.random.default_rng(0), np.zeros(2), np.zeros((810, 2))
+    for t in range(170, 810):
+        y[t] = x + 0.3 * rng.standard_normal(2)
+        x = A @ x + 0.05 * rng.standard_normal(2)
+    tuning = tuned(
+        [y], qpmhe.System(lambda x: x @ A.T, lambda x: x, n=2, p=2), objective="prediction",
+        horizon=3, max_qps=0, noise=0.1 * np.eye(2), disturbance=0.01 * np.eye(2), held_out=0.0,
+        starts=1)
+    assert tuning.values["noise y1"] > 0.1
+
+
 def test_a_judge_runs_no_estimator_again(monkeypatch):
     runs = []
     run = score.Score._of_record
