@@ -517,6 +517,12 @@ def test_the_explanation_shows_the_errors_of_the_step_and_of_others():
     assert "step: " not in qpmhe.System(lambda x: 0.5 * x, lambda x: x, n=1, p=1).explain()
 
 
+def test_the_explanation_compares_no_step_with_itself():
+    found = rows(system(lambda x: -x * x, 1, dt=0.1, method="radau", steps=2).explain())
+    assert found[1][:2] == ("radau", 2)
+    assert 0.0 < found[1][2] < found[0][2]
+
+
 @pytest.mark.parametrize("kind", ["traced", "called"])
 @pytest.mark.parametrize("method", METHODS)
 def test_the_errors_in_the_explanation_are_those_of_the_steps(method, kind):
