@@ -191,14 +191,21 @@ class FilterBank:
         return self._values(self.model.f.batch, states, inputs, (self.system.n,))
 
     def bounded_prior(self, one: Hypothesis, most: float) -> Array:
-        """The prior, smaller where outputs would vary by more than a multiple of the noise."""
-        slope = self._values(
-            self.functions()[3], one.start[None], self.full_inputs(one.inputs[:1], one.step),
-            (self.system.p, self.n),
-        )[0]
-        shown = np.einsum("ij,jk,ik->i", slope, one.prior, slope)
-        ratio = float(np.max(shown / one.usual_noise.diagonal()))
-        return one.prior * (most / ratio) if np.isfinite(ratio) and ratio > most else one.prior
+        """The prior, smaller in states by which outputs would vary by too much.
+
+        That is by more than a multiple of the noise, in one of the first n samples.
+        """
+        x, u = one.start[None], self.full_inputs(one.inputs[:1], one.step)
+        _, _, f_jacobian, h_jacobian = self.functions()
+        a = self._values(f_jacobian, x, u, (self.n, self.n))[0]
+        slope = self._values(h_jacobian, x, u, (self.system.p, self.n))[0]
+        shown = np.zeros(self.n)
+        for _ in range(self.n):
+            ahead = slope**2 / one.usual_noise.diagonal()[:, None]
+            shown = np.fmax(shown, ahead.max(axis=0) * one.prior.diagonal())
+            slope = slope @ a
+        bound = np.sqrt(most / np.where(np.isfinite(shown), np.maximum(shown, most), most))
+        return bound[:, None] * one.prior * bound
 
     def moves(self, states: Array, inputs: Array) -> tuple[Array, Array]:
         """Expected outputs (T, p) at states (T, n), and how far they move within a step."""

@@ -691,6 +691,22 @@ def test_a_vague_prior_is_no_vaguer_than_the_data_need(title):
     np.testing.assert_allclose(gains, other_gains, rtol=1e-6)
 
 
+def test_a_vague_prior_of_one_state_leaves_that_of_others():
+    """A speed that is known as well as its prior says looked like steps of another length."""
+    A, rng = np.array([[1.0, 0.1], [0.0, 1.0]]), np.random.default_rng(1)
+    Q, R = np.diag([1e-6, 1e-8]), np.array([[0.01]])
+    x, y = np.array([0.0, 1.0]), np.zeros((400, 1))
+    for t in range(400):
+        y[t] = x[0] + 0.1 * rng.standard_normal()
+        x = A @ x + np.sqrt(Q.diagonal()) * rng.standard_normal(2)
+    mhe = qpmhe.MovingHorizonEstimator(
+        qpmhe.System(lambda x: x @ A.T, lambda x: x[..., :1], n=2, p=1),
+        qpmhe.ExtendedKalman(prior=np.diag([1e10, 1.0]), disturbance=Q, noise=R),
+        qpmhe.QuadraticCost(disturbance=np.linalg.inv(Q), noise=np.linalg.inv(R)), horizon=5,
+        initial_state=[0.0, 0.0], max_qps=1)
+    assert not qpmhe.diagnose(mhe.run(y)).findings
+
+
 def test_what_is_not_seen_is_told_beside_a_vague_prior():
     case = planted.unseen("", 1)
     Q, R = (np.linalg.inv(one) for one in (case.cost.disturbance, case.cost.noise))
