@@ -62,8 +62,9 @@ class StageRows:
         """The values (r, 2 n) that the rows meet."""
         by_stage = np.zeros((self._stages + 1, self._n))
         by_stage[:-1] = step.reshape(self._stages, self._n)
-        pairs: Array = np.concatenate((by_stage[:-1], by_stage[1:]), axis=1)
-        return pairs.take(self._stage, axis=0)
+        pairs = np.concatenate((by_stage[:-1], by_stage[1:]), axis=1)
+        found: Array = pairs.take(self._stage, axis=0)
+        return found
 
     def times(self, step: Array) -> Array:
         """The rows' values at a step (K n,)."""
