@@ -68,11 +68,11 @@ static int mhe_invert_blocks(real h, const real *J, const real *per, mhe_modes *
         squares += 0 * pivot[0]; /* no number if it is none */
         if (MHE_PAIR) {
             real *pair = pivot + MHE_PAIR;
-            const int first = fabs(pair[0]) >= fabs(pair[1]); /* squares may be out of range */
-            const real large = pair[!first], ratio = pair[first] / large;
-            const real size = 1 / (large + pair[first] * ratio);
-            pair[!first] = first ? size : -size;
-            pair[first] = first ? -size * ratio : size * ratio;
+            const int longer = fabs(pair[0]) >= fabs(pair[1]); /* squares may be out of range */
+            const real large = pair[!longer], share = pair[longer] / large;
+            const real size = 1 / (large + pair[longer] * share);
+            pair[!longer] = longer ? size : -size;
+            pair[longer] = longer ? -size * share : size * share;
             squares += 0 * size;
         }
         for (int q = mhe_near_start[p]; q < mhe_near_start[p + 1]; q++) {
