@@ -23,10 +23,11 @@ from .._version import __version__
 from ..errors import CompilationError
 from .folders import cache_folders, own_file, writable_folder
 
+# Where a library keeps what is too large for the stack: see `model_source`.
+_THREADS = "-DTHREAD_LOCAL=__thread"
 # They keep infinities and NaN, and the order of operations: without contraction of a * b + c to
 # one rounding, all levels give the same bits. The verdict compares costs that are stored, each
 # computed once, so that it holds whichever way they were rounded.
-_THREADS = "-DTHREAD_LOCAL=__thread"
 _FLAGS = ("-std=c99", "-fPIC", "-shared", "-ffp-contract=fast", "-fno-math-errno",
           "-fno-trapping-math", _THREADS)
 # Tried in turn until the code is right. Without vectors, masked loads cannot go wrong.

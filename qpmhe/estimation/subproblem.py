@@ -84,6 +84,7 @@ class Subproblem:
             self._elimination = Elimination(constraints, n, p)
         self._around: Around  # what that reads of the present QP
         self._eliminated: Eliminated | None = None  # the last QP without them
+        self._along: Softened | None = None  # its soft rows, once they are needed
         self._functions = system.constraints
         #: Whether QPs have inequalities.
         self.has_inequalities: bool = constraints.has_inequalities or penalties is not None
@@ -186,6 +187,7 @@ class Subproblem:
         if self._elimination is None or qp is not self._qp:
             return solver.solve(qp, None, limit)
         eliminated = self._eliminated = self._elimination.of(self._around, qp, self._w)
+        self._along = None
         if eliminated is None:
             return Solution(None, SolveStatus.FAILED, 0, message=SINGULAR)
         found = eliminated.solution
@@ -281,7 +283,9 @@ class Subproblem:
         assert soft is not None
         if eliminated is None:
             return qp, soft
-        return eliminated.qp, soft.along(eliminated.step, eliminated.along)
+        if self._along is None:
+            self._along = soft.along(eliminated.step, eliminated.along)
+        return eliminated.qp, self._along
 
     def _restored(self, qp: QP, base: QP, soft: Softened, found: Solution) -> Solution:
         """A solution with the soft rows in all unknowns, whose multipliers are kept."""

@@ -122,7 +122,7 @@ def minimised(
     free = -dpbtrs(factor, unit * base.gradient.reshape(-1, 1), lower=1)[0][:, 0]
     # H^-1 of the rows that have been active at some time, and how stiff H is against each row: for
     # the others, its diagonal will do.
-    known = _Moved(lambda side: dpbtrs(factor, unit * side, lower=1)[0], rows, len(free))
+    known = _KnownColumns(lambda side: dpbtrs(factor, unit * side, lower=1)[0], rows, len(free))
     stiff, soft = 1.0 / rows.squares_times(1.0 / base.band[:, :, 0].ravel()), np.zeros(len(rows))
     np.divide(1.0, curvature, out=soft, where=curvature > 0.0)
     step: Array = free if start is None else start
@@ -181,7 +181,7 @@ def minimised(
     return None
 
 
-class _Moved:
+class _KnownColumns:
     """The columns H^-1 c of rows c that have been active at some time; ``has`` says which."""
 
     def __init__(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from copy import copy
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -478,12 +479,14 @@ class Softened:
         The forces (2, K + 1, rows) are those of upper and of lower sides, of the soft rows, of the
         hard ones and of the bounds of each stage; they and d say which rows are active at first.
         """
-        inequalities, which, uppers = self._sides(base, forces.shape[2])
-        found = minimised(
-            base, inequalities, None if d is None else d.ravel(),
-            np.append(forces[0].ravel()[which[:uppers]], forces[1].ravel()[which[uppers:]]),
-            deadline,
-        )
+        found = None
+        with suppress(MemoryError, np.linalg.LinAlgError):  # the solver's answer stays
+            inequalities, which, uppers = self._sides(base, forces.shape[2])
+            found = minimised(
+                base, inequalities, None if d is None else d.ravel(),
+                np.append(forces[0].ravel()[which[:uppers]], forces[1].ravel()[which[uppers:]]),
+                deadline,
+            )
         if found is None:
             return None
         step, held, steps = found

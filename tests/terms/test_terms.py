@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import qpmhe
+from qpmhe.terms import soft
 from qpmhe.terms.base import Derivatives, QuadraticModel
 from qpmhe.terms.linearization import Span, StageTerms
 from qpmhe.terms.soft import Softened
@@ -283,3 +284,19 @@ def test_no_search_for_active_rows_goes_on_behind_the_deadline(monkeypatch):
         mhe.update(**sample)
     assert late
     assert not any(late)
+
+
+@pytest.mark.parametrize("error", [MemoryError, np.linalg.LinAlgError])
+def test_a_search_for_active_rows_that_fails_does_not_leave_update(monkeypatch, error):
+    """The QP with slack variables takes its place, and its answer stays as it is."""
+    def failing(*_):
+        raise error
+
+    one = case("soft states, hard noises")
+    plain, mhe = one.estimator("python"), one.estimator("python")
+    expected = [plain.update(**sample) for sample in one.samples]
+    monkeypatch.setattr(soft, "minimised", failing)
+    found = [mhe.update(**sample) for sample in one.samples]
+    np.testing.assert_allclose(
+        [each.cost for each in found], [each.cost for each in expected], rtol=1e-4
+    )
