@@ -421,116 +421,161 @@ def refine(
     known, value, done = checkpoint.known("estimator")
     if done and known is not None:
         return known
-    structure, least = likelihood.structure, likelihood.value(theta)
-    share = _LIKELY / sum(
-        int(one.observed[mask].sum())
-        for one, mask in zip(likelihood.data, likelihood.tuned, strict=True)
-    )
-
-    def plain(point: Array, some: Score = score) -> float:
-        return some.total(structure.weights(structure.bounded(point)))
-
-    def total(point: Array, some: Score) -> float:
-        return min(plain(point, some) + _STAY * float(np.sum((point - anchor) ** 2)), _FAILED)
-
-    def whole(point: Array) -> float:
-        unlikely = share * (likelihood.value(point) - least)
-        return min(total(point, score) + unlikely, _FAILED)
-
-    anchor = min((theta, structure.start), key=plain)
+    sought = _Sought(score, likelihood, theta)
+    anchor = sought.anchor
     most = score.seconds * sum(map(len, likelihood.data)) * 2 * len(theta) * _REFINEMENTS
     advance(f"estimator, at most about {most:.2g} s")
-
-    def lowered(
-        some: Score, begin: Array, value: float, note: Callable[[Array, float], None], ends: float,
-        spread: float = 0.0,
-    ) -> tuple[Array, float, float]:
-        """Where the search of a score ends from here, its value there, and the unit of a step.
-
-        If no unit is given, the curvature along the first slope tells it.
-        """
-        is_rough = ends > _STEP**2  # the bias of differences ahead is far below
-        best: list[Any] = [begin, value]
-        # The newest point with a gradient, and the one at which the search stands.
-        newest: list[Any] = []
-        here: list[Any] = []
-
-        def difference(point: Array, move: Array) -> float:
-            return (total(point + move, some) - total(point - move, some)) / (2 * _STEP)
-
-        def cost(point: Array) -> tuple[float, Array]:
-            if here and point is begin:
-                return here[1], here[2]
-            alone, (unlikely, slope) = total(point, some), likelihood.gradient(point)
-            value = min(alone + share * (unlikely - least), _FAILED)
-            if value == _FAILED:
-                return _FAILED, np.zeros(len(point))
-            if value < best[1]:
-                best[:] = point.copy(), value
-            slope = share * slope
-            if here:
-                # Where the search is going to end here, the slope along its way tells.
-                at, before, by = here
-                way, gain = point - at, before - value
-                size = float(np.linalg.norm(way))
-                if not size:
-                    raise _EndedError
-                if -_ARMIJO * (by @ way) <= gain <= ends * max(abs(before), abs(value), 1.0):
-                    along = slope @ way + size * difference(point, _STEP / size * way)
-                    # The first step, which has a largest length, may end where it still descends.
-                    if (along if at is begin else abs(along)) <= _WOLFE * abs(by @ way):
-                        raise _EndedError
-            for k, move in enumerate(_STEP * np.eye(len(point))):
-                slope[k] += (
-                    (total(point + move, some) - alone) / _STEP if is_rough
-                    else difference(point, move)
-                )
-                advance(f"estimator, score {best[1]:.5g}")
-            note(best[0], best[1])
-            newest[:] = point.copy(), value, slope
-            if not here:
-                here[:] = begin, value, slope
-            return value, slope
-
-        if not spread:
-            first, slope = cost(begin)
-            size = float(np.linalg.norm(slope))
-            if not size:
-                return best[0], best[1], 1.0
-            trial = structure.bounded(begin - _TRIAL / size * slope)
-            moved = total(trial, some) + share * (likelihood.value(trial) - least)
-            bend = 2.0 * (moved - first + _TRIAL * size) / _TRIAL**2
-            spread = 1.0 / np.sqrt(np.clip(bend, 1.0 / _MOST_SPREAD**2, 1.0))
-
-        def scaled(part: Array) -> tuple[float, Array]:
-            value, slope = cost(begin + spread * part if part.any() else begin)
-            return value, spread * slope
-
-        limits = [tuple((np.array(pair) - at) / spread)
-                  for pair, at in zip(structure.limits, begin, strict=True)]
-        with suppress(_EndedError):
-            minimize(
-                scaled, np.zeros(len(begin)), jac=True, method="L-BFGS-B", bounds=limits,
-                callback=lambda _: here.__setitem__(slice(None), newest),
-                options={"maxiter": _REFINEMENTS, "ftol": ends},
-            )
-        return best[0], best[1], spread
 
     def note(point: Array, value: float) -> None:
         checkpoint.note("estimator", point, value, False)
 
     begin, enough, spread = anchor if known is None else known, False, 1.0
     short = score.shortened(_PART)
-    if short is not None and not plain(anchor, short) < _FAILED:
+    if short is not None and not sought.plain(anchor, short) < _FAILED:
         short = None  # it compares nothing, as in a gap
     if short is not None and known is None:
-        found, _, spread = lowered(short, anchor, np.inf, lambda *_: None, _ROUGHLY, 0.0)
-        begin, value, enough = _along(whole, anchor, found - anchor)
+        descent = _Descent(sought, short, anchor, np.inf, lambda *_: None, _ROUGHLY, advance)
+        spread = descent.unit()
+        found, _ = descent.lowest(spread)
+        begin, value, enough = _along(sought.whole, anchor, found - anchor)
     if not enough:
         ends = _ENDS if short is None else _NEARLY
-        begin, value, _ = lowered(score, begin, value, note, ends, spread)
+        descent = _Descent(sought, score, begin, value, note, ends, advance)
+        begin, value = descent.lowest(spread)
     checkpoint.note("estimator", begin, value, True)
     return begin
+
+
+class _Sought:
+    """What the estimator's search makes small: a score, a share of the likelihood, and changes.
+
+    Attributes
+    ----------
+    anchor : array
+        The likelihood's weights or, if these are worse, the start weights; changes are from there.
+    """
+
+    def __init__(self, score: Score, likelihood: Likelihood, theta: Array) -> None:
+        self._score, self.likelihood = score, likelihood
+        self.structure, self._least = likelihood.structure, likelihood.value(theta)
+        self._share = _LIKELY / sum(
+            int(one.observed[mask].sum())
+            for one, mask in zip(likelihood.data, likelihood.tuned, strict=True)
+        )
+        self.anchor = min((theta, self.structure.start), key=self.plain)
+
+    def plain(self, point: Array, some: Score | None = None) -> float:
+        """A score alone."""
+        weights = self.structure.weights(self.structure.bounded(point))
+        return (self._score if some is None else some).total(weights)
+
+    def total(self, point: Array, some: Score) -> float:
+        """A score and what the change costs."""
+        change = _STAY * float(np.sum((point - self.anchor) ** 2))
+        return min(self.plain(point, some) + change, _FAILED)
+
+    def value(self, point: Array, some: Score) -> float:
+        """All of it, with a score of some samples."""
+        unlikely = self._share * (self.likelihood.value(point) - self._least)
+        return self.total(point, some) + unlikely
+
+    def whole(self, point: Array) -> float:
+        """All of it."""
+        return min(self.value(point, self._score), _FAILED)
+
+    def with_slope(self, point: Array, some: Score) -> tuple[float, float, Array]:
+        """A score, all with it, and the likelihood's share of the slope."""
+        alone, (unlikely, slope) = self.total(point, some), self.likelihood.gradient(point)
+        value = min(alone + self._share * (unlikely - self._least), _FAILED)
+        return alone, value, self._share * slope
+
+
+class _Descent:
+    """A search from a point at which all may be known, to where a step gains less than a share."""
+
+    def __init__(
+        self, sought: _Sought, some: Score, begin: Array, value: float,
+        note: Callable[[Array, float], None], ends: float, advance: Callable[[str], None],
+    ) -> None:
+        self._sought, self._some, self._begin = sought, some, begin
+        self._note, self._ends, self._advance = note, ends, advance
+        self._is_rough = ends > _STEP**2  # the bias of differences ahead is far below
+        self._best: list[Any] = [begin, value]
+        # The newest point with a gradient, and the one at which the search stands.
+        self._newest: list[Any] = []
+        self._here: list[Any] = []
+
+    def _total(self, point: Array) -> float:
+        return self._sought.total(point, self._some)
+
+    def _difference(self, point: Array, move: Array) -> float:
+        return (self._total(point + move) - self._total(point - move)) / (2 * _STEP)
+
+    def _cost(self, point: Array) -> tuple[float, Array]:
+        """The value and the slope; ends the search where a step is the last one."""
+        if self._here and point is self._begin:
+            return self._here[1], self._here[2]
+        alone, value, slope = self._sought.with_slope(point, self._some)
+        if value == _FAILED:
+            return _FAILED, np.zeros(len(point))
+        if value < self._best[1]:
+            self._best[:] = point.copy(), value
+        if self._here:
+            self._end(point, value, slope)
+        for k, move in enumerate(_STEP * np.eye(len(point))):
+            slope[k] += (
+                (self._total(point + move) - alone) / _STEP if self._is_rough
+                else self._difference(point, move)
+            )
+            self._advance(f"estimator, score {self._best[1]:.5g}")
+        self._note(self._best[0], self._best[1])
+        self._newest[:] = point.copy(), value, slope
+        if not self._here:
+            self._here[:] = self._begin, value, slope
+        return value, slope
+
+    def _end(self, point: Array, value: float, slope: Array) -> None:
+        """End where the search is going to end; the slope along its way tells."""
+        at, before, by = self._here
+        way, gain = point - at, before - value
+        size = float(np.linalg.norm(way))
+        if not size:
+            raise _EndedError
+        largest = self._ends * max(abs(before), abs(value), 1.0)
+        if -_ARMIJO * (by @ way) <= gain <= largest:
+            along = slope @ way + size * self._difference(point, _STEP / size * way)
+            # The first step, which has a largest length, may end where it still descends.
+            if (along if at is self._begin else abs(along)) <= _WOLFE * abs(by @ way):
+                raise _EndedError
+
+    def unit(self) -> float:
+        """The unit of a step, by the curvature along the first slope."""
+        first, slope = self._cost(self._begin)
+        size = float(np.linalg.norm(slope))
+        if not size:
+            return 1.0
+        trial = self._sought.structure.bounded(self._begin - _TRIAL / size * slope)
+        moved = self._sought.value(trial, self._some)
+        bend = 2.0 * (moved - first + _TRIAL * size) / _TRIAL**2
+        return float(1.0 / np.sqrt(np.clip(bend, 1.0 / _MOST_SPREAD**2, 1.0)))
+
+    def lowest(self, unit: float) -> tuple[Array, float]:
+        """The best point, and its value."""
+        begin = self._begin
+
+        def scaled(part: Array) -> tuple[float, Array]:
+            value, slope = self._cost(begin + unit * part if part.any() else begin)
+            return value, unit * slope
+
+        limits = [tuple((np.array(pair) - at) / unit)
+                  for pair, at in zip(self._sought.structure.limits, begin, strict=True)]
+        with suppress(_EndedError):
+            minimize(
+                scaled, np.zeros(len(begin)), jac=True, method="L-BFGS-B", bounds=limits,
+                callback=lambda _: self._here.__setitem__(slice(None), self._newest),
+                options={"maxiter": _REFINEMENTS, "ftol": self._ends},
+            )
+        return self._best[0], self._best[1]
 
 
 def _along(whole: Callable[[Array], float], anchor: Array, way: Array) -> tuple[Array, float, bool]:
