@@ -517,6 +517,8 @@ def main(arguments=None):
         unpacked(options.against, there)
         with Server(HERE) as now:
             names = [name for name in now.ask("names") if fnmatch(name, options.cases)]
+        if not names:
+            parser.error(f"no case has a name like {options.cases!r}")
         print(f"{len(names)} cases, against {_git('log', '-1', '--oneline', options.against)}")
         if options.time:
             speed(there, names, options.engines)
